@@ -1,0 +1,13 @@
+"""The paper's environments; importing this package registers their Gymnasium ids."""
+
+import gymnasium as gym
+
+# String entry points: an environment's module (and with it PyBullet) is imported only when it is made.
+ENTRY_POINTS = {
+    "Lava-v0": "sb3_tdpg.envs.lava:LavaEnv",
+}
+
+for _env_id, _entry_point in ENTRY_POINTS.items():
+    # No max_episode_steps: the horizon belongs to the problem and ends as `terminated`, not as a time limit.
+    if _env_id not in gym.registry:
+        gym.register(id=_env_id, entry_point=_entry_point)

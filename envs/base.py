@@ -1,0 +1,123 @@
+"""The common base of the environments: a finite-horizon POMDP whose core is batched NumPy.
+
+Dimension key: N episodes side by side, X state, U action; observations have shape ``(N, *obs)``.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+
+class BatchStep(NamedTuple):
+    """What one step of N episodes returns."""
+
+    state: np.ndarray  # (N, X), x_{t+1}
+    observation: np.ndarray  # (N, *obs), y_{t+1}
+    cost: np.ndarray  # (N,), c_t, plus c_T on the last step
+
+
+class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
+    """
+    A finite-horizon POMDP (Section II of the paper) as a Gymnasium environment.
+
+    A subclass sets ``horizon``, ``state_space``, ``observation_space`` and ``action_space`` and writes the five
+    methods of the model, each for N episodes at once: :meth:`_initial_state`, :meth:`_dynamics`, :meth:`_sensor`,
+    :meth:`_cost`, :meth:`_terminal_cost`. Everything random must draw from ``self.np_random``.
+
+    This class turns them into ``reset``/``step`` for one episode; :class:`sb3_tdpg.vec_env.BatchedVecEnv` turns the
+    same methods into an SB3 ``VecEnv`` for many. The end of the horizon is ``terminated=True``: it is part of the
+    problem, so that nothing bootstraps there. The reward is the negative cost, negated here and nowhere else.
+
+    ``info["state"]`` holds a copy of the true state (after ``reset`` x_0, after ``step`` x_{t+1}), ``info["cost"]``
+    the cost of the step.
+
+    :param horizon: Number of controls T in an episode.
+    :param render_mode: ``None`` or one of ``metadata["render_modes"]``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "render_fps": 4}
+
+    state_space: spaces.Box
+
+    def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
+        if not (isinstance(horizon, (int, np.integer)) and horizon >= 1):
+            raise ValueError(f"horizon={horizon!r} must be an integer of at least 1: the number of controls in an episode")
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode={render_mode!r} must be None or one of {self.metadata['render_modes']}")
+        self.horizon = int(horizon)
+        self.render_mode = render_mode
+        self._state: np.ndarray | None = None  # (1, X)
+        self._time = 0
+
+    @abstractmethod
+    def _initial_state(self, n: int) -> np.ndarray:
+        """Draw x_0: ``(N, X)``."""
+
+    @abstractmethod
+    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """Return a new array x_{t+1} ~ p(. | x_t, u_t): ``(N, X)`` from ``(N, X)`` and ``(N, U)``."""
+
+    @abstractmethod
+    def _sensor(self, state: np.ndarray) -> np.ndarray:
+        """Draw y_t ~ s(. | x_t): ``(N, *obs)``, in the dtype of the observation space."""
+
+    @abstractmethod
+    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """c_t(x_t, u_t): ``(N,)``."""
+
+    @abstractmethod
+    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+        """c_T(x_T): ``(N,)``."""
+
+    def reset_batch(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Start N episodes; return x_0 ``(N, X)`` and y_0 ``(N, *obs)``."""
+        state = self._initial_state(n)
+        return state, self._sensor(state)
+
+    def step_batch(self, state: np.ndarray, action: np.ndarray, *, is_last: bool) -> BatchStep:
+        """
+        Advance N episodes by one control.
+
+        :param state: x_t, ``(N, X)``
+        :param action: u_t, ``(N, U)``; clipped to the action space, as every SB3 algorithm does, too
+        :param is_last: Whether this is control T - 1, so that the terminal cost is due.
+        :raises ValueError: if an action is NaN or infinite.
+        """
+        if not np.all(np.isfinite(action)):
+            raise ValueError(
+                f"{type(self).__name__} received an action that is not finite: {action[~np.isfinite(action).all(-1)][0]}; "
+                "the policy that produced it has probably diverged"
+            )
+        box = self.action_space
+        assert isinstance(box, spaces.Box)
+        action = np.clip(np.asarray(action, dtype=np.float64), box.low, box.high)
+        cost = self._cost(state, action)
+        next_state = self._dynamics(state, action)
+        if is_last:
+            cost = cost + self._terminal_cost(next_state)
+        return BatchStep(next_state, self._sensor(next_state), cost)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; see :class:`gymnasium.Env`."""
+        super().reset(seed=seed)
+        self._time = 0
+        self._state, observation = self.reset_batch(1)
+        return observation[0], {"state": self._state[0].copy()}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply one control; see :class:`gymnasium.Env`."""
+        if self._state is None or self._time >= self.horizon:
+            raise gym.error.ResetNeeded(f"the episode has not begun or is over (horizon={self.horizon}): call reset() first")
+        self._time += 1
+        terminated = self._time == self.horizon
+        batch = np.asarray(action, dtype=np.float64).reshape(1, -1)
+        self._state, observation, cost = self.step_batch(self._state, batch, is_last=terminated)
+        info = {"state": self._state[0].copy(), "cost": float(cost[0])}
+        return observation[0], -float(cost[0]), terminated, False, info

@@ -1,0 +1,130 @@
+"""The lava problem (Section IV-A of the paper): a double integrator between a wall and a lava pit."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+
+from .base import POMDPEnv
+
+WALL = 0.0  # m
+LAVA = 5.0  # m
+GOAL = np.array([3.0, 0.0])  # m, m/s
+
+
+class LavaEnv(POMDPEnv):
+    r"""
+    Reach ``d = 3 m`` and stand still, without falling into the lava at ``d = 5 m``.
+
+    State ``x = (d, v)``: distance from the wall in metres, velocity in metres a step. Observation
+    ``y ~ N(x, sensor_noise_std^2 I)``. Action ``u``: the change of velocity. With ``T = 5`` controls,
+
+    .. math::
+        x_{t+1} = (d_t + v_t,\ v_t + u_t), \qquad
+        c_t = \lVert x_t - g \rVert, \qquad c_T = 100 \lVert x_T - g \rVert, \qquad g = (3, 0).
+
+    A robot that would pass the wall stops there with ``v = 0``: the control of that step is lost. A robot that passes
+    5 m is in the lava and stays at ``(5, 0)`` for ever. It starts with ``v = 0`` and ``d`` uniform in [0, 5] m.
+
+    The defaults are the paper's text. The numbers in the paper's Table I fit another reading better:
+    ``LavaEnv(**sb3_tdpg.envs.scenarios.LAVA_TABLE_READING)``.
+
+    :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
+    :param action_cost: Weight of ``|u_t|`` in the stage cost (0 in the text, 1 in the table's reading).
+    :param lava_stage_cost: Stage cost once in the lava; ``None``: the distance to the goal, which is 2 there.
+    :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
+    :param horizon: Number of controls T.
+    :param max_action: The action space is ``[-max_action, max_action]``; the paper's is unbounded.
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+
+    def __init__(
+        self,
+        *,
+        sensor_noise_std: float = 0.01,
+        action_cost: float = 0.0,
+        lava_stage_cost: float | None = None,
+        lava_terminal_cost: float | None = None,
+        horizon: int = 5,
+        max_action: float = 10.0,
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(horizon=horizon, render_mode=render_mode)
+        if not (np.isfinite(sensor_noise_std) and sensor_noise_std >= 0):
+            raise ValueError(f"sensor_noise_std={sensor_noise_std} must be finite and not negative (it is sigma, not sigma^2)")
+        if not (np.isfinite(max_action) and max_action > 0):
+            raise ValueError(f"max_action={max_action} must be finite and positive")
+        for name, value in (("action_cost", action_cost), ("lava_stage_cost", lava_stage_cost),
+                            ("lava_terminal_cost", lava_terminal_cost)):  # fmt: skip
+            if value is not None and not np.isfinite(value):
+                raise ValueError(f"{name}={value} must be finite")
+        self.sensor_noise_std = float(sensor_noise_std)
+        self.action_cost = float(action_cost)
+        self.lava_stage_cost = lava_stage_cost
+        self.lava_terminal_cost = lava_terminal_cost
+        self.state_space = spaces.Box(
+            np.array([WALL, -np.inf]), np.array([LAVA, np.inf]), dtype=np.float64
+        )
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
+
+    def _initial_state(self, n: int) -> np.ndarray:
+        state = np.zeros((n, 2))
+        state[:, 0] = self.np_random.uniform(WALL, LAVA, n)
+        return state
+
+    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        d, v = state.T
+        next_state = np.stack([d + v, v + action[:, 0]], axis=1)
+        next_d = next_state[:, 0]
+        # Strictly beyond the wall: a robot that stands *at* the wall must be able to leave it.
+        next_state[next_d < WALL] = (WALL, 0.0)
+        next_state[(d >= LAVA) | (next_d >= LAVA)] = (LAVA, 0.0)
+        return next_state
+
+    def _sensor(self, state: np.ndarray) -> np.ndarray:
+        noise = self.sensor_noise_std * self.np_random.standard_normal(state.shape)
+        return (state + noise).astype(np.float32)
+
+    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        distance = np.linalg.norm(state - GOAL, axis=1)
+        if self.lava_stage_cost is not None:
+            distance = np.where(state[:, 0] >= LAVA, self.lava_stage_cost, distance)
+        return distance + self.action_cost * np.abs(action[:, 0])
+
+    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+        cost = 100.0 * np.linalg.norm(state - GOAL, axis=1)
+        if self.lava_terminal_cost is not None:
+            cost = np.where(state[:, 0] >= LAVA, self.lava_terminal_cost, cost)
+        return cost
+
+    def render(self) -> np.ndarray | None:
+        """
+        Draw the corridor from the side: ``(96, 480, 3)`` uint8.
+
+        Wall grey, lava orange, goal green, robot blue with its velocity as a dark bar.
+        """
+        if self.render_mode is None:
+            return None
+        if self._state is None:
+            raise ValueError("there is nothing to render before the first reset()")
+        height, width, margin = 96, 480, 40
+        scale = (width - 2 * margin) / (LAVA - WALL)
+
+        def column(d: float) -> int:
+            return int(np.clip(margin + scale * d, 0, width - 1))
+
+        image = np.full((height, width, 3), 245, np.uint8)
+        image[72:] = (150, 140, 130)  # ground
+        image[20:, : column(WALL)] = (110, 110, 115)
+        image[72:, column(LAVA) :] = (235, 90, 20)
+        goal, robot = column(GOAL[0]), column(self._state[0, 0])
+        image[40:72, goal - 2 : goal + 2] = (40, 150, 60)
+        image[54:72, max(robot - 9, 0) : robot + 9] = (45, 90, 190)
+        tip = column(self._state[0, 0] + self._state[0, 1])
+        image[61:65, min(robot, tip) : max(robot, tip)] = (20, 30, 70)
+        return image

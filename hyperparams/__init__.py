@@ -1,0 +1,1 @@
+"""Hyperparameter files for rl-zoo3, one YAML file per algorithm."""

@@ -1,0 +1,96 @@
+"""
+Baselines: what is subtracted from the costs before they weight the log-probabilities.
+
+Dimension key: T horizon, N episodes, X state, F features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch as th
+
+from sb3_tdpg.losses import cost_to_go
+
+AdvantageFunction = Callable[[th.Tensor, th.Tensor, th.Tensor, float], th.Tensor]
+
+
+def episode_mean_advantages(costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float) -> th.Tensor:
+    """
+    Subtract the batch's mean from the cost of the whole episode, as the paper does.
+
+    :param costs: ``(T, N)``
+    :param states: ``(T, N, X)``, unused
+    :param alive: ``(T, N)``
+    :param gamma: discount
+    :return: ``(T, N)``
+    """
+    episode_cost = cost_to_go(costs, gamma)[0]
+    return (episode_cost - episode_cost.mean()).expand_as(costs)
+
+
+def value_advantages(costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float) -> th.Tensor:
+    """
+    Subtract from the cost to come its regression on the true state, one regression per time step.
+
+    The true state is known in training only, and only the baseline sees it: the gradient stays unbiased, since x_t
+    precedes the noise of step t. Each half of the episodes is predicted from the other half, so that no episode's own
+    cost enters its baseline.
+
+    :param costs: ``(T, N)``
+    :param states: x_t, ``(T, N, X)``
+    :param alive: ``(T, N)``
+    :param gamma: discount
+    :return: ``(T, N)``
+    """
+    targets = cost_to_go(costs, gamma)
+    features = _state_features(states, alive)  # (T, N, F)
+    fold = th.arange(costs.shape[1], device=costs.device) % 2
+    prediction = th.zeros_like(targets)
+    for held_out in (0, 1):
+        weight = alive * (fold != held_out)
+        prediction += (fold == held_out) * _ridge(features, targets, weight)
+    return targets - prediction
+
+
+def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: float = 0.5) -> th.Tensor:
+    """Fit a weighted ridge regression with a free intercept at each time step; return its predictions ``(T, N)``."""
+    total = weight.sum(1, keepdim=True).clamp(min=1.0)  # (T, 1)
+    mean = (weight * targets).sum(1, keepdim=True) / total
+    feature_mean = (weight[..., None] * features).sum(1, keepdim=True) / total[..., None]
+    x = features - feature_mean
+    weighted = weight[..., None] * x
+    gram = weighted.mT @ x + penalty * th.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    coefficients = th.linalg.solve(gram, weighted.mT @ (targets - mean)[..., None])
+    return mean + (x @ coefficients)[..., 0]
+
+
+def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = 60) -> th.Tensor:
+    """Standardised state, its squares and Gaussian bumps centred on states of the batch, for each time step."""
+    weight = alive[..., None]
+    total = weight.sum(1, keepdim=True).clamp(min=1.0)
+    mean = (weight * states).sum(1, keepdim=True) / total
+    std = ((weight * (states - mean) ** 2).sum(1, keepdim=True) / total).sqrt()
+    x = (states - mean) / th.where(std > 1e-6, std, th.ones_like(std))
+    step = max(1, states.shape[1] // n_centres)
+    centres = x[:, ::step]
+    squared_distance = th.cdist(x, centres).square()  # (T, N, centres)
+    bumps = [th.exp(-squared_distance / (2 * width**2)) for width in (0.3, 1.0)]
+    return th.cat([x, x.square(), *bumps], dim=-1)
+
+
+BASELINES: dict[str, AdvantageFunction] = {
+    "mean": episode_mean_advantages,
+    "value": value_advantages,
+}
+
+
+def get_baseline(name: str) -> AdvantageFunction:
+    """
+    Look up a baseline.
+
+    :raises ValueError: if there is none of this name.
+    """
+    if name not in BASELINES:
+        raise ValueError(f"baseline={name!r} is unknown: use one of {sorted(BASELINES)}")
+    return BASELINES[name]

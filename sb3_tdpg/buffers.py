@@ -1,0 +1,96 @@
+"""
+The rollouts of one policy epoch, episode by episode.
+
+Dimension key: T horizon, N episodes, X state, Z TRVs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from sb3_tdpg.information import InformationBatch
+
+
+class EpisodeBatch(NamedTuple):
+    """An epoch's rollouts as tensors on the training device."""
+
+    observations: th.Tensor  # (T, N, *obs), y_t
+    states: th.Tensor  # (T, N, X), x_t
+    noise: th.Tensor  # (T, N, Z), eps_t
+    trvs: th.Tensor  # (T, N, Z), x~_t
+    means: th.Tensor  # (T, N, Z) of q(x~_t | x~_{t-1}, y_t)
+    stds: th.Tensor  # (T, N, Z)
+    actions: th.Tensor  # (T, N, U), u_t before clipping
+    costs: th.Tensor  # (T, N), zero after the end
+    alive: th.Tensor  # (T, N), 1.0 while the episode lasts
+
+    @property
+    def prev_trvs(self) -> th.Tensor:
+        """x~_{t-1}, which is zero at t = 0: ``(T, N, Z)``."""
+        return th.cat([th.zeros_like(self.trvs[:1]), self.trvs[:-1]])
+
+    def information_batch(self) -> InformationBatch:
+        """What the mutual-information estimators see, detached."""
+        alive = None if bool(self.alive.all()) else self.alive.bool()
+        return InformationBatch(self.states, self.trvs, self.means, self.stds, alive)
+
+
+class EpisodeBuffer(RolloutBuffer):
+    """
+    A rollout buffer of ``(T, N, ...)`` arrays: time step by episode, where SB3's is time step by environment.
+
+    ``buffer_size`` is the horizon T and ``n_envs`` the number of episodes N, however many environments produce them. An
+    episode that ends early leaves zeros behind it, and ``alive`` tells them apart.
+
+    :param state_dim: X
+    :param trv_dim: Z
+    :param args: as SB3's :class:`~stable_baselines3.common.buffers.RolloutBuffer`
+    :param kwargs: likewise
+    """
+
+    def __init__(self, *args: Any, state_dim: int, trv_dim: int, **kwargs: Any) -> None:
+        self.state_dim = state_dim
+        self.trv_dim = trv_dim
+        super().__init__(*args, **kwargs)
+
+    def reset(self) -> None:
+        """Forget the last epoch."""
+        shape = (self.buffer_size, self.n_envs)
+        assert self.observation_space.dtype is not None
+        self.observations = np.zeros((*shape, *self.obs_shape), self.observation_space.dtype)
+        self.states = np.zeros((*shape, self.state_dim), np.float32)
+        self.noise = np.zeros((*shape, self.trv_dim), np.float32)
+        self.trvs = np.zeros((*shape, self.trv_dim), np.float32)
+        self.means = np.zeros((*shape, self.trv_dim), np.float32)
+        self.stds = np.ones((*shape, self.trv_dim), np.float32)
+        self.actions = np.zeros((*shape, self.action_dim), np.float32)
+        self.costs = np.zeros(shape, np.float32)
+        self.alive = np.zeros(shape, np.float32)
+        self.full = False
+
+    def add_step(self, t: np.ndarray, episode: np.ndarray, **values: np.ndarray) -> None:
+        """
+        Store one step of some episodes.
+
+        :param t: time step of each, ``(n,)``
+        :param episode: column of each, ``(n,)``
+        :param values: ``observations``, ``states``, ``noise``, ``trvs``, ``means``, ``stds``, ``actions``, ``costs``,
+            each ``(n, ...)``
+        """
+        for name, value in values.items():
+            getattr(self, name)[t, episode] = value
+        self.alive[t, episode] = 1.0
+
+    def episode_batch(self) -> EpisodeBatch:
+        """Return the epoch as tensors."""
+        assert self.full, "the epoch's rollouts are not complete"
+        return EpisodeBatch(*(self.to_torch(getattr(self, name), copy=False) for name in EpisodeBatch._fields))
+
+    @property
+    def episode_costs(self) -> np.ndarray:
+        """Undiscounted cost of each episode, ``(N,)``."""
+        return self.costs.sum(axis=0)

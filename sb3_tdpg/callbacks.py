@@ -1,0 +1,207 @@
+"""Callbacks: fit the critics each epoch, select a policy, write checkpoints, show progress."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+
+if TYPE_CHECKING:
+    from sb3_tdpg.tdpg import TDPG
+
+
+class _TDPGCallback(BaseCallback):
+    """A callback that knows that its model is a :class:`TDPG`."""
+
+    @property
+    def tdpg(self) -> TDPG:
+        return cast("TDPG", self.model)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class MINECallback(_TDPGCallback):
+    """
+    Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of alg:trv-policy).
+
+    :class:`TDPG` installs it by itself, before the callbacks of the user, so that those find ``model.information``
+    up to date. It does nothing in an epoch without a penalty (``beta = inf``): no critic is trained for plain policy
+    gradient.
+    """
+
+    def _on_rollout_end(self) -> None:
+        model = self.tdpg
+        if model.mi_coef == 0.0:
+            model.information = None
+            return
+        batch = model.rollout_buffer.episode_batch().information_batch()
+        diagnostics = model.estimator.fit(batch)
+        with th.no_grad():
+            information = model.estimator(batch).cpu().numpy()
+        model.information = information
+        self.logger.record("mi/total", float(information.sum()))
+        for name, value in diagnostics.items():
+            self.logger.record(f"mi/{name}", value)
+        for t, value in enumerate(information):
+            self.logger.record(f"mi/t{t:02d}", float(value), exclude=("stdout", "log", "json", "csv"))
+
+
+class Candidate(NamedTuple):
+    """The policy of one epoch, measured on the rollouts that it made itself."""
+
+    epoch: int
+    cost: float  # empirical expected cost
+    information: float  # sum over t, nats
+
+
+class SelectionCallback(_TDPGCallback):
+    """
+    Keep the policy of the best epoch.
+
+    With ``cost_limit`` alone this is the paper's rule: the lowest information among the epochs whose empirical expected
+    cost is below the limit. With ``mi_limit`` it is the other way about: the lowest cost among the epochs whose
+    information is below ``mi_limit`` (and whose cost is below ``cost_limit``, if that is given, too). Where many
+    epochs reach an information of about 0, the paper's rule picks any of them, and the second rule the best.
+
+    The policy is kept in memory; :meth:`restore` puts it back into the model. With ``save_path`` it is also written
+    there whenever a better one is found, so that an interrupted training leaves it behind, and a resumed one goes on
+    from it.
+
+    :param cost_limit: Upper limit on the expected cost.
+    :param mi_limit: Upper limit on the information in nats, summed over time.
+    :param save_path: Where to save the selected model (``.zip``); a ``.json`` beside it tells epoch, cost, information.
+    :param verbose: 1: print every new best epoch.
+    :raises ValueError: if neither limit is given, or one is NaN or negative.
+    """
+
+    def __init__(
+        self,
+        cost_limit: float | None = None,
+        mi_limit: float | None = None,
+        save_path: str | os.PathLike[str] | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if cost_limit is None and mi_limit is None:
+            raise ValueError("give cost_limit (lowest information under a cost), mi_limit (lowest cost under it) or both")
+        for name, limit in (("cost_limit", cost_limit), ("mi_limit", mi_limit)):
+            if limit is not None and np.isnan(limit):
+                raise ValueError(f"{name} is NaN")
+        if mi_limit is not None and mi_limit < 0:
+            raise ValueError(f"mi_limit={mi_limit} must not be negative")
+        self.cost_limit = cost_limit
+        self.mi_limit = mi_limit
+        self.save_path = None if save_path is None else Path(save_path).with_suffix(".zip")
+        self.best: Candidate | None = None
+        self._best_policy: dict[str, th.Tensor] | None = None
+
+    @property
+    def criterion(self) -> Literal["lowest information", "lowest cost"]:
+        """What is minimised."""
+        return "lowest information" if self.mi_limit is None else "lowest cost"
+
+    def _init_callback(self) -> None:
+        resumes = self.model.num_timesteps > 0
+        if resumes and self.best is None and self.save_path is not None and self.save_path.exists():
+            record = json.loads(self.save_path.with_suffix(".json").read_text())
+            self.best = Candidate(record["epoch"], record["cost"], record["information"])
+            saved = type(self.tdpg).load(self.save_path, device=self.model.device)
+            self._best_policy = saved.policy.state_dict()
+        elif not resumes:
+            self.best, self._best_policy = None, None
+
+    def _on_rollout_end(self) -> None:
+        model = self.tdpg
+        cost = float(model.rollout_buffer.episode_costs.mean())
+        information = 0.0 if model.information is None else float(model.information.clip(min=0).sum())
+        candidate = Candidate(model.epoch, cost, information)
+        if not self._is_eligible(candidate) or (self.best is not None and not self._is_better(candidate, self.best)):
+            return
+        self.best = candidate
+        self._best_policy = {name: value.detach().clone() for name, value in model.policy.state_dict().items()}
+        if self.verbose >= 1:
+            print(f"epoch {candidate.epoch}: cost {cost:.2f}, information {information:.3f} nat: new {self.criterion}")
+        if self.save_path is not None:
+            model.save(self.save_path)
+            write_atomically(self.save_path.with_suffix(".json"), json.dumps(candidate._asdict()))
+
+    def _is_eligible(self, candidate: Candidate) -> bool:
+        under_cost = self.cost_limit is None or candidate.cost < self.cost_limit
+        under_mi = self.mi_limit is None or candidate.information < self.mi_limit
+        return np.isfinite(candidate.cost) and np.isfinite(candidate.information) and under_cost and under_mi
+
+    def _is_better(self, candidate: Candidate, best: Candidate) -> bool:
+        if self.mi_limit is None:
+            return (candidate.information, candidate.cost) < (best.information, best.cost)
+        return candidate.cost < best.cost
+
+    def restore(self, model: TDPG) -> Candidate:
+        """
+        Put the selected policy into the model.
+
+        :return: when it was found, and what it measured
+        :raises ValueError: if no epoch met the limits.
+        """
+        if self.best is None or self._best_policy is None:
+            limits = ", ".join(
+                f"{name} < {limit}" for name, limit in (("cost", self.cost_limit), ("information", self.mi_limit)) if limit
+            )
+            raise ValueError(f"no epoch met the limits ({limits}): train longer or loosen them; the last policy is kept")
+        model.policy.load_state_dict(self._best_policy)
+        return self.best
+
+
+class TrainingCheckpointCallback(_TDPGCallback):
+    """
+    Write a file from which a killed training goes on exactly as if it had not been killed.
+
+    Every ``save_freq`` epochs, before the epoch's rollouts, the model is saved with the state of all random number
+    generators, and the environments are reset: the reset makes the generators' state all there is to know of the
+    environments. The file is replaced atomically, so that there is always a whole one. To go on::
+
+        model = TDPG.load("checkpoint.zip", env=env)
+        model.learn(model.remaining_timesteps, reset_num_timesteps=False, callback=TrainingCheckpointCallback(...))
+
+    Environments must draw their randomness from ``np_random``, as Gymnasium asks of them.
+
+    :param save_path: The file.
+    :param save_freq: Epochs from one checkpoint to the next.
+    :param verbose: 1: print each.
+    """
+
+    def __init__(self, save_path: str | os.PathLike[str], save_freq: int = 10, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if save_freq < 1:
+            raise ValueError(f"save_freq={save_freq} must be at least 1 (epochs)")
+        self.save_path = Path(save_path).with_suffix(".zip")
+        self.save_freq = save_freq
+
+    def _on_rollout_start(self) -> None:
+        if self.tdpg.epoch % self.save_freq == 0:
+            self.tdpg.save_checkpoint(self.save_path)
+            if self.verbose >= 1:
+                print(f"epoch {self.tdpg.epoch}: checkpoint {self.save_path}")
+
+
+class TDPGProgressBar(ProgressBarCallback):
+    """SB3's progress bar, with the epoch's cost and information beside it."""
+
+    def _on_rollout_end(self) -> None:
+        model = cast("TDPG", self.model)
+        shown: dict[str, Any] = {"cost": f"{model.rollout_buffer.episode_costs.mean():.2f}"}
+        if model.information is not None:
+            shown["nats"] = f"{model.information.sum():.2f}"
+        self.pbar.set_postfix(shown, refresh=False)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file so that at no time a half-written one is there."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)

@@ -1,0 +1,54 @@
+"""
+Mutual-information estimators and bounds; knows nothing of Stable-Baselines3.
+
+A new estimator is a file of its own here and a row in :data:`ESTIMATORS`.
+"""
+
+from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+from sb3_tdpg.information.critic import CriticEstimator
+from sb3_tdpg.information.infonce import InfoNCE
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.loo import LeaveOneOut
+from sb3_tdpg.information.mine import Mine
+from sb3_tdpg.information.nwj import Nwj
+from sb3_tdpg.information.smile import Smile
+
+ESTIMATORS: dict[str, type[InformationEstimator]] = {
+    "mine": Mine,
+    "nwj": Nwj,
+    "smile": Smile,
+    "infonce": InfoNCE,
+    "logdet": LogDet,
+    "loo": LeaveOneOut,
+}
+
+
+def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[InformationEstimator]:
+    """
+    Look up an estimator.
+
+    :param estimator: A name in :data:`ESTIMATORS` or a class of one's own.
+    :raises ValueError: if the name is unknown or the class is no :class:`InformationEstimator`.
+    """
+    if isinstance(estimator, str) and estimator in ESTIMATORS:
+        return ESTIMATORS[estimator]
+    if isinstance(estimator, type) and issubclass(estimator, InformationEstimator):
+        return estimator
+    raise ValueError(
+        f"mi_estimator={estimator!r} is unknown: use one of {sorted(ESTIMATORS)} or a subclass of InformationEstimator"
+    )
+
+
+__all__ = [
+    "ESTIMATORS",
+    "CriticEstimator",
+    "InfoNCE",
+    "InformationBatch",
+    "InformationEstimator",
+    "LeaveOneOut",
+    "LogDet",
+    "Mine",
+    "Nwj",
+    "Smile",
+    "get_estimator_class",
+]

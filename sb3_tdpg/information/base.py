@@ -1,0 +1,82 @@
+"""
+The interface of every mutual-information estimator.
+
+Dimension key: T time steps, N episodes, X state, Z task-relevant variables (TRVs).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar, Literal, NamedTuple
+
+import torch as th
+from torch import nn
+
+
+class InformationBatch(NamedTuple):
+    """Samples of x_t and of the TRVs, with the encoder's density at each."""
+
+    states: th.Tensor  # (T, N, X)
+    trvs: th.Tensor  # (T, N, Z), x~_t = means + stds * noise
+    means: th.Tensor  # (T, N, Z) of q(x~_t | x~_{t-1}, y_t)
+    stds: th.Tensor  # (T, N, Z)
+    alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
+
+    def at(self, t: int) -> InformationBatch:
+        """Only step t, and there only the episodes that are still alive: ``(1, n, ...)``."""
+        keep = slice(None) if self.alive is None else self.alive[t]
+        return InformationBatch(*(x[t, keep][None] for x in self[:4]))
+
+
+class InformationEstimator(nn.Module):
+    """
+    Estimates I[x_t; x~_t] in nats for every time step at once.
+
+    :param horizon: Number of time steps T.
+    :param state_dim: X
+    :param trv_dim: Z
+    """
+
+    bound: ClassVar[Literal["lower", "upper", "neither"]]
+    """Whether the expectation of the estimate is a lower or an upper bound on I[x_t; x~_t], or neither."""
+
+    def __init__(self, horizon: int, state_dim: int, trv_dim: int) -> None:
+        super().__init__()
+        self.horizon = horizon
+        self.state_dim = state_dim
+        self.trv_dim = trv_dim
+
+    def fit(self, batch: InformationBatch) -> dict[str, float]:
+        """
+        Fit what the estimator learns to detached samples; nothing for a critic-free bound.
+
+        :return: diagnostics for the log
+        """
+        return {}
+
+    def forward(self, batch: InformationBatch) -> th.Tensor:
+        """
+        Estimate I[x_t; x~_t], differentiable in ``trvs``, ``means`` and ``stds``.
+
+        A step at which fewer than :meth:`min_episodes` episodes are alive counts as 0: nothing can be said of it.
+
+        :return: ``(T,)``, nats
+        """
+        if batch.alive is None:
+            return self._estimate(batch, None)
+        alive = batch.alive.sum(dim=1).tolist()
+        enough = self.min_episodes(batch.alive.shape[1])
+        zero = batch.trvs.new_zeros(1)
+        return th.cat([self._estimate(batch.at(t), t) if n >= enough else zero for t, n in enumerate(alive)])
+
+    def min_episodes(self, n_episodes: int) -> int:
+        """Return the number of living episodes that an estimate needs, out of a batch of ``n_episodes``."""
+        return min(self.trv_dim + 2, n_episodes)
+
+    @abstractmethod
+    def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
+        """
+        Estimate for all steps (``t=None``, ``(T, N, ...) -> (T,)``) or for step t alone (``(1, n, ...) -> (1,)``).
+
+        Every episode of the batch is alive.
+        """

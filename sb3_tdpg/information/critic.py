@@ -1,0 +1,237 @@
+"""
+What the estimators with a trained critic F^theta have in common.
+
+Dimension key: T time steps, N episodes, B minibatch, K marginal samples for each state, X state, Z TRVs.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch as th
+from torch import nn
+
+from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+from sb3_tdpg.networks import BatchedMLP
+
+
+class Scores(NamedTuple):
+    """The critic's values at samples of p(x, x~) and of p(x) q(x~)."""
+
+    joint: th.Tensor  # (T, B)
+    marginal: th.Tensor  # (T, B, K)
+
+
+class CriticEstimator(InformationEstimator):
+    """
+    T critics F^theta_t(x_t, x~_t) as one batched network (alg:mine), fitted to each epoch's rollouts.
+
+    A subclass says which bound the scores make (:meth:`_bound`), and, where the critic is trained on something else
+    than the bound itself, on what (:meth:`_objective`).
+
+    :param horizon: Number of time steps T.
+    :param state_dim: X
+    :param trv_dim: Z
+    :param hidden_sizes: Hidden layers of each critic.
+    :param activation_fn: Nonlinearity of the critics.
+    :param learning_rate: Adam's learning rate.
+    :param batch_size: Minibatch size B; at most half of the episodes is used, since the joint and the marginal samples
+        of a step come from different episodes.
+    :param gradient_steps: Optimiser steps ("MINE epochs") for each policy epoch.
+    :param warmup_gradient_steps: The same for the first epoch.
+    :param refit_below: A critic whose estimate on the batch is not finite or is below this value (in nats; the truth is
+        never negative) has diverged: it starts anew and is fitted for ``refit_gradient_steps``. A frozen critic's bound
+        is unbounded below, and without this guard a policy learns to exploit it.
+    :param refit_gradient_steps: See ``refit_below``.
+    :param reset_moments: Whether Adam's moments start from zero at each epoch: the data have moved.
+    :param standardize: Whether each component of the state is brought to mean 0 and variance 1 at each time step.
+    """
+
+    def __init__(
+        self,
+        horizon: int,
+        state_dim: int,
+        trv_dim: int,
+        *,
+        hidden_sizes: Sequence[int] = (32, 32),
+        activation_fn: type[nn.Module] = nn.ELU,
+        learning_rate: float = 1e-3,
+        batch_size: int = 50,
+        gradient_steps: int = 50,
+        warmup_gradient_steps: int = 2000,
+        refit_below: float = -0.5,
+        refit_gradient_steps: int = 500,
+        reset_moments: bool = True,
+        standardize: bool = False,
+    ) -> None:
+        super().__init__(horizon, state_dim, trv_dim)
+        for name, value in (("learning_rate", learning_rate), ("batch_size", batch_size),
+                            ("gradient_steps", gradient_steps)):  # fmt: skip
+            if not value > 0:
+                raise ValueError(f"mi_kwargs: {name}={value} must be positive")
+        self.sizes = (state_dim + trv_dim, *hidden_sizes, 1)
+        self.activation_fn = activation_fn
+        self.learning_rate = learning_rate
+        self.batch_size = batch_size
+        self.gradient_steps = gradient_steps
+        self.warmup_gradient_steps = warmup_gradient_steps
+        self.refit_below = refit_below
+        self.refit_gradient_steps = refit_gradient_steps
+        self.reset_moments = reset_moments
+        self.standardize = standardize
+        self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
+        self.optimizer = self._make_optimizer(self.critic)
+        self.is_warm = False
+        self.register_buffer("state_mean", th.zeros(horizon, 1, state_dim))
+        self.register_buffer("state_std", th.ones(horizon, 1, state_dim))
+
+    state_mean: th.Tensor
+    state_std: th.Tensor
+
+    @abstractmethod
+    def _bound(self, scores: Scores) -> th.Tensor:
+        """The estimate that these scores make: ``(T,)``, nats."""
+
+    def _objective(self, scores: Scores, steps: th.Tensor) -> th.Tensor:
+        """
+        What the critic's gradient ascends: ``(T,)``.
+
+        :param scores: scores of a minibatch for the time steps in ``steps``
+        :param steps: indices of these time steps
+        """
+        return self._bound(scores)
+
+    def _pair(self, states: th.Tensor, trvs: th.Tensor, other_trvs: th.Tensor) -> th.Tensor:
+        """
+        Lay out the critic's inputs for one call: the joint samples, then the marginal ones.
+
+        :param states: ``(..., B, X)``
+        :param trvs: ``(..., B, Z)`` of the same episodes
+        :param other_trvs: ``(..., B, Z)`` of other episodes
+        :return: ``(..., B + B * K, X + Z)``
+        """
+        return th.cat([th.cat([states, trvs], -1), th.cat([states, other_trvs], -1)], dim=-2)
+
+    def _split(self, values: th.Tensor, n: int) -> Scores:
+        """Undo :meth:`_pair` on the critic's outputs ``(T, B + B * K, 1)``."""
+        values = values.squeeze(-1)
+        return Scores(values[:, :n], values[:, n:].unflatten(1, (n, -1)))
+
+    def fit(self, batch: InformationBatch) -> dict[str, float]:
+        """Train the critics on the epoch's samples (alg:mine); see :class:`InformationEstimator`."""
+        states, trvs = batch.states.detach(), batch.trvs.detach()
+        if self.standardize:
+            self._update_scaling(batch)
+        states = self._scale(states)
+        steps = th.arange(self.horizon, device=trvs.device)
+        if batch.alive is not None:
+            steps = steps[batch.alive.sum(1) >= self.min_episodes(batch.alive.shape[1])]
+        if len(steps) == 0:
+            return {"critic_refits": 0.0}
+
+        if self.reset_moments:
+            self.optimizer = self._make_optimizer(self.critic)
+        n_steps = self.gradient_steps if self.is_warm else max(self.warmup_gradient_steps, self.gradient_steps)
+        self._ascend(self.critic, self.optimizer, states, trvs, batch.alive, steps, n_steps)
+        self.is_warm = True
+
+        broken = steps[self._is_broken(batch)[steps]]
+        if len(broken) > 0:
+            self._refit(states, trvs, batch.alive, broken)
+        return {"critic_refits": float(len(broken))}
+
+    def _ascend(
+        self,
+        critic: BatchedMLP,
+        optimizer: th.optim.Optimizer,
+        states: th.Tensor,
+        trvs: th.Tensor,
+        alive: th.Tensor | None,
+        steps: th.Tensor,
+        n_gradient_steps: int,
+    ) -> None:
+        """Gradient ascent on the objective; ``critic`` has one network for each row of ``states`` and ``trvs``."""
+        n_rows, n_episodes = trvs.shape[:2]
+        n = min(self.batch_size, n_episodes // 2)
+        subset = None if len(steps) == n_rows else steps
+        for _ in range(n_gradient_steps):
+            if alive is None:
+                chosen = th.randperm(n_episodes, device=trvs.device)[: 2 * n]
+                batch_states, batch_trvs = states[:, chosen[:n]], trvs[:, chosen]
+            else:
+                # Dead episodes sort to the end; steps with fewer than 2n living ones are not in `steps`.
+                priority = th.rand(alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
+                chosen = priority.argsort(dim=1)[:, : 2 * n, None]
+                batch_states = states.take_along_dim(chosen[:, :n], dim=1)
+                batch_trvs = trvs.take_along_dim(chosen, dim=1)
+            inputs = self._pair(batch_states, batch_trvs[:, :n], batch_trvs[:, n:])
+            scores = self._split(critic(inputs), n)
+            if subset is not None:
+                scores = Scores(scores.joint[subset], scores.marginal[subset])
+            loss = -self._objective(scores, steps).sum()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+    @th.no_grad()
+    def _is_broken(self, batch: InformationBatch) -> th.Tensor:
+        estimate = self(batch)
+        return ~(estimate >= self.refit_below) | ~th.isfinite(estimate)
+
+    def _refit(self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, broken: th.Tensor) -> None:
+        """Give the critics of the steps ``broken`` new weights and fit them, leaving the others alone."""
+        fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(trvs.device)
+        self._forget(broken)
+        self.optimizer = self._make_optimizer(self.critic)  # the old moments may not be finite, either
+        rows = None if alive is None else alive[broken]
+        self._ascend(
+            fresh, self._make_optimizer(fresh), states[broken], trvs[broken], rows, broken, self.refit_gradient_steps
+        )
+        with th.no_grad():
+            for parameter, fresh_parameter in zip(self.critic.parameters(), fresh.parameters(), strict=True):
+                parameter[broken] = fresh_parameter
+
+    def _forget(self, steps: th.Tensor) -> None:
+        """Drop what a subclass remembers of these steps beside the weights."""
+
+    def _make_optimizer(self, critic: BatchedMLP) -> th.optim.Optimizer:
+        return th.optim.Adam(critic.parameters(), lr=self.learning_rate, fused=True)
+
+    @th.no_grad()
+    def _update_scaling(self, batch: InformationBatch) -> None:
+        weight = th.ones_like(batch.states[..., :1]) if batch.alive is None else batch.alive[..., None].float()
+        total = weight.sum(1, keepdim=True).clamp(min=1)
+        self.state_mean = (batch.states * weight).sum(1, keepdim=True) / total
+        variance = (weight * (batch.states - self.state_mean) ** 2).sum(1, keepdim=True) / total
+        # A component that is constant at this step carries no information: leave it at 0 instead of dividing by 0.
+        self.state_std = th.where(variance > 1e-12, variance.sqrt(), th.ones_like(variance))
+
+    def _scale(self, states: th.Tensor, t: int | None = None) -> th.Tensor:
+        rows = slice(None) if t is None else slice(t, t + 1)
+        return (states - self.state_mean[rows]) / self.state_std[rows]
+
+    def min_episodes(self, n_episodes: int) -> int:
+        """Return twice the minibatch: below that no step of gradient ascent is made."""
+        return 2 * min(self.batch_size, n_episodes // 2)
+
+    def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
+        states, trvs = self._scale(batch.states, t), batch.trvs
+        n = trvs.shape[1]
+        # A random cyclic order makes a derangement: no state is paired with its own TRVs.
+        order = th.randperm(n, device=trvs.device)
+        other = th.empty_like(order)
+        other[order] = order.roll(1)
+        inputs = self._pair(states, trvs, trvs[:, other])
+        values = self.critic(inputs) if t is None else self.critic.at(inputs[0], t)[None]
+        return self._bound(self._split(values, n))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what is not a tensor of the module: Adam's moments and whether the warm-up is done."""
+        return {"optimizer": self.optimizer.state_dict(), "is_warm": self.is_warm}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.is_warm = state["is_warm"]

@@ -1,0 +1,40 @@
+"""The leave-one-out bound from the known density of the Gaussian encoder (Poole et al., 2019)."""
+
+from __future__ import annotations
+
+import math
+
+import torch as th
+
+from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+
+
+class LeaveOneOut(InformationEstimator):
+    r"""
+    The marginal q(x~_t) is replaced by the mixture of the *other* episodes' encoder densities:
+
+    .. math::
+        I[x_t; \tilde x_t] \le I[e_t; \tilde x_t] \le E\left[\frac1N \sum_i \log
+        \frac{q(\tilde x_i | e_i)}{\frac{1}{N-1} \sum_{j \ne i} q(\tilde x_i | e_j)}\right],
+        \qquad e_t = (\tilde x_{t-1}, y_t).
+
+    An upper bound in expectation. It makes no assumption about the shape of q(x~_t), and becomes loose above about ln N.
+    """
+
+    bound = "upper"
+
+    def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
+        trvs, means, stds = batch.trvs, batch.means, batch.stds
+        n = trvs.shape[1]
+        precision = stds.square().reciprocal()  # (T, N, Z)
+        # sum_z (x_iz - m_jz)^2 / s_jz^2 as products of matrices: (T, N, N) without a (T, N, N, Z) intermediate. Centred
+        # first, since the expansion of the square loses digits far from the origin.
+        centre = means.mean(dim=1, keepdim=True).detach()
+        x, m = trvs - centre, means - centre
+        quadratic = (
+            x.square() @ precision.mT - 2 * x @ (m * precision).mT + (m.square() * precision).sum(-1)[:, None, :]
+        )
+        log_density = -0.5 * quadratic - stds.log().sum(-1)[:, None, :]  # (T, i, j), up to a constant that cancels
+        own = log_density.diagonal(dim1=1, dim2=2)
+        others = log_density.masked_fill(th.eye(n, dtype=th.bool, device=trvs.device), -math.inf)
+        return (own - th.logsumexp(others, dim=2)).mean(dim=1) + math.log(n - 1)

@@ -1,0 +1,55 @@
+"""
+The loss of TDPG as pure functions, one per equation.
+
+Dimension key: T horizon, N episodes. ``alive`` is 1 while an episode lasts and 0 after its end.
+"""
+
+from __future__ import annotations
+
+import torch as th
+
+
+def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor) -> th.Tensor:
+    """
+    Surrogate whose gradient is that of the expected cost (eq:grad psi, eq:grad phi).
+
+    The paper multiplies every log-probability with the whole episode's cost. Any ``advantages[t]`` with the same
+    conditional expectation up to a function of what precedes the sample at t gives the same expected gradient: the cost
+    to come, less a baseline of the state.
+
+    :param log_prob: log-probabilities at the *stored* samples, ``(T, N)``
+    :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
+    :param alive: ``(T, N)``
+    :return: scalar
+    """
+    assert log_prob.shape == advantages.shape == alive.shape, (log_prob.shape, advantages.shape, alive.shape)
+    return (alive * advantages.detach() * log_prob).sum(dim=0).mean()
+
+
+def information_loss(information: th.Tensor) -> th.Tensor:
+    """
+    The penalty of eq:robust pomdp: the sum over time of I[x_t; x~_t], none below zero.
+
+    Mutual information is never negative, but the bound of a frozen critic is unbounded below. Without the clamp the
+    policy would descend there.
+
+    :param information: estimates in nats, ``(T,)``
+    :return: scalar
+    """
+    assert information.dim() == 1, information.shape
+    return information.clamp(min=0.0).sum()
+
+
+def cost_to_go(costs: th.Tensor, gamma: float = 1.0) -> th.Tensor:
+    """
+    Discounted sum of the costs from each step to the end.
+
+    :param costs: ``(T, N)``, zero after the end of an episode
+    :return: ``(T, N)``
+    """
+    result = th.empty_like(costs)
+    running = th.zeros_like(costs[0])
+    for t in range(costs.shape[0] - 1, -1, -1):
+        running = costs[t] + gamma * running
+        result[t] = running
+    return result

@@ -1,0 +1,114 @@
+"""
+Networks with one set of weights per time step, evaluated for all steps at once.
+
+Dimension key: T horizon, N episodes, I inputs, O outputs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch as th
+from torch import nn
+
+
+class BatchedLinear(nn.Module):
+    """
+    M affine maps with weights of their own, applied to M batches in one call.
+
+    The initialisation is that of :class:`torch.nn.Linear`, for each map.
+
+    :param n_maps: Number of maps M: the horizon for weights that vary in time, 1 for weights shared by all steps.
+    :param in_features: I
+    :param out_features: O
+    """
+
+    def __init__(self, n_maps: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        bound = 1.0 / math.sqrt(in_features)
+        self.weight = nn.Parameter(th.empty(n_maps, in_features, out_features).uniform_(-bound, bound))
+        self.bias = nn.Parameter(th.empty(n_maps, 1, out_features).uniform_(-bound, bound))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """``(M, N, I) -> (M, N, O)``."""
+        return th.baddbmm(self.bias, x, self.weight)
+
+    def at(self, x: th.Tensor, index: int) -> th.Tensor:
+        """Apply the map of one index: ``(N, I) -> (N, O)``."""
+        return th.addmm(self.bias[index], x, self.weight[index])
+
+
+class BatchedMLP(nn.Module):
+    """
+    M multi-layer perceptrons of the same shape as one network.
+
+    :param n_maps: Number of networks M.
+    :param sizes: Width of every layer, from the input to the output.
+    :param activation_fn: Nonlinearity after each layer but the last.
+    :param activate_output: Whether it follows the last layer, too.
+    """
+
+    def __init__(
+        self,
+        n_maps: int,
+        sizes: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ELU,
+        activate_output: bool = False,
+    ) -> None:
+        super().__init__()
+        self.n_maps = n_maps
+        self.layers = nn.ModuleList(BatchedLinear(n_maps, i, o) for i, o in zip(sizes[:-1], sizes[1:], strict=True))
+        self.activation = activation_fn()
+        self.activate_output = activate_output
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """``(M, N, I) -> (M, N, O)``."""
+        for layer in self.layers[:-1]:
+            x = self.activation(layer(x))
+        x = self.layers[-1](x)
+        return self.activation(x) if self.activate_output else x
+
+    def at(self, x: th.Tensor, index: int) -> th.Tensor:
+        """Evaluate the network of one index: ``(N, I) -> (N, O)``."""
+        last = len(self.layers) - 1
+        for i, layer in enumerate(self.layers):
+            x = layer.at(x, index)
+            if i < last or self.activate_output:
+                x = self.activation(x)
+        return x
+
+
+class TimeMLP(nn.Module):
+    """
+    An MLP whose weights vary with the time step, or are shared by all steps.
+
+    :param horizon: Number of time steps T.
+    :param sizes: Width of every layer, from the input to the output.
+    :param activation_fn: Nonlinearity after each layer but the last.
+    :param time_varying: One set of weights per step, or one for all.
+    :param activate_output: Whether the nonlinearity follows the last layer, too.
+    """
+
+    def __init__(
+        self,
+        horizon: int,
+        sizes: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ELU,
+        *,
+        time_varying: bool = True,
+        activate_output: bool = False,
+    ) -> None:
+        super().__init__()
+        self.time_varying = time_varying
+        self.mlp = BatchedMLP(horizon if time_varying else 1, sizes, activation_fn, activate_output)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """All steps of all episodes: ``(T, N, I) -> (T, N, O)``."""
+        if self.time_varying:
+            return self.mlp(x)
+        return self.mlp(x.flatten(0, 1)[None])[0].unflatten(0, x.shape[:2])
+
+    def at(self, x: th.Tensor, t: int) -> th.Tensor:
+        """One step, the same for all episodes: ``(N, I) -> (N, O)``."""
+        return self.mlp.at(x, t if self.time_varying else 0)

@@ -1,0 +1,335 @@
+"""
+The recurrent stochastic policy with task-relevant variables (TRVs) between the observation and the action.
+
+Dimension key: T horizon, N episodes or environments, Z TRVs, U action, F features of an observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution, make_proba_distribution
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_tdpg.buffers import EpisodeBatch
+from sb3_tdpg.features import TRVCnn
+from sb3_tdpg.networks import TimeMLP
+
+# Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
+MAX_TIME_VARYING_HORIZON = 50
+
+
+class PolicyStep(NamedTuple):
+    """One control of N episodes."""
+
+    actions: th.Tensor  # (N, U), not clipped
+    trvs: th.Tensor  # (N, Z)
+    means: th.Tensor  # (N, Z)
+    stds: th.Tensor  # (N, Z)
+    noise: th.Tensor  # (N, Z)
+
+
+class RebuiltTRVs(NamedTuple):
+    """The TRVs of whole episodes, rebuilt from the stored noise so that gradients flow through the recurrence."""
+
+    trvs: th.Tensor  # (T, N, Z)
+    means: th.Tensor  # (T, N, Z)
+    stds: th.Tensor  # (T, N, Z)
+
+
+class TRVPolicy(BasePolicy):
+    r"""
+    Encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head :math:`\pi^\psi(u_t | \tilde x_t)`.
+
+    Both are diagonal Gaussians (the head of a discrete action space is SB3's distribution for it). The action head sees
+    the TRVs and nothing else. At the first step of an episode the previous TRVs are zero.
+
+    The memory that ``predict`` takes and returns as ``state`` is ``(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the
+    index of the next time step, ``(n_envs,)``.
+
+    :param observation_space: A vector, or an image with channels first.
+    :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
+    :param lr_schedule: Learning rate schedule.
+    :param horizon: T. The algorithm passes the environment's.
+    :param trv_dim: Number of TRVs Z; default 2 for vectors and 8 for images, as in the paper.
+    :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default ``[64, 64]`` each for vectors,
+        ``[32]`` and none for images.
+    :param activation_fn: Nonlinearity of the hidden layers.
+    :param time_varying: One set of weights for each time step, or one for all; default: time-varying up to a horizon of
+        50. A convolutional feature extractor is always shared.
+    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it.
+    :param action_log_var_init: The same for the action head (Box actions).
+    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``.
+    :param action_var_floor: Smallest variance of an action, likewise.
+    :param features_extractor_class: What stands in front of the encoder; default: nothing (flatten) for vectors, the
+        paper's two convolutional layers for images.
+    :param features_extractor_kwargs: Its keywords.
+    :param normalize_images: Whether to divide uint8 images by 255.
+    :param optimizer_class: Optimiser of the policy.
+    :param optimizer_kwargs: Its keywords beside the learning rate.
+    :param use_sde: Must be False.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        use_sde: bool = False,
+        *,
+        horizon: int,
+        trv_dim: int | None = None,
+        net_arch: dict[str, Sequence[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ELU,
+        time_varying: bool | None = None,
+        encoder_log_var_init: float = 0.0,
+        action_log_var_init: float = 0.0,
+        encoder_var_floor: float = 1e-3,
+        action_var_floor: float = 1e-5,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        is_image = is_image_space(observation_space, check_channels=False, normalized_image=not normalize_images)
+        if features_extractor_class is None:
+            features_extractor_class = TRVCnn if is_image else FlattenExtractor
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=False,
+        )
+        self.horizon = horizon
+        self.trv_dim = (8 if is_image else 2) if trv_dim is None else trv_dim
+        self.time_varying = horizon <= MAX_TIME_VARYING_HORIZON if time_varying is None else time_varying
+        self.activation_fn = activation_fn
+        self.encoder_log_var_init = encoder_log_var_init
+        self.action_log_var_init = action_log_var_init
+        self.encoder_var_floor = encoder_var_floor
+        self.action_var_floor = action_var_floor
+        default_arch = dict(encoder=[32], action_head=[]) if is_image else dict(encoder=[64, 64], action_head=[64, 64])
+        self.net_arch = _check_net_arch(net_arch, default_arch)
+        if self.trv_dim < 1:
+            raise ValueError(f"policy_kwargs: trv_dim={trv_dim} must be at least 1")
+        for name, floor in (("encoder_var_floor", encoder_var_floor), ("action_var_floor", action_var_floor)):
+            if not floor >= 0:
+                raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
+
+        self.features_extractor = self.make_features_extractor()
+        self.features_dim = self.features_extractor.features_dim
+        self.action_dist = make_proba_distribution(action_space)
+        self.encoder = TimeMLP(
+            horizon,
+            [self.trv_dim + self.features_dim, *self.net_arch["encoder"], 2 * self.trv_dim],
+            activation_fn,
+            time_varying=self.time_varying,
+        )
+        self.action_head = TimeMLP(
+            horizon,
+            [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()],
+            activation_fn,
+            time_varying=self.time_varying,
+        )
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+    def _n_action_parameters(self) -> int:
+        """Return how many numbers define the distribution of an action."""
+        space = self.action_space
+        if isinstance(space, spaces.Box):
+            return 2 * int(np.prod(space.shape))  # mean and log-variance
+        if isinstance(space, spaces.Discrete):
+            return int(space.n)
+        if isinstance(space, spaces.MultiDiscrete):
+            return int(space.nvec.sum())
+        assert isinstance(space, spaces.MultiBinary)
+        return int(space.n)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            horizon=self.horizon,
+            trv_dim=self.trv_dim,
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            time_varying=self.time_varying,
+            encoder_log_var_init=self.encoder_log_var_init,
+            action_log_var_init=self.action_log_var_init,
+            encoder_var_floor=self.encoder_var_floor,
+            action_var_floor=self.action_var_floor,
+            lr_schedule=self._dummy_schedule,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+        )
+        return data
+
+    # -- the two conditional distributions --------------------------------------------------------------------
+
+    def _encoder_density(self, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and standard deviation of q from the encoder's outputs: ``(..., 2 Z) -> 2 x (..., Z)``."""
+        mean, log_var = parameters.chunk(2, dim=-1)
+        return mean, th.sqrt(th.exp(log_var + self.encoder_log_var_init) + self.encoder_var_floor)
+
+    def _action_distribution(self, parameters: th.Tensor) -> Distribution:
+        """Distribution of the action from the head's outputs, ``(n, ...)``: one dimension of samples only."""
+        if isinstance(self.action_dist, DiagGaussianDistribution):
+            mean, log_var = parameters.chunk(2, dim=-1)
+            variance = th.exp(log_var + self.action_log_var_init) + self.action_var_floor
+            return self.action_dist.proba_distribution(mean, 0.5 * th.log(variance))
+        return self.action_dist.proba_distribution(parameters)
+
+    # -- one step, for rollouts and predict -------------------------------------------------------------------
+
+    def step(self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False) -> PolicyStep:
+        """
+        Choose the actions of one step.
+
+        :param observation: y_t, ``(N, *obs)``
+        :param prev_trv: x~_{t-1}, ``(N, Z)``; zero at the start of an episode
+        :param t: time step of each episode, ``(N,)``
+        :param deterministic: Means instead of samples, of the TRVs and of the action.
+        """
+        inputs = th.cat([prev_trv, self.extract_features(observation, self.features_extractor)], dim=1)
+        mean, std = self._encoder_density(self._at_times(self.encoder, inputs, t))
+        noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
+        trv = mean + std * noise
+        distribution = self._action_distribution(self._at_times(self.action_head, trv, t))
+        return PolicyStep(distribution.get_actions(deterministic), trv, mean, std, noise)
+
+    @staticmethod
+    def _at_times(network: TimeMLP, inputs: th.Tensor, t: np.ndarray) -> th.Tensor:
+        """Evaluate a network where every row may be at another time step: ``(N, I) -> (N, O)``."""
+        if not network.time_varying or (t == t[0]).all():
+            return network.at(inputs, int(t[0]))
+        rows = [np.flatnonzero(t == step) for step in np.unique(t)]
+        outputs = [network.at(inputs[r], int(t[r[0]])) for r in rows]
+        return th.cat(outputs)[np.argsort(np.concatenate(rows))]
+
+    # -- whole episodes, for training -------------------------------------------------------------------------
+
+    def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
+        """Features of every observation: ``(T, N, F)``."""
+        features = self.extract_features(batch.observations.flatten(0, 1), self.features_extractor)
+        return features.unflatten(0, batch.observations.shape[:2])
+
+    def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
+        """
+        log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (eq:grad phi).
+
+        The stored TRVs are constants here: ``Normal.log_prob(rsample())`` without a detach has no gradient in the mean.
+
+        :return: ``(T, N)``
+        """
+        mean, std = self._encoder_density(self.encoder(th.cat([batch.prev_trvs, features], dim=-1)))
+        return th.distributions.Normal(mean, std, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
+
+    def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
+        """
+        log pi(u_t | x~_t) at the stored actions (eq:grad psi).
+
+        :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
+        :return: ``(T, N)``
+        """
+        parameters = self.action_head(trvs).flatten(0, 1)  # (T * N, .)
+        actions = batch.actions.flatten(0, 1)
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = actions[:, 0]
+        return self._action_distribution(parameters).log_prob(actions).unflatten(0, trvs.shape[:2])
+
+    def rebuild_trvs(self, features: th.Tensor, noise: th.Tensor) -> RebuiltTRVs:
+        """
+        Unroll eq:lg, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
+
+        :param features: ``(T, N, F)``
+        :param noise: eps_t, ``(T, N, Z)``
+        """
+        trv = th.zeros_like(noise[0])
+        trvs, means, stds = [], [], []
+        for t in range(self.horizon):
+            mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features[t]], dim=-1), t))
+            trv = mean + std * noise[t]
+            trvs.append(trv)
+            means.append(mean)
+            stds.append(std)
+        return RebuiltTRVs(th.stack(trvs), th.stack(means), th.stack(stds))
+
+    # -- the interface of SB3 ---------------------------------------------------------------------------------
+
+    def forward(self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False) -> PolicyStep:
+        """See :meth:`step`."""
+        return self.step(observation, prev_trv, t, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        raise NotImplementedError("the policy is recurrent: use predict() with its state")
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Choose actions, one step at a time.
+
+        :param observation: one observation, or one for each environment
+        :param state: what the last call returned; ``None`` at the start
+        :param episode_start: ``(n_envs,)`` bool: where an episode begins, the memory is cleared
+        :param deterministic: Use the means. This removes the channel noise that the information bottleneck acts
+            through; the paper's tables use ``False``.
+        :return: the actions, clipped to their bounds, and the memory for the next call
+        :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
+        """
+        self.set_training_mode(False)
+        observation_tensor, is_vectorized = self.obs_to_tensor(observation)
+        assert isinstance(observation_tensor, th.Tensor)
+        n_envs = observation_tensor.shape[0]
+        if state is None:
+            prev_trv, t = np.zeros((n_envs, self.trv_dim), np.float32), np.zeros(n_envs, np.int64)
+        else:
+            prev_trv, t = state
+            if prev_trv.shape != (n_envs, self.trv_dim):
+                raise ValueError(
+                    f"state[0] has shape {prev_trv.shape}, expected {(n_envs, self.trv_dim)}: "
+                    "pass the state that the last predict() returned, for the same number of environments"
+                )
+        if episode_start is not None:
+            start = np.asarray(episode_start, dtype=bool).reshape(-1)
+            prev_trv = np.where(start[:, None], np.float32(0), prev_trv)
+            t = np.where(start, 0, t)
+        if (t >= self.horizon).any():
+            raise ValueError(
+                f"predict() was called for step {int(t.max()) + 1} of an episode, but the policy's horizon is "
+                f"{self.horizon}: pass episode_start=True at the first step of an episode (or state=None)"
+            )
+        with th.no_grad():
+            step = self.step(observation_tensor, th.as_tensor(prev_trv, device=self.device), t, deterministic)
+        actions = step.actions.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        return (actions if is_vectorized else actions[0]), (step.trvs.cpu().numpy(), t + 1)
+
+
+def _check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:
+    given = {} if given is None else given
+    if not isinstance(given, dict) or not set(given) <= set(default):
+        raise ValueError(
+            f"policy_kwargs: net_arch={given!r} must be a dict with the keys {sorted(default)}, "
+            f"for instance {default}"
+        )
+    return {key: list(given.get(key, sizes)) for key, sizes in default.items()}

@@ -1,0 +1,93 @@
+"""
+What TDPG must know of an environment beside its spaces: the horizon, and the true state in training.
+
+Dimension key: E environments, X state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+BRING_THE_STATE = (
+    'give the environment an attribute `state_space` (a Box) and put a copy of the true state into info["state"] in both '
+    "reset() and step()"
+)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    A finite-horizon problem as the algorithm sees it.
+
+    :param horizon: Controls in an episode, T.
+    :param state_dim: X
+    :param state_is_observation: The environment tells no state, and the observation stands in for it.
+    """
+
+    horizon: int
+    state_dim: int
+    state_is_observation: bool
+
+    def initial_states(self, env: VecEnv, obs: np.ndarray) -> np.ndarray:
+        """x_0 after a reset or an auto-reset of all environments: ``(E, X)``."""
+        # The wrappers' own reset_infos stay empty.
+        return self._states(env.unwrapped.reset_infos, obs)
+
+    def next_states(self, env: VecEnv, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
+        """x_{t+1} after a step, or x_0 of the next episode where one has ended: ``(E, X)``."""
+        if dones.any():
+            reset_infos = env.unwrapped.reset_infos
+            infos = [reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
+        return self._states(infos, obs)
+
+    def _states(self, infos: list[dict[str, Any]], obs: np.ndarray) -> np.ndarray:
+        if self.state_is_observation:
+            return obs.reshape(len(obs), -1).astype(np.float32)
+        try:
+            states = np.stack([info["state"] for info in infos])
+        except KeyError as e:
+            raise ValueError(f'the environment has a `state_space` but no info["state"]: {BRING_THE_STATE}') from e
+        if states.shape[1:] != (self.state_dim,):
+            raise ValueError(f'info["state"] has shape {states.shape[1:]}, but `state_space` says {(self.state_dim,)}')
+        return states
+
+
+def read_problem(env: VecEnv) -> Problem:
+    """
+    Learn the horizon and the state of an environment, without a step.
+
+    :raises ValueError: if it has no finite horizon, an unsuitable observation space, or no state where it needs one.
+    """
+    if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
+        raise ValueError(
+            f"the observation space {env.observation_space} is not supported: use gymnasium.wrappers.FlattenObservation"
+        )
+    horizon = _attribute(env, "horizon")
+    if horizon is None:
+        spec = _attribute(env, "spec")
+        horizon = None if spec is None else spec.max_episode_steps
+    if not isinstance(horizon, (int, np.integer)) or horizon < 1:
+        raise ValueError(
+            f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer attribute "
+            "`horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
+        )
+    state_space = _attribute(env, "state_space")
+    if state_space is not None:
+        return Problem(int(horizon), int(np.prod(state_space.shape)), state_is_observation=False)
+    observation_shape = env.observation_space.shape
+    if observation_shape is None or len(observation_shape) > 1:
+        raise ValueError(
+            f"the mutual information is that of the true state, and an observation of shape {observation_shape} cannot stand "
+            f"in for it: {BRING_THE_STATE}"
+        )
+    return Problem(int(horizon), max(1, int(np.prod(observation_shape))), state_is_observation=True)
+
+
+def _attribute(env: VecEnv, name: str) -> Any:
+    """Return an attribute of the first environment, or None."""
+    return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None

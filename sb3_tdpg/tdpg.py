@@ -1,0 +1,536 @@
+"""
+Task-Driven Policy Gradient (alg:trv-policy) as a Stable-Baselines3 algorithm.
+
+Dimension key: T horizon, N episodes of an epoch, X state, Z task-relevant variables (TRVs), U action.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import random
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_tdpg.baselines import get_baseline
+from sb3_tdpg.buffers import EpisodeBuffer
+from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
+from sb3_tdpg.information import InformationEstimator, get_estimator_class
+from sb3_tdpg.losses import information_loss, policy_gradient_loss
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.problem import Problem, read_problem
+from sb3_tdpg.vec_env import make_episodes_env
+
+SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
+
+ENCODER_GRADIENTS = ("score", "pathwise")
+
+
+class TrainingDivergedError(ValueError):
+    """A loss is NaN or infinite. The model keeps the last good parameters."""
+
+
+class TDPG(OnPolicyAlgorithm):
+    r"""
+    Task-Driven Policy Gradient (Pacelli and Majumdar, 2020).
+
+    Minimises the expected cost of an episode plus the information that the task-relevant variables carry about the
+    state (eq:robust pomdp, divided by beta):
+
+    .. math:: E[c(\tau)] + \frac1\beta \sum_t I[x_t; \tilde x_t]
+
+    One policy epoch rolls out ``n_episodes`` episodes, fits the mutual-information critics to them
+    (:class:`~sb3_tdpg.callbacks.MINECallback`), and makes one update of the policy. ``beta=inf`` is plain policy gradient
+    with the same policy.
+
+    The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). The true
+    state comes from ``info["state"]`` of ``reset`` and ``step`` together with an attribute ``state_space``; an
+    environment without it is taken as fully observed if its observation is a vector.
+
+    :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.policies.TRVPolicy`.
+    :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
+    :param beta: Weight of the cost against the information, a positive number or a function of the remaining progress
+        (1 to 0). ``inf``: no penalty.
+    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress. The critics have
+        their own (``mi_kwargs``).
+    :param n_episodes: Episodes N of a policy epoch.
+    :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this plugin,
+        otherwise the largest divisor of N up to 50.
+    :param mi_estimator: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, ``"logdet"``, ``"loo"`` or a subclass of
+        :class:`~sb3_tdpg.information.InformationEstimator`.
+    :param mi_kwargs: Keywords of the estimator.
+    :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step; ``"mean"``: cost
+        of the whole episode minus the mean over the batch, as in the paper.
+    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (eq:grad phi), as in the paper;
+        ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the second
+        varies less.
+    :param gamma: Discount factor; the paper has none.
+    :param max_grad_norm: Clip the norm of the policy's gradient to this; ``None``: no clipping.
+    :param stats_window_size: Episodes that ``rollout/ep_rew_mean`` averages over.
+    :param tensorboard_log: Folder of the TensorBoard log.
+    :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.policies.TRVPolicy`.
+    :param verbose: 0: nothing; 1: what the environment is wrapped in, and a table each epoch; 2: debug messages.
+    :param seed: Seed of all random number generators.
+    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    :param _init_setup_model: Whether to build the networks at once.
+    :raises ValueError: if an argument is out of its range or does not fit the environment; the message says how to mend
+        it. Nothing has been trained by then.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TRVPolicy": TRVPolicy}
+    policy: TRVPolicy
+    rollout_buffer: EpisodeBuffer
+    estimator: InformationEstimator
+
+    def __init__(
+        self,
+        policy: str | type[TRVPolicy] = "TRVPolicy",
+        env: GymEnv | str | None = None,
+        *,
+        beta: float | Schedule = 1 / 75,
+        learning_rate: float | Schedule = 1.6e-3,
+        n_episodes: int = 500,
+        n_envs: int | None = None,
+        mi_estimator: str | type[InformationEstimator] = "mine",
+        mi_kwargs: dict[str, Any] | None = None,
+        baseline: str = "value",
+        encoder_gradient: str = "score",
+        gamma: float = 1.0,
+        max_grad_norm: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        _check_arguments(policy, beta, n_episodes, n_envs, encoder_gradient, gamma, max_grad_norm)
+        get_estimator_class(mi_estimator)
+        get_baseline(baseline)
+        if isinstance(env, str):
+            env = make_episodes_env(env, n_envs, n_episodes=n_episodes)
+        elif n_envs is not None and getattr(env, "num_envs", 1) != n_envs:
+            raise ValueError(
+                f"n_envs={n_envs} is for an environment given by its id; "
+                f"the environment given has {getattr(env, 'num_envs', 1)} of its own: leave n_envs out"
+            )
+        super().__init__(
+            policy=policy,  # type: ignore[arg-type]
+            env=env,  # type: ignore[arg-type]
+            learning_rate=learning_rate,
+            n_steps=0,  # known once the horizon is
+            gamma=gamma,
+            # What follows belongs to value-based on-policy algorithms and is not used.
+            gae_lambda=1.0,
+            ent_coef=0.0,
+            vf_coef=0.0,
+            max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
+            _init_setup_model=False,
+        )
+        self.beta = beta
+        self.n_episodes = n_episodes
+        self.mi_estimator = mi_estimator
+        self.mi_kwargs = {} if mi_kwargs is None else mi_kwargs
+        self.baseline = baseline
+        self.encoder_gradient = encoder_gradient
+        # Plain numbers, so that a model loaded without an environment can rebuild its networks.
+        self.horizon = 0
+        self.state_dim = 0
+        self.epoch = 0
+        """Policy epochs completed."""
+        self.information: np.ndarray | None = None
+        """I[x_t; x~_t] of the last rollouts in nats, ``(T,)``; None without a penalty."""
+        self._random_state: dict[str, Any] | None = None
+        self._problem: Problem | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    # -- construction -----------------------------------------------------------------------------------------
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.beta_schedule = FloatSchedule(self.beta)
+        self.set_random_seed(self.seed)
+        if self.env is not None:
+            self._set_problem(self.env)
+        self.policy = cast(
+            TRVPolicy,
+            self.policy_class(
+                self.observation_space, self.action_space, self.lr_schedule, horizon=self.horizon, **self.policy_kwargs
+            ),
+        ).to(self.device)
+        # Built at beta = inf, too: a policy-gradient model must be able to warm-start TDPG.
+        estimator_class = get_estimator_class(self.mi_estimator)
+        try:
+            self.estimator = estimator_class(self.horizon, self.state_dim, self.policy.trv_dim, **self.mi_kwargs)
+        except TypeError as e:
+            raise ValueError(f"mi_kwargs={self.mi_kwargs} do not fit {estimator_class.__name__}: {e}") from e
+        self.estimator.to(self.device)
+        self.rollout_buffer = EpisodeBuffer(
+            self.horizon,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            gamma=self.gamma,
+            n_envs=self.n_episodes,
+            state_dim=self.state_dim,
+            trv_dim=self.policy.trv_dim,
+        )
+
+    def _set_problem(self, env: VecEnv) -> None:
+        """Learn horizon and state from the environment, or say why it cannot be used."""
+        normalize = unwrap_vec_normalize(env)
+        if normalize is not None and normalize.norm_reward:
+            raise ValueError(
+                "VecNormalize(norm_reward=True) rescales the cost and with it, silently, beta: use norm_reward=False"
+            )
+        if self.n_episodes % env.num_envs != 0:
+            raise ValueError(
+                f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), so that "
+                f"each runs as many episodes: use {_nearest_multiples(self.n_episodes, env.num_envs)}"
+            )
+        problem = read_problem(env)
+        if self.horizon not in (0, problem.horizon) or self.state_dim not in (0, problem.state_dim):
+            raise ValueError(
+                f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, but the model was "
+                f"made for horizon={self.horizon} and {self.state_dim}: use an environment of the same shape"
+            )
+        self._problem = problem
+        self.horizon, self.state_dim = problem.horizon, problem.state_dim
+        self.n_steps = self.horizon * (self.n_episodes // env.num_envs)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        self._set_problem(self.env)
+
+    @property
+    def mi_coef(self) -> float:
+        """1 / beta at the present progress: the weight of the information, in units of cost per nat."""
+        return 1.0 / _check_beta(self.beta_schedule(self._current_progress_remaining))
+
+    # -- one policy epoch -------------------------------------------------------------------------------------
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: EpisodeBuffer, n_rollout_steps: int  # type: ignore[override]
+    ) -> bool:
+        """
+        Roll out N whole episodes with the current policy (line 2 of alg:trv-policy).
+
+        Each of E environments runs N / E episodes one after the other. A quota per environment, not the first N that
+        finish: those would be the short ones. All environments begin an epoch at t = 0.
+
+        :param env: The training environments.
+        :param callback: Called at each step, and at the beginning and the end.
+        :param rollout_buffer: Where the episodes go.
+        :param n_rollout_steps: Unused: an epoch is a number of episodes.
+        :return: False if a callback asked to stop.
+        """
+        assert self._problem is not None, "the model has no environment: set_env() first"
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+        if self._last_obs is None:
+            self._last_obs = env.reset()  # type: ignore[assignment]
+            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+
+        n_envs = env.num_envs
+        obs = cast(np.ndarray, self._last_obs)
+        states = self._problem.initial_states(env, obs)  # (E, X)
+        trvs = th.zeros(n_envs, self.policy.trv_dim, device=self.device)
+        t = np.zeros(n_envs, np.int64)
+        column = np.arange(n_envs)  # where each environment's present episode goes
+        # A partial epoch cannot be continued: whatever ends this method early leaves the environments to be reset.
+        self._last_obs = None
+
+        while (running := np.flatnonzero(column < self.n_episodes)).size > 0:
+            with th.no_grad():
+                step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(t, self.horizon - 1))
+            actions = step.actions.cpu().numpy()
+            env_actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+            if isinstance(self.action_space, spaces.Box):
+                env_actions = np.clip(env_actions, self.action_space.low, self.action_space.high)
+            new_obs, rewards, dones, infos = env.step(env_actions)
+
+            self.num_timesteps += n_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+
+            stored = {
+                "observations": obs.reshape(n_envs, *rollout_buffer.obs_shape),
+                "states": states,
+                "noise": step.noise.cpu().numpy(),
+                "trvs": step.trvs.cpu().numpy(),
+                "means": step.means.cpu().numpy(),
+                "stds": step.stds.cpu().numpy(),
+                "actions": actions.reshape(n_envs, -1),
+                "costs": -rewards,
+            }
+            rollout_buffer.add_step(t[running], column[running], **{k: v[running] for k, v in stored.items()})
+
+            states = self._problem.next_states(env, new_obs, dones, infos)
+            trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
+            t = np.where(dones, 0, t + 1)
+            column = np.where(dones, column + n_envs, column)
+            if (t[column < self.n_episodes] >= self.horizon).any():
+                raise ValueError(
+                    f"an episode did not end after horizon={self.horizon} steps: the environment must return terminated "
+                    "or truncated there (or declare its true horizon)"
+                )
+            obs = cast(np.ndarray, new_obs)
+
+        rollout_buffer.full = True
+        if (t == 0).all():
+            self._last_obs = obs
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Write the log; the epoch's cost comes from all of its episodes."""
+        self.logger.record("rollout/ep_cost_mean", float(self.rollout_buffer.episode_costs.mean()))
+        super().dump_logs(iteration)
+
+    def train(self) -> None:
+        """Update encoder and action head once (line 6 of alg:trv-policy)."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        mi_coef = self.mi_coef
+        batch = self.rollout_buffer.episode_batch()
+        advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma)
+
+        features = self.policy.episode_features(batch)
+        rebuilt = None
+        if mi_coef > 0.0 or self.encoder_gradient == "pathwise":
+            rebuilt = self.policy.rebuild_trvs(features, batch.noise)
+        if self.encoder_gradient == "pathwise":
+            assert rebuilt is not None
+            log_prob = self.policy.action_log_prob(rebuilt.trvs, batch)
+        else:
+            log_prob = self.policy.trv_log_prob(features, batch) + self.policy.action_log_prob(batch.trvs, batch)
+        policy_loss = policy_gradient_loss(log_prob, advantages, batch.alive)
+        loss = policy_loss
+        if mi_coef > 0.0:
+            information = self.estimator(batch.information_batch()._replace(**rebuilt._asdict()))  # type: ignore[union-attr]
+            penalty = mi_coef * information_loss(information)
+            loss = loss + penalty
+            self.logger.record("train/mi_loss", penalty.item())
+
+        self._step_optimizer(loss, {"costs": batch.costs, "policy loss": policy_loss, "loss": loss})
+        self.epoch += 1
+        self._n_updates += 1
+        mean_cost = batch.costs.sum(0).mean().item()
+        total = 0.0 if self.information is None else float(self.information.sum())
+        self.logger.record("train/objective", mean_cost + mi_coef * total)
+        self.logger.record("train/policy_loss", policy_loss.item())
+        self.logger.record("train/loss", loss.item())
+        self.logger.record("train/mi_coef", mi_coef)
+        self.logger.record("train/trv_std", batch.stds.mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _step_optimizer(self, loss: th.Tensor, checked: dict[str, th.Tensor]) -> None:
+        """Make one step, unless something is not finite: then the parameters stay as they are."""
+        for name, value in checked.items():
+            if not bool(th.isfinite(value).all()):
+                raise self._diverged(name)
+        self.policy.optimizer.zero_grad()
+        loss.backward()
+        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        if not bool(th.isfinite(grad_norm)):
+            raise self._diverged("gradient")
+        self.logger.record("train/grad_norm", grad_norm.item())
+        self.policy.optimizer.step()
+
+    def _diverged(self, name: str) -> TrainingDivergedError:
+        self._last_obs = None
+        return TrainingDivergedError(
+            f"the {name} of epoch {self.epoch} is NaN or infinite (after {self.num_timesteps} timesteps). The model keeps the "
+            "parameters from before this update. Check the environment's costs and observations; a smaller learning_rate, "
+            "max_grad_norm=1, or a larger encoder_var_floor in policy_kwargs help against exploding log-probabilities"
+        )
+
+    # -- learn, save, resume ----------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfTDPG,
+        total_timesteps: int = 1_000_000,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "TDPG",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfTDPG:
+        """
+        Train; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
+
+        Interrupted by Ctrl-C, the model keeps the parameters of the last whole epoch and can be used, saved or trained on.
+
+        :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        callbacks: list[BaseCallback] = [MINECallback()]
+        if isinstance(callback, list):
+            callbacks += callback
+        elif isinstance(callback, BaseCallback):
+            callbacks.append(callback)
+        else:
+            callbacks.append(ConvertCallback(cast("Callable[[dict[str, Any], dict[str, Any]], bool]", callback)))
+        if progress_bar:
+            callbacks.append(TDPGProgressBar())
+        return super()._init_callback(CallbackList(callbacks))
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps:
+            self.epoch = 0
+            self._current_progress_remaining = 1.0
+        elif self._random_state is not None:
+            self._restore_random_state(self._random_state)
+            self._last_obs = None
+        self._random_state = None
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """Timesteps that the last call of ``learn`` was asked for and did not reach."""
+        return max(0, self._total_timesteps - self.num_timesteps)
+
+    def save_checkpoint(self, path: str | os.PathLike[str]) -> None:
+        """
+        Save the model with all random number generators, between two epochs.
+
+        The environments are reset, here and after loading, so that their generators are all there is to know of them. See
+        :class:`~sb3_tdpg.callbacks.TrainingCheckpointCallback`.
+        """
+        assert self.env is not None
+        self._last_obs = None
+        self._random_state = {
+            "python": random.getstate(),
+            "numpy": np.random.get_state(),
+            "torch": th.get_rng_state(),
+            "cuda": th.cuda.get_rng_state_all() if self.device.type == "cuda" else [],
+            "env": self.env.get_attr("np_random"),
+        }
+        try:
+            self.save(Path(path))
+        finally:
+            self._random_state = None
+
+    def _restore_random_state(self, state: dict[str, Any]) -> None:
+        random.setstate(state["python"])
+        np.random.set_state(state["numpy"])
+        th.set_rng_state(state["torch"])
+        if self.device.type == "cuda" and state["cuda"]:
+            th.cuda.set_rng_state_all(state["cuda"])
+        assert self.env is not None
+        if len(state["env"]) != self.env.num_envs:
+            raise ValueError(
+                f"the checkpoint was made with {len(state['env'])} environments, the model now has {self.env.num_envs}: "
+                "resume with as many"
+            )
+        for i, generator in enumerate(state["env"]):
+            self.env.set_attr("np_random", generator, indices=i)
+
+    def save(
+        self,
+        path: str | os.PathLike[str] | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save to a zip file, replaced atomically; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.save`."""
+        if isinstance(path, io.IOBase):
+            super().save(cast(io.BufferedIOBase, path), exclude, include)
+            return
+        target = Path(cast("str | os.PathLike[str]", path))
+        if target.suffix == "":
+            target = target.with_suffix(".zip")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial = target.with_name(target.name + ".partial")
+        with partial.open("wb") as file:
+            super().save(file, exclude, include)
+        os.replace(partial, target)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_problem"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        # The estimator's state dict holds its optimiser, too.
+        return ["policy", "policy.optimizer", "estimator"], []
+
+
+def _check_arguments(
+    policy: str | type[TRVPolicy],
+    beta: float | Schedule,
+    n_episodes: int,
+    n_envs: int | None,
+    encoder_gradient: str,
+    gamma: float,
+    max_grad_norm: float | None,
+) -> None:
+    if isinstance(policy, str) and policy not in TDPG.policy_aliases:
+        raise ValueError(f"policy={policy!r} is unknown: use one of {sorted(TDPG.policy_aliases)}")
+    if not isinstance(policy, str) and not issubclass(policy, TRVPolicy):
+        raise ValueError(
+            f"the policy {policy.__name__} is no TRVPolicy; if it comes from a file, that was saved by another algorithm: "
+            "load it with the class that saved it"
+        )
+    for progress in (1.0, 0.0):
+        _check_beta(beta(progress) if callable(beta) else beta)
+    for name, value in (("n_episodes", n_episodes), ("n_envs", n_envs)):
+        if value is not None and not (isinstance(value, (int, np.integer)) and value >= 1):
+            raise ValueError(f"{name}={value!r} must be an integer of at least 1")
+    if n_episodes < 2:
+        raise ValueError(f"n_episodes={n_episodes} must be at least 2: baseline and information are taken over a batch")
+    if encoder_gradient not in ENCODER_GRADIENTS:
+        raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
+    if not 0.0 < gamma <= 1.0:
+        raise ValueError(f"gamma={gamma} must be in (0, 1]; the paper's problems have gamma=1")
+    if max_grad_norm is not None and not max_grad_norm > 0:
+        raise ValueError(f"max_grad_norm={max_grad_norm} must be positive, or None for no clipping")
+
+
+def _check_beta(beta: float) -> float:
+    if not (isinstance(beta, (int, float, np.number)) and beta > 0):  # NaN compares false
+        raise ValueError(
+            f"beta={beta!r} must be a positive number (or a function of the remaining progress that returns one): the weight "
+            "of the cost against the information. float('inf') gives plain policy gradient"
+        )
+    return float(beta)
+
+
+def _nearest_multiples(n: int, divisor: int) -> str:
+    below = n // divisor * divisor
+    return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"
