@@ -1,0 +1,72 @@
+# Every target that needs Python first makes the virtual environment below, once.
+PYTHON ?= python3
+VENV ?= .venv
+JOBS ?= 2
+EXTRAS ?= zoo,tests,plots,docs,dev
+
+PY := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+
+# A name of a target is not a file: docs/ exists and must not count as "up to date".
+.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava wheel clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{ printf "  %-16s %s\n", $$1, $$2 }'
+	@echo "Variables: PYTHON=$(PYTHON) VENV=$(VENV) JOBS=$(JOBS) EXTRAS=$(EXTRAS)"
+
+venv: $(STAMP) ## make the virtual environment (also done on demand by every other target)
+
+$(STAMP): setup.cfg pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "PYTHON=$(PYTHON) is missing or older than 3.10: install Python 3.10 or later, or choose one with 'make PYTHON=python3.11 ...'." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ echo "$(PYTHON) cannot make virtual environments: install its venv module (Debian, Ubuntu: 'apt install python3-venv')." >&2; exit 1; }
+	@echo "Installing into $(VENV); PyTorch is large, so the first time takes a few minutes."
+	$(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
+	@touch $@
+
+demo: $(STAMP) ## train TDPG and its baseline on the lava problem, compare them, write results/lava
+	$(PY) -m sb3_tdpg demo --out results/lava
+
+# One thread per worker: the networks are small, and the workers already fill the cores.
+test: $(STAMP) ## run the tests but for the slow ones
+	OMP_NUM_THREADS=1 $(PY) -m pytest -m "not slow" -n $(JOBS)
+
+test-slow: $(STAMP) ## run the slow tests
+	OMP_NUM_THREADS=1 $(PY) -m pytest -m slow -n $(JOBS)
+
+lint: $(STAMP) ## check style and format
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+# mypy does not see that the package extends __path__, so it is given the tree that a wheel has.
+TYPES := build/types
+type: $(STAMP) ## check the types
+	@rm -rf $(TYPES) && mkdir -p $(TYPES)/sb3_tdpg
+	@ln -s $(CURDIR)/sb3_tdpg/* $(CURDIR)/envs $(CURDIR)/hyperparams $(TYPES)/sb3_tdpg
+	cd $(TYPES) && $(abspath $(PY)) -m mypy --config-file $(CURDIR)/setup.cfg --cache-dir $(CURDIR)/.mypy_cache -p sb3_tdpg
+
+format: $(STAMP) ## mend style and format in place
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+docs: $(STAMP) ## build the documentation into docs/_build/html
+	$(PY) -m sphinx -W --keep-going -b html docs docs/_build/html
+
+bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
+	$(PY) tests/benchmarks/run.py
+
+reproduce: reproduce-lava ## reproduce every experiment
+
+reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
+	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction
+
+wheel: $(STAMP) ## build the wheel into dist/
+	@rm -rf build/lib
+	$(PY) -m pip wheel --no-deps --wheel-dir dist .
+
+clean: ## remove what was built, but neither results nor the virtual environment
+	rm -rf build dist docs/_build *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

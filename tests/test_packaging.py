@@ -1,0 +1,131 @@
+"""The package as a user gets it: built, installed alone in a fresh environment, used from another folder."""
+
+import os
+import shutil
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SOURCES = ("sb3_tdpg", "envs", "hyperparams", "setup.cfg", "pyproject.toml", "LICENSE")
+
+IMPORT_ALL = "import sb3_tdpg, sb3_tdpg.envs, sb3_tdpg.hyperparams; "
+MAKE_LAVA = (
+    "import gymnasium, sb3_tdpg; [gymnasium.make(id).reset() for id in ('Lava-v0', 'sb3_tdpg:Lava-v0')]"
+)
+
+
+def run(*command: object, cwd: Path, pythonpath: Path | None = None) -> str:
+    """Run a command with no trace of this checkout in its environment; fail with all that it printed."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    if pythonpath is not None:
+        environment["PYTHONPATH"] = str(pythonpath)
+    arguments = [str(argument) for argument in command]
+    done = subprocess.run(arguments, cwd=cwd, env=environment, text=True, capture_output=True)
+    assert done.returncode == 0, f"{' '.join(arguments)}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def pip(*arguments: object, cwd: Path) -> None:
+    """Call pip without the network: setuptools comes with the `tests` extra."""
+    run(sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments, cwd=cwd)
+
+
+def copy_sources(folder: Path) -> Path:
+    """Copy what a build needs: setuptools builds in place, and an old build/ would end up in the wheel."""
+    folder.mkdir()
+    for name in SOURCES:
+        source = REPOSITORY / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, folder)
+    return folder
+
+
+def make_environment(folder: Path) -> Path:
+    """Make a virtual environment that borrows our dependencies, and return its interpreter.
+
+    A folder named in a .pth file goes behind the environment's own packages, and the .pth files inside it are
+    not read: so the dependencies are there without a second install, but an editable install of ours is not.
+    """
+    venv.create(folder, symlinks=os.name != "nt")
+    python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    packages = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).strip()
+    borrowed = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
+    Path(packages, "borrowed.pth").write_text("\n".join(borrowed))
+    return python
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    source = copy_sources(folder / "source")
+    pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, source, cwd=folder)
+    return next(folder.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment into which the wheel was installed."""
+    folder = tmp_path_factory.mktemp("installed")
+    python = make_environment(folder / "venv")
+    pip("--python", python, "install", "--no-deps", wheel, cwd=folder)
+    return python
+
+
+def test_the_wheel_holds_every_module_environment_and_hyperparameter_file(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    expected = {"sb3_tdpg/py.typed"}
+    expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("envs/**/*.py")}
+    expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("hyperparams/*.yml")}
+    expected |= {str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("sb3_tdpg/**/*.py")}
+    assert any(name.endswith(".yml") for name in expected)
+    assert expected <= names, f"missing from the wheel: {sorted(expected - names)}"
+
+
+def test_the_wheel_installs_nothing_but_sb3_tdpg_at_the_top(wheel: Path) -> None:
+    top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    assert {name for name in top if not name.endswith(".dist-info")} == {"sb3_tdpg"}
+
+
+def test_the_installed_wheel_imports_from_its_own_environment(installed: Path, tmp_path: Path) -> None:
+    show = "print(sb3_tdpg.__file__, sb3_tdpg.envs.__file__, sb3_tdpg.hyperparams.__file__, sep='\\n')"
+    files = run(installed, "-c", IMPORT_ALL + show, cwd=tmp_path).splitlines()[-3:]
+    assert all(Path(file).is_relative_to(installed.parents[1]) for file in files), files
+
+
+def test_the_installed_wheel_has_the_version_that_it_reports(installed: Path, tmp_path: Path) -> None:
+    show = "print(importlib.metadata.version('sb3_tdpg'), sb3_tdpg.__version__)"
+    output = run(installed, "-c", "import importlib.metadata, sb3_tdpg; " + show, cwd=tmp_path)
+    packaged, reported = output.splitlines()[-1].split()
+    assert packaged == reported
+
+
+def test_the_installed_wheel_makes_the_lava_environment(installed: Path, tmp_path: Path) -> None:
+    run(installed, "-c", MAKE_LAVA, cwd=tmp_path)
+
+
+def test_the_installed_wheel_does_not_get_in_the_way_of_a_checkout(installed: Path) -> None:
+    output = run(installed, "-c", IMPORT_ALL + "print(sb3_tdpg.envs.__file__)", cwd=REPOSITORY)
+    assert Path(output.splitlines()[-1]) == REPOSITORY / "envs" / "__init__.py"
+
+
+def test_a_checkout_on_the_python_path_works_without_an_install(tmp_path: Path) -> None:
+    python = make_environment(tmp_path / "venv")
+    run(python, "-c", IMPORT_ALL + MAKE_LAVA, cwd=tmp_path, pythonpath=REPOSITORY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["lenient", "strict"])
+def test_an_editable_install_works_from_inside_and_outside_the_checkout(mode: str, tmp_path: Path) -> None:
+    checkout = copy_sources(tmp_path / "checkout")
+    python = make_environment(tmp_path / "venv")
+    arguments = ["--no-deps", "--no-build-isolation", "--config-settings", f"editable_mode={mode}"]
+    pip("--python", python, "install", *arguments, "-e", checkout, cwd=tmp_path)
+    for cwd in (tmp_path, checkout):
+        run(python, "-c", IMPORT_ALL + MAKE_LAVA, cwd=cwd)
