@@ -1,0 +1,24 @@
+"""Evaluation: scenario -> per-episode records -> table -> figure."""
+
+from sb3_tdpg.evaluation.figures import cost_histograms, lava_trajectories, save_figure, training_curves
+from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.evaluation.records import evaluate_scenarios
+from sb3_tdpg.evaluation.tables import add_ratio, aggregate_seeds, comparison_markdown, summary_table
+from sb3_tdpg.evaluation.trajectories import Trajectories, rollout_states
+
+__all__ = [
+    "Trajectories",
+    "add_ratio",
+    "aggregate_seeds",
+    "comparison_markdown",
+    "cost_histograms",
+    "evaluate_scenarios",
+    "lava_trajectories",
+    "provenance",
+    "rollout_states",
+    "save_figure",
+    "summary_table",
+    "training_curves",
+    "write_frame_atomically",
+    "write_run_config",
+]

@@ -1,0 +1,214 @@
+"""From records to figures, in Matplotlib's object-oriented interface: no window, no global state."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdpg.envs.lava import GOAL, LAVA, WALL
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.trajectories import rollout_states
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette, which readers with any colour vision can tell apart: vermillion, blue, green, ...
+PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+INK = "#333333"
+WIDTH = 9.0  # inches: about as wide as a README is shown, so that 9 points stay readable
+
+
+def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_bins: int = 40) -> Figure:
+    """
+    Draw how often each model incurs which cost, as in the paper's Fig. 3: one panel for each scenario.
+
+    :param records: From :func:`~sb3_tdpg.evaluation.records.evaluate_scenarios`.
+    :param scenarios: The panels from left to right.
+    :param n_bins: Bins, the same in all panels. They are equal on a logarithmic axis, since costs range over two
+        decades, unless a cost is zero or negative.
+    """
+    names = [scenario.name for scenario in scenarios]
+    shown = records[records["scenario"].isin(names)]
+    if missing := sorted(set(names) - set(shown["scenario"])):
+        raise ValueError(f"the records have no episodes of the scenarios {missing}")
+    figure = _new_figure(WIDTH, 2.9)
+    panels = _panels(figure, 1, len(scenarios))[0]
+    low, high = shown["cost"].min(), shown["cost"].max()
+    is_positive = low > 0
+    if is_positive:
+        low = max(low, high / 1e3)  # a few costs next to 0 must not stretch the axis; they go into the first bin
+        bins = np.geomspace(low, high * 1.001, n_bins + 1)
+    else:
+        bins = np.histogram_bin_edges(shown["cost"], n_bins)
+    for axes, scenario in zip(panels, scenarios, strict=True):
+        for color, (label, group) in zip(cycle(PALETTE), shown.groupby("model", sort=False), strict=False):
+            costs = group.loc[group["scenario"] == scenario.name, "cost"].clip(lower=low)
+            weights = np.full(len(costs), 1 / len(costs))
+            axes.hist(costs, bins, weights=weights, color=color, alpha=0.45, label=str(label))
+            axes.hist(costs, bins, weights=weights, color=color, histtype="step", linewidth=1.2)
+            axes.axvline(costs.mean(), color=color, linestyle=(0, (3, 2)), linewidth=1.2)
+        axes.set_title(_title(scenario), fontsize=9)
+    if is_positive:
+        _log_axis(panels[0], "x", subs=(1, 3))
+    panels[0].set_ylabel("share of episodes", fontsize=9)
+    figure.supxlabel(f"episode cost{' (logarithmic axis)' if is_positive else ''}; dashed: mean", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9)
+    return figure
+
+
+def lava_trajectories(
+    models: Mapping[str, Any],
+    env_kwargs: Mapping[str, Any] | None = None,
+    n_episodes: int = 60,
+    seed: int = 0,
+    *,
+    noise_variances: Sequence[float] = (1e-4, 1.0),
+    deterministic: bool = False,
+) -> Figure:
+    """
+    Draw where the robot of the lava problem is over time: one column for each model, one row for each noise level.
+
+    :param models: SB3 models by their label.
+    :param env_kwargs: Keywords of the environment beside its noise.
+    :param n_episodes: Episodes in a panel; the same start positions in all.
+    :param seed: Seed of the episodes.
+    :param noise_variances: sigma^2 of the sensor in each row.
+    :param deterministic: Act without noise.
+    """
+    matplotlib = _import_matplotlib()
+    figure = _new_figure(WIDTH, 0.6 + 2.4 * len(noise_variances))
+    panels = _panels(figure, len(noise_variances), len(models))
+    norm = matplotlib.colors.Normalize(WALL, LAVA)
+    colors = matplotlib.cm.ScalarMappable(norm, "viridis")
+    for row, variance in zip(panels, noise_variances, strict=True):
+        for axes, (label, model) in zip(row, models.items(), strict=True):
+            scenario = Scenario(label, "Lava-v0", {**(env_kwargs or {}), "sensor_noise_std": variance**0.5})
+            states, costs = rollout_states(model, scenario, n_episodes, seed=seed, deterministic=deterministic)
+            d = states[:, :, 0]  # (T + 1, N)
+            _draw_corridor(axes, horizon=len(d) - 1)
+            for path in d.T:
+                axes.plot(path, color=colors.to_rgba(path[0]), linewidth=0.8, alpha=0.8)
+            in_lava = (d[-1] >= LAVA).mean()
+            title = f"{label}, {_noise(variance)}: mean cost {costs.mean():.0f}, {in_lava:.0%} in the lava"
+            axes.set_title(title, fontsize=9)
+    for axes in panels[-1]:
+        axes.set_xlabel("time step $t$", fontsize=9)
+    figure.supylabel("distance from the wall $d_t$ (m)", fontsize=9)
+    bar = figure.colorbar(colors, ax=panels, pad=0.01, aspect=40)
+    bar.set_label("start $d_0$ (m)", fontsize=9)
+    return figure
+
+
+def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
+    """
+    Draw cost and information over the policy epochs.
+
+    :param progress: By label, what SB3's CSV logger wrote: ``pandas.read_csv("progress.csv")``.
+    """
+    figure = _new_figure(WIDTH, 2.8)
+    cost, information = (figure.add_subplot(1, 2, i) for i in (1, 2))
+    for color, (label, frame) in zip(cycle(PALETTE), progress.items(), strict=False):
+        epochs = frame["time/iterations"]
+        cost.plot(epochs, frame["rollout/ep_cost_mean"], color=color, label=label)
+        if "mi/total" in frame:
+            information.plot(epochs, frame["mi/total"], color=color, label=label)
+    _log_axis(cost, "y", subs=(1, 2, 5))
+    cost.set_ylabel("mean episode cost", fontsize=9)
+    information.set_ylabel(r"$I[x_t; \tilde{x}_t]$, summed over $t$ (nat)", fontsize=9)
+    for axes in (cost, information):
+        axes.set_xlabel("policy epoch", fontsize=9)
+        axes.grid(alpha=0.25)
+        _tidy(axes)
+    cost.legend(frameon=False)
+    return figure
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> None:
+    """
+    Write a figure so that at no time a half-written file is there.
+
+    :param figure: A figure of this module.
+    :param path: The file; its ending tells the format. Folders are made.
+    :param dpi: Pixels an inch.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    figure.savefig(partial, format=path.suffix.lstrip("."), dpi=dpi)
+    os.replace(partial, path)
+
+
+def _draw_corridor(axes: Axes, horizon: int) -> None:
+    """Wall, goal and lava behind the trajectories."""
+    low, high = WALL - 0.5, LAVA + 0.5
+    axes.axhspan(low, WALL, color="#999999", linewidth=0)
+    axes.axhspan(LAVA, high, color="#F0954B", linewidth=0)
+    axes.axhline(GOAL[0], color=INK, linestyle=(0, (4, 3)), linewidth=1)
+    for height, text in ((WALL - 0.25, "wall"), (LAVA + 0.25, "lava")):
+        axes.text(0.98 * horizon, height, text, color=INK, fontsize=8, ha="right", va="center")
+    axes.text(1.015 * horizon, GOAL[0], "goal", color=INK, fontsize=8, va="center")
+    axes.set_ylim(low, high)
+    axes.set_xlim(0, horizon)
+    axes.set_xticks(range(horizon + 1))
+
+
+def _title(scenario: Scenario) -> str:
+    std = scenario.env_kwargs.get("sensor_noise_std")
+    if std is None:
+        return scenario.name
+    return f"training: {_noise(std**2)}" if scenario.name == "Training" else _noise(std**2)
+
+
+def _noise(variance: float) -> str:
+    """sigma^2 = 10^-3 in Matplotlib's mathematics."""
+    if variance == 0:
+        return r"$\sigma^2 = 0$"
+    exponent = np.log10(variance)
+    if np.isclose(exponent, round(exponent)) and round(exponent) != 0:
+        return rf"$\sigma^2 = 10^{{{round(exponent)}}}$"
+    return rf"$\sigma^2 = {variance:.3g}$"
+
+
+def _new_figure(width: float, height: float) -> Figure:
+    return _import_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
+
+
+def _panels(figure: Figure, n_rows: int, n_columns: int) -> np.ndarray:
+    """Panels with common axes: ``(n_rows, n_columns)``."""
+    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+    for axes in panels.flat:
+        _tidy(axes)
+    return panels
+
+
+def _log_axis(axes: Axes, which: str, subs: tuple[int, ...]) -> None:
+    """Make an axis logarithmic, with the ticks (10, 30, 100, ...) as plain numbers."""
+    axes.set(**{f"{which}scale": "log"})
+    axis = getattr(axes, f"{which}axis")
+    axis.set_major_locator(_import_matplotlib().ticker.LogLocator(subs=subs))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("")
+
+
+def _tidy(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+
+
+def _import_matplotlib() -> Any:
+    try:
+        import matplotlib.cm
+        import matplotlib.colors
+        import matplotlib.figure
+        import matplotlib.ticker
+    except ImportError as e:
+        raise ImportError("figures need matplotlib: pip install sb3_tdpg[plots]") from e
+    return matplotlib

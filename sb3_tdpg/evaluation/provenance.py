@@ -1,0 +1,121 @@
+"""Where a result came from: versions, commit, machine and command, and files that are never half-written."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdpg.callbacks import write_atomically
+
+PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "pandas", "pybullet")
+
+
+def provenance() -> dict[str, Any]:
+    """
+    Describe the run that is going on, in plain JSON types.
+
+    :return: ``versions``, ``git`` (commit and whether it was changed; None outside a checkout), ``platform``,
+        ``cpu_count``, ``torch_threads``, ``cuda_device`` (None without), ``utc_time``, ``command``
+    """
+    import torch as th
+
+    from sb3_tdpg import __version__
+
+    versions: dict[str, str | None] = {"python": platform.python_version(), "sb3_tdpg": __version__}
+    versions.update({package: _version(package) for package in PACKAGES})
+    return dict(
+        versions=versions,
+        git=_git(),
+        platform=platform.platform(),
+        cpu_count=os.cpu_count(),
+        torch_threads=th.get_num_threads(),
+        cuda_device=th.cuda.get_device_name() if th.cuda.is_available() else None,
+        utc_time=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        command=shlex.join(sys.orig_argv),
+    )
+
+
+def write_run_config(path: str | os.PathLike[str], config: Mapping[str, Any]) -> None:
+    """
+    Write a run's configuration as JSON, atomically, with its :func:`provenance` unless it has one already.
+
+    :param path: The file; folders are made.
+    :param config: Settings and seeds. ``inf`` (as in ``beta``) is written as ``"inf"``, since JSON has no such number;
+        ``float("inf")`` reads it back. What JSON does not know is written as text.
+    """
+    content = jsonable({**config, "provenance": config.get("provenance") or provenance()})
+    write_atomically(_with_folder(path), json.dumps(content, indent=2) + "\n")
+
+
+def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) -> None:
+    """
+    Write a frame as CSV without its index, so that at no time a half-written file is there.
+
+    :param frame: Records or a table.
+    :param path: ``.csv``, or ``.csv.gz`` to compress it; folders are made. The same frame gives the same bytes.
+    """
+    path = _with_folder(path)
+    if not path.name.endswith((".csv", ".csv.gz")):
+        raise ValueError(f"path={str(path)!r} must end in .csv or .csv.gz")
+    # Without mtime the compressed file would differ from one second to the next.
+    compression: Any = {"method": "gzip", "mtime": 0} if path.name.endswith(".gz") else None
+    partial = path.with_name(path.name + ".partial")
+    frame.to_csv(partial, index=False, compression=compression)
+    os.replace(partial, path)
+
+
+def _with_folder(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _git() -> dict[str, Any] | None:
+    """Commit of the checkout that this package lies in, and whether a tracked file was changed since."""
+    package = Path(__file__).resolve().parents[1]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(package), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        # An installed package may lie in a checkout of something else (a virtual environment in a project).
+        git("ls-files", "--error-unmatch", str(package / "__init__.py"))
+        return dict(commit=git("rev-parse", "HEAD"), dirty=bool(git("status", "--porcelain", "--untracked-files=no")))
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def jsonable(value: Any) -> Any:
+    """Turn a value into what JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [jsonable(item) for item in value]
+    if isinstance(value, np.generic):
+        return jsonable(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
