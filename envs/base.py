@@ -6,7 +6,7 @@ Dimension key: N episodes side by side, X state, U action; observations have sha
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -40,13 +40,15 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     :param render_mode: ``None`` or one of ``metadata["render_modes"]``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "render_fps": 4}
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
         if not (isinstance(horizon, (int, np.integer)) and horizon >= 1):
-            raise ValueError(f"horizon={horizon!r} must be an integer of at least 1: the number of controls in an episode")
+            raise ValueError(
+                f"horizon={horizon!r} must be an integer of at least 1: the number of controls in an episode"
+            )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} must be None or one of {self.metadata['render_modes']}")
         self.horizon = int(horizon)
@@ -90,7 +92,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         if not np.all(np.isfinite(action)):
             raise ValueError(
-                f"{type(self).__name__} received an action that is not finite: {action[~np.isfinite(action).all(-1)][0]}; "
+                f"{type(self).__name__} received an action that is not finite: "
+                f"{action[~np.isfinite(action).all(-1)][0]}; "
                 "the policy that produced it has probably diverged"
             )
         box = self.action_space
@@ -114,7 +117,9 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply one control; see :class:`gymnasium.Env`."""
         if self._state is None or self._time >= self.horizon:
-            raise gym.error.ResetNeeded(f"the episode has not begun or is over (horizon={self.horizon}): call reset() first")
+            raise gym.error.ResetNeeded(
+                f"the episode has not begun or is over (horizon={self.horizon}): call reset() first"
+            )
         self._time += 1
         terminated = self._time == self.horizon
         batch = np.asarray(action, dtype=np.float64).reshape(1, -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -36,11 +36,13 @@ class LavaEnv(POMDPEnv):
     :param lava_stage_cost: Stage cost once in the lava; ``None``: the distance to the goal, which is 2 there.
     :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
     :param horizon: Number of controls T.
-    :param max_action: The action space is ``[-max_action, max_action]``; the paper's is unbounded.
+    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, SB3 needs
+        bounds: a large
+        one, since the cost does not depend on how far beyond its bound an action lies and gives no gradient there.
     :param render_mode: ``None`` or ``"rgb_array"``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
 
     def __init__(
         self,
@@ -50,12 +52,14 @@ class LavaEnv(POMDPEnv):
         lava_stage_cost: float | None = None,
         lava_terminal_cost: float | None = None,
         horizon: int = 5,
-        max_action: float = 10.0,
+        max_action: float = 100.0,
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=horizon, render_mode=render_mode)
         if not (np.isfinite(sensor_noise_std) and sensor_noise_std >= 0):
-            raise ValueError(f"sensor_noise_std={sensor_noise_std} must be finite and not negative (it is sigma, not sigma^2)")
+            raise ValueError(
+                f"sensor_noise_std={sensor_noise_std} must be finite and not negative (it is sigma, not sigma^2)"
+            )
         if not (np.isfinite(max_action) and max_action > 0):
             raise ValueError(f"max_action={max_action} must be finite and positive")
         for name, value in (("action_cost", action_cost), ("lava_stage_cost", lava_stage_cost),
@@ -66,9 +70,7 @@ class LavaEnv(POMDPEnv):
         self.action_cost = float(action_cost)
         self.lava_stage_cost = lava_stage_cost
         self.lava_terminal_cost = lava_terminal_cost
-        self.state_space = spaces.Box(
-            np.array([WALL, -np.inf]), np.array([LAVA, np.inf]), dtype=np.float64
-        )
+        self.state_space = spaces.Box(np.array([WALL, -np.inf]), np.array([LAVA, np.inf]), dtype=np.float64)
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
 

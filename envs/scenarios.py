@@ -10,7 +10,10 @@ from typing import Any
 LAVA_TABLE_READING: Mapping[str, Any] = MappingProxyType(
     dict(action_cost=1.0, lava_stage_cost=3.0, lava_terminal_cost=300.0)
 )
-"""Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv` that fit the numbers of Table I better than the paper's text does."""
+"""
+Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv` that fit the numbers of Table I better than the paper's text
+does.
+"""
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,17 @@
 
 from pathlib import Path
 
-# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. Without this, sb3_tdpg.envs
-# is not found when the checkout comes first on sys.path (the working directory is the repository, or PYTHONPATH).
+# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. Without this, sb3_tdpg.envs is
+# not found when the checkout comes first on sys.path (the working directory is the repository, or PYTHONPATH).
 _package = Path(__path__[0]).resolve()
 if not (_package / "envs").is_dir() and (_package.parent / "envs" / "__init__.py").is_file():
     __path__.append(str(_package.parent))
 
-from sb3_tdpg import envs as _envs  # noqa: E402  (registers the environments)
-from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback  # noqa: E402
-from sb3_tdpg.policies import TRVPolicy  # noqa: E402
-from sb3_tdpg.tdpg import TDPG, TrainingDivergedError  # noqa: E402
-from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env  # noqa: E402
+from sb3_tdpg import envs
+from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
+from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
 
 __version__ = "0.1.0"
 
@@ -24,5 +24,6 @@ __all__ = [
     "TRVPolicy",
     "TrainingCheckpointCallback",
     "TrainingDivergedError",
+    "envs",
     "make_episodes_env",
 ]

@@ -89,7 +89,9 @@ class SelectionCallback(_TDPGCallback):
     ) -> None:
         super().__init__(verbose)
         if cost_limit is None and mi_limit is None:
-            raise ValueError("give cost_limit (lowest information under a cost), mi_limit (lowest cost under it) or both")
+            raise ValueError(
+                "give cost_limit (lowest information under a cost), mi_limit (lowest cost under it) or both"
+            )
         for name, limit in (("cost_limit", cost_limit), ("mi_limit", mi_limit)):
             if limit is not None and np.isnan(limit):
                 raise ValueError(f"{name} is NaN")
@@ -150,9 +152,13 @@ class SelectionCallback(_TDPGCallback):
         """
         if self.best is None or self._best_policy is None:
             limits = ", ".join(
-                f"{name} < {limit}" for name, limit in (("cost", self.cost_limit), ("information", self.mi_limit)) if limit
+                f"{name} < {limit}"
+                for name, limit in (("cost", self.cost_limit), ("information", self.mi_limit))
+                if limit
             )
-            raise ValueError(f"no epoch met the limits ({limits}): train longer or loosen them; the last policy is kept")
+            raise ValueError(
+                f"no epoch met the limits ({limits}): train longer or loosen them; the last policy is kept"
+            )
         model.policy.load_state_dict(self._best_policy)
         return self.best
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch as th
 from torch import nn
@@ -58,21 +59,59 @@ class BatchedMLP(nn.Module):
     ) -> None:
         super().__init__()
         self.n_maps = n_maps
-        self.layers = nn.ModuleList(BatchedLinear(n_maps, i, o) for i, o in zip(sizes[:-1], sizes[1:], strict=True))
+        self.layers = nn.ModuleList(BatchedLinear(n_maps, i, o) for i, o in pairwise(sizes))
         self.activation = activation_fn()
         self.activate_output = activate_output
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """``(M, N, I) -> (M, N, O)``."""
-        for layer in self.layers[:-1]:
-            x = self.activation(layer(x))
-        x = self.layers[-1](x)
-        return self.activation(x) if self.activate_output else x
+        last = len(self.layers) - 1
+        for i, layer in enumerate(self.layers):
+            x = layer(x)
+            if i < last or self.activate_output:
+                x = self.activation(x)
+        return x
+
+    @th.no_grad()
+    def forward_keeping_hidden(self, x: th.Tensor) -> tuple[th.Tensor, list[th.Tensor]]:
+        """
+        Evaluate without autograd, for :meth:`set_gradients`.
+
+        :return: the output ``(M, N, O)``, and the input of every layer
+        """
+        inputs = []
+        last = len(self.layers) - 1
+        for i, layer in enumerate(self.layers):
+            inputs.append(x)
+            x = layer(x)
+            if i < last:
+                x = self.activation(x)
+        return x, inputs
+
+    @th.no_grad()
+    def set_gradients(self, inputs: list[th.Tensor], grad_output: th.Tensor) -> None:
+        """
+        Back-propagate by hand into the parameters' ``grad``: less than half the time that autograd takes for so small a
+        network. For ELU hidden layers and a linear output.
+
+        :param inputs: from :meth:`forward_keeping_hidden`
+        :param grad_output: derivative of a scalar with respect to the output, ``(M, N, O)``
+        """
+        grad = grad_output
+        for layer, x in zip(reversed(list(self.layers)), reversed(inputs), strict=True):
+            assert isinstance(layer, BatchedLinear)
+            layer.weight.grad = (grad.mT @ x).mT if grad.shape[2] == 1 else x.mT @ grad
+            layer.bias.grad = grad.sum(dim=1, keepdim=True)
+            if x is not inputs[0]:
+                grad = grad * layer.weight.mT if grad.shape[2] == 1 else grad @ layer.weight.mT
+                # d elu(z) / dz in terms of h = elu(z): 1 where h > 0, and exp(z) = h + 1 elsewhere.
+                grad = th.ops.aten.elu_backward(grad, 1.0, 1.0, 1.0, True, x)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
         """Evaluate the network of one index: ``(N, I) -> (N, O)``."""
         last = len(self.layers) - 1
         for i, layer in enumerate(self.layers):
+            assert isinstance(layer, BatchedLinear)
             x = layer.at(x, index)
             if i < last or self.activate_output:
                 x = self.activation(x)

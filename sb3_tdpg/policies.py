@@ -25,6 +25,8 @@ from sb3_tdpg.networks import TimeMLP
 
 # Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
 MAX_TIME_VARYING_HORIZON = 50
+# A standard deviation of e^4, about 55.
+MAX_LOG_VAR = 8.0
 
 
 class PolicyStep(NamedTuple):
@@ -65,6 +67,8 @@ class TRVPolicy(BasePolicy):
     :param activation_fn: Nonlinearity of the hidden layers.
     :param time_varying: One set of weights for each time step, or one for all; default: time-varying up to a horizon of
         50. A convolutional feature extractor is always shared.
+    :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images:
+        then no observation, however unlike those in training, drives the TRVs to where the action head has never been.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it.
     :param action_log_var_init: The same for the action head (Box actions).
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``.
@@ -90,6 +94,7 @@ class TRVPolicy(BasePolicy):
         net_arch: dict[str, Sequence[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ELU,
         time_varying: bool | None = None,
+        squash_trv_mean: bool = False,
         encoder_log_var_init: float = 0.0,
         action_log_var_init: float = 0.0,
         encoder_var_floor: float = 1e-3,
@@ -116,6 +121,7 @@ class TRVPolicy(BasePolicy):
         self.horizon = horizon
         self.trv_dim = (8 if is_image else 2) if trv_dim is None else trv_dim
         self.time_varying = horizon <= MAX_TIME_VARYING_HORIZON if time_varying is None else time_varying
+        self.squash_trv_mean = squash_trv_mean
         self.activation_fn = activation_fn
         self.encoder_log_var_init = encoder_log_var_init
         self.action_log_var_init = action_log_var_init
@@ -144,7 +150,11 @@ class TRVPolicy(BasePolicy):
             activation_fn,
             time_varying=self.time_varying,
         )
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]  # the base class takes none, every optimiser does
+            **self.optimizer_kwargs,
+        )
 
     def _n_action_parameters(self) -> int:
         """Return how many numbers define the distribution of an action."""
@@ -156,7 +166,7 @@ class TRVPolicy(BasePolicy):
         if isinstance(space, spaces.MultiDiscrete):
             return int(space.nvec.sum())
         assert isinstance(space, spaces.MultiBinary)
-        return int(space.n)
+        return int(np.prod(space.shape))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -166,6 +176,7 @@ class TRVPolicy(BasePolicy):
             net_arch=self.net_arch,
             activation_fn=self.activation_fn,
             time_varying=self.time_varying,
+            squash_trv_mean=self.squash_trv_mean,
             encoder_log_var_init=self.encoder_log_var_init,
             action_log_var_init=self.action_log_var_init,
             encoder_var_floor=self.encoder_var_floor,
@@ -183,19 +194,23 @@ class TRVPolicy(BasePolicy):
     def _encoder_density(self, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and standard deviation of q from the encoder's outputs: ``(..., 2 Z) -> 2 x (..., Z)``."""
         mean, log_var = parameters.chunk(2, dim=-1)
-        return mean, th.sqrt(th.exp(log_var + self.encoder_log_var_init) + self.encoder_var_floor)
+        if self.squash_trv_mean:
+            mean = th.tanh(mean)
+        return mean, _variance(log_var + self.encoder_log_var_init, self.encoder_var_floor).sqrt()
 
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
         """Distribution of the action from the head's outputs, ``(n, ...)``: one dimension of samples only."""
         if isinstance(self.action_dist, DiagGaussianDistribution):
             mean, log_var = parameters.chunk(2, dim=-1)
-            variance = th.exp(log_var + self.action_log_var_init) + self.action_var_floor
+            variance = _variance(log_var + self.action_log_var_init, self.action_var_floor)
             return self.action_dist.proba_distribution(mean, 0.5 * th.log(variance))
         return self.action_dist.proba_distribution(parameters)
 
     # -- one step, for rollouts and predict -------------------------------------------------------------------
 
-    def step(self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False) -> PolicyStep:
+    def step(
+        self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False
+    ) -> PolicyStep:
         """
         Choose the actions of one step.
 
@@ -229,7 +244,7 @@ class TRVPolicy(BasePolicy):
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (eq:grad phi).
+        Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (eq:grad phi).
 
         The stored TRVs are constants here: ``Normal.log_prob(rsample())`` without a detach has no gradient in the mean.
 
@@ -240,7 +255,7 @@ class TRVPolicy(BasePolicy):
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        log pi(u_t | x~_t) at the stored actions (eq:grad psi).
+        Log pi(u_t | x~_t) at the stored actions (eq:grad psi).
 
         :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
         :return: ``(T, N)``
@@ -270,7 +285,9 @@ class TRVPolicy(BasePolicy):
 
     # -- the interface of SB3 ---------------------------------------------------------------------------------
 
-    def forward(self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False) -> PolicyStep:
+    def forward(
+        self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False
+    ) -> PolicyStep:
         """See :meth:`step`."""
         return self.step(observation, prev_trv, t, deterministic)
 
@@ -325,11 +342,16 @@ class TRVPolicy(BasePolicy):
         return (actions if is_vectorized else actions[0]), (step.trvs.cpu().numpy(), t + 1)
 
 
+def _variance(log_var: th.Tensor, floor: float) -> th.Tensor:
+    # Bounded: observations unlike any in training drive an unbounded log-variance, and through it the recurrence,
+    # to inf.
+    return th.exp(log_var.clamp(max=MAX_LOG_VAR)) + floor
+
+
 def _check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:
     given = {} if given is None else given
     if not isinstance(given, dict) or not set(given) <= set(default):
         raise ValueError(
-            f"policy_kwargs: net_arch={given!r} must be a dict with the keys {sorted(default)}, "
-            f"for instance {default}"
+            f"policy_kwargs: net_arch={given!r} must be a dict with the keys {sorted(default)}, for instance {default}"
         )
     return {key: list(given.get(key, sizes)) for key, sizes in default.items()}

@@ -14,8 +14,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 BRING_THE_STATE = (
-    'give the environment an attribute `state_space` (a Box) and put a copy of the true state into info["state"] in both '
-    "reset() and step()"
+    "give the environment an attribute `state_space` (a Box) and put a copy of the true state into "
+    'info["state"] in both reset() and step()'
 )
 
 
@@ -73,7 +73,8 @@ def read_problem(env: VecEnv) -> Problem:
         horizon = None if spec is None else spec.max_episode_steps
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(
-            f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer attribute "
+            f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer "
+            "attribute "
             "`horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
     state_space = _attribute(env, "state_space")
@@ -82,7 +83,8 @@ def read_problem(env: VecEnv) -> Problem:
     observation_shape = env.observation_space.shape
     if observation_shape is None or len(observation_shape) > 1:
         raise ValueError(
-            f"the mutual information is that of the true state, and an observation of shape {observation_shape} cannot stand "
+            f"the mutual information is that of the true state, and an observation of shape {observation_shape} "
+            "cannot stand "
             f"in for it: {BRING_THE_STATE}"
         )
     return Problem(int(horizon), max(1, int(np.prod(observation_shape))), state_is_observation=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import random
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
@@ -27,15 +26,15 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_tdpg.baselines import get_baseline
 from sb3_tdpg.buffers import EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
+from sb3_tdpg.checks import check_arguments, check_beta, nearest_multiples
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.losses import information_loss, policy_gradient_loss
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, read_problem
+from sb3_tdpg.random_state import RandomState
 from sb3_tdpg.vec_env import make_episodes_env
 
 SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
-
-ENCODER_GRADIENTS = ("score", "pathwise")
 
 
 class TrainingDivergedError(ValueError):
@@ -52,8 +51,8 @@ class TDPG(OnPolicyAlgorithm):
     .. math:: E[c(\tau)] + \frac1\beta \sum_t I[x_t; \tilde x_t]
 
     One policy epoch rolls out ``n_episodes`` episodes, fits the mutual-information critics to them
-    (:class:`~sb3_tdpg.callbacks.MINECallback`), and makes one update of the policy. ``beta=inf`` is plain policy gradient
-    with the same policy.
+    (:class:`~sb3_tdpg.callbacks.MINECallback`), and makes one update of the policy. ``beta=inf`` is plain policy
+    gradient with the same policy.
 
     The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). The true
     state comes from ``info["state"]`` of ``reset`` and ``step`` together with an attribute ``state_space``; an
@@ -63,19 +62,19 @@ class TDPG(OnPolicyAlgorithm):
     :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
     :param beta: Weight of the cost against the information, a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty.
-    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress. The critics have
-        their own (``mi_kwargs``).
+    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress. The
+        critics have their own (``mi_kwargs``).
     :param n_episodes: Episodes N of a policy epoch.
-    :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this plugin,
-        otherwise the largest divisor of N up to 50.
+    :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this
+        plugin, otherwise the largest divisor of N up to 50.
     :param mi_estimator: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, ``"logdet"``, ``"loo"`` or a subclass of
         :class:`~sb3_tdpg.information.InformationEstimator`.
     :param mi_kwargs: Keywords of the estimator.
-    :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step; ``"mean"``: cost
-        of the whole episode minus the mean over the batch, as in the paper.
+    :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step;
+        ``"mean"``: cost of the whole episode minus the mean over the batch, as in the paper.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (eq:grad phi), as in the paper;
-        ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the second
-        varies less.
+        ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the
+        second varies less.
     :param gamma: Discount factor; the paper has none.
     :param max_grad_norm: Clip the norm of the policy's gradient to this; ``None``: no clipping.
     :param stats_window_size: Episodes that ``rollout/ep_rew_mean`` averages over.
@@ -90,7 +89,7 @@ class TDPG(OnPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TRVPolicy": TRVPolicy}
-    policy: TRVPolicy
+    policy: TRVPolicy  # type: ignore[assignment]
     rollout_buffer: EpisodeBuffer
     estimator: InformationEstimator
 
@@ -117,7 +116,7 @@ class TDPG(OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        _check_arguments(policy, beta, n_episodes, n_envs, encoder_gradient, gamma, max_grad_norm)
+        check_arguments(policy, beta, n_episodes, n_envs, encoder_gradient, gamma, max_grad_norm)
         get_estimator_class(mi_estimator)
         get_baseline(baseline)
         if isinstance(env, str):
@@ -162,7 +161,7 @@ class TDPG(OnPolicyAlgorithm):
         """Policy epochs completed."""
         self.information: np.ndarray | None = None
         """I[x_t; x~_t] of the last rollouts in nats, ``(T,)``; None without a penalty."""
-        self._random_state: dict[str, Any] | None = None
+        self._random_state: RandomState | None = None
         self._problem: Problem | None = None
         if _init_setup_model:
             self._setup_model()
@@ -175,6 +174,8 @@ class TDPG(OnPolicyAlgorithm):
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._set_problem(self.env)
+        elif self.horizon == 0:
+            raise ValueError("TDPG needs an environment to learn the horizon and the spaces from: pass env=...")
         self.policy = cast(
             TRVPolicy,
             self.policy_class(
@@ -208,13 +209,15 @@ class TDPG(OnPolicyAlgorithm):
             )
         if self.n_episodes % env.num_envs != 0:
             raise ValueError(
-                f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), so that "
-                f"each runs as many episodes: use {_nearest_multiples(self.n_episodes, env.num_envs)}"
+                f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), "
+                "so that "
+                f"each runs as many episodes: use {nearest_multiples(self.n_episodes, env.num_envs)}"
             )
         problem = read_problem(env)
         if self.horizon not in (0, problem.horizon) or self.state_dim not in (0, problem.state_dim):
             raise ValueError(
-                f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, but the model was "
+                f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, but the "
+                "model was "
                 f"made for horizon={self.horizon} and {self.state_dim}: use an environment of the same shape"
             )
         self._problem = problem
@@ -230,12 +233,16 @@ class TDPG(OnPolicyAlgorithm):
     @property
     def mi_coef(self) -> float:
         """1 / beta at the present progress: the weight of the information, in units of cost per nat."""
-        return 1.0 / _check_beta(self.beta_schedule(self._current_progress_remaining))
+        return 1.0 / check_beta(self.beta_schedule(self._current_progress_remaining))
 
     # -- one policy epoch -------------------------------------------------------------------------------------
 
     def collect_rollouts(
-        self, env: VecEnv, callback: BaseCallback, rollout_buffer: EpisodeBuffer, n_rollout_steps: int  # type: ignore[override]
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: EpisodeBuffer,  # type: ignore[override]
+        n_rollout_steps: int,
     ) -> bool:
         """
         Roll out N whole episodes with the current policy (line 2 of alg:trv-policy).
@@ -293,13 +300,14 @@ class TDPG(OnPolicyAlgorithm):
             }
             rollout_buffer.add_step(t[running], column[running], **{k: v[running] for k, v in stored.items()})
 
-            states = self._problem.next_states(env, new_obs, dones, infos)
+            states = self._problem.next_states(env, cast(np.ndarray, new_obs), dones, infos)
             trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
             t = np.where(dones, 0, t + 1)
             column = np.where(dones, column + n_envs, column)
             if (t[column < self.n_episodes] >= self.horizon).any():
                 raise ValueError(
-                    f"an episode did not end after horizon={self.horizon} steps: the environment must return terminated "
+                    f"an episode did not end after horizon={self.horizon} steps: the environment must return "
+                    "terminated "
                     "or truncated there (or declare its true horizon)"
                 )
             obs = cast(np.ndarray, new_obs)
@@ -369,8 +377,10 @@ class TDPG(OnPolicyAlgorithm):
     def _diverged(self, name: str) -> TrainingDivergedError:
         self._last_obs = None
         return TrainingDivergedError(
-            f"the {name} of epoch {self.epoch} is NaN or infinite (after {self.num_timesteps} timesteps). The model keeps the "
-            "parameters from before this update. Check the environment's costs and observations; a smaller learning_rate, "
+            f"the {name} of epoch {self.epoch} is NaN or infinite (after {self.num_timesteps} timesteps). The model "
+            "keeps the "
+            "parameters from before this update. Check the environment's costs and observations; a smaller "
+            "learning_rate, "
             "max_grad_norm=1, or a larger encoder_var_floor in policy_kwargs help against exploding log-probabilities"
         )
 
@@ -388,7 +398,8 @@ class TDPG(OnPolicyAlgorithm):
         """
         Train; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
 
-        Interrupted by Ctrl-C, the model keeps the parameters of the last whole epoch and can be used, saved or trained on.
+        Interrupted by Ctrl-C, the model keeps the parameters of the last whole epoch and can be used, saved or
+        trained on.
 
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
@@ -418,7 +429,8 @@ class TDPG(OnPolicyAlgorithm):
             self.epoch = 0
             self._current_progress_remaining = 1.0
         elif self._random_state is not None:
-            self._restore_random_state(self._random_state)
+            assert self.env is not None
+            self._random_state.restore(self.env)
             self._last_obs = None
         self._random_state = None
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
@@ -432,37 +444,17 @@ class TDPG(OnPolicyAlgorithm):
         """
         Save the model with all random number generators, between two epochs.
 
-        The environments are reset, here and after loading, so that their generators are all there is to know of them. See
+        The environments are reset, here and after loading, so that their generators are all there is to know of
+        them. See
         :class:`~sb3_tdpg.callbacks.TrainingCheckpointCallback`.
         """
         assert self.env is not None
         self._last_obs = None
-        self._random_state = {
-            "python": random.getstate(),
-            "numpy": np.random.get_state(),
-            "torch": th.get_rng_state(),
-            "cuda": th.cuda.get_rng_state_all() if self.device.type == "cuda" else [],
-            "env": self.env.get_attr("np_random"),
-        }
+        self._random_state = RandomState.capture(self.env)
         try:
             self.save(Path(path))
         finally:
             self._random_state = None
-
-    def _restore_random_state(self, state: dict[str, Any]) -> None:
-        random.setstate(state["python"])
-        np.random.set_state(state["numpy"])
-        th.set_rng_state(state["torch"])
-        if self.device.type == "cuda" and state["cuda"]:
-            th.cuda.set_rng_state_all(state["cuda"])
-        assert self.env is not None
-        if len(state["env"]) != self.env.num_envs:
-            raise ValueError(
-                f"the checkpoint was made with {len(state['env'])} environments, the model now has {self.env.num_envs}: "
-                "resume with as many"
-            )
-        for i, generator in enumerate(state["env"]):
-            self.env.set_attr("np_random", generator, indices=i)
 
     def save(
         self,
@@ -470,11 +462,14 @@ class TDPG(OnPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        """Save to a zip file, replaced atomically; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.save`."""
+        """
+        Save to a zip file, replaced atomically; see
+        :meth:`stable_baselines3.common.base_class.BaseAlgorithm.save`.
+        """
         if isinstance(path, io.IOBase):
-            super().save(cast(io.BufferedIOBase, path), exclude, include)
+            super().save(path, exclude, include)
             return
-        target = Path(cast("str | os.PathLike[str]", path))
+        target = Path(path)
         if target.suffix == "":
             target = target.with_suffix(".zip")
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -489,48 +484,3 @@ class TDPG(OnPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         # The estimator's state dict holds its optimiser, too.
         return ["policy", "policy.optimizer", "estimator"], []
-
-
-def _check_arguments(
-    policy: str | type[TRVPolicy],
-    beta: float | Schedule,
-    n_episodes: int,
-    n_envs: int | None,
-    encoder_gradient: str,
-    gamma: float,
-    max_grad_norm: float | None,
-) -> None:
-    if isinstance(policy, str) and policy not in TDPG.policy_aliases:
-        raise ValueError(f"policy={policy!r} is unknown: use one of {sorted(TDPG.policy_aliases)}")
-    if not isinstance(policy, str) and not issubclass(policy, TRVPolicy):
-        raise ValueError(
-            f"the policy {policy.__name__} is no TRVPolicy; if it comes from a file, that was saved by another algorithm: "
-            "load it with the class that saved it"
-        )
-    for progress in (1.0, 0.0):
-        _check_beta(beta(progress) if callable(beta) else beta)
-    for name, value in (("n_episodes", n_episodes), ("n_envs", n_envs)):
-        if value is not None and not (isinstance(value, (int, np.integer)) and value >= 1):
-            raise ValueError(f"{name}={value!r} must be an integer of at least 1")
-    if n_episodes < 2:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 2: baseline and information are taken over a batch")
-    if encoder_gradient not in ENCODER_GRADIENTS:
-        raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
-    if not 0.0 < gamma <= 1.0:
-        raise ValueError(f"gamma={gamma} must be in (0, 1]; the paper's problems have gamma=1")
-    if max_grad_norm is not None and not max_grad_norm > 0:
-        raise ValueError(f"max_grad_norm={max_grad_norm} must be positive, or None for no clipping")
-
-
-def _check_beta(beta: float) -> float:
-    if not (isinstance(beta, (int, float, np.number)) and beta > 0):  # NaN compares false
-        raise ValueError(
-            f"beta={beta!r} must be a positive number (or a function of the remaining progress that returns one): the weight "
-            "of the cost against the information. float('inf') gives plain policy gradient"
-        )
-    return float(beta)
-
-
-def _nearest_multiples(n: int, divisor: int) -> str:
-    below = n // divisor * divisor
-    return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -36,7 +36,7 @@ class BatchedVecEnv(VecEnv):
         self.env = env
         super().__init__(n_envs, env.observation_space, env.action_space)
         self._time = 0
-        self._state = np.empty(0)
+        self._state = np.empty((0, 0))
         self._actions = np.empty(0)
         self._returns = np.zeros(n_envs)
         self._start_time = time.time()
@@ -50,7 +50,8 @@ class BatchedVecEnv(VecEnv):
         """Start N episodes: y_0, ``(N, *obs)``. The true states x_0 are in ``reset_infos``."""
         if any(self._options):
             raise ValueError(
-                f"{type(self.env).__name__} takes no reset options; variations are keywords of its constructor (env_kwargs)"
+                f"{type(self.env).__name__} takes no reset options; variations are keywords of its constructor "
+                "(env_kwargs)"
             )
         if self._seeds[0] is not None:
             gym.Env.reset(self.env, seed=self._seeds[0])
@@ -102,7 +103,9 @@ class BatchedVecEnv(VecEnv):
         """Set an attribute of the one environment that all episodes share."""
         setattr(self.env, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
         """Call a method of the one environment; its result stands once for each index."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [result for _ in self._get_indices(indices)]
@@ -113,7 +116,7 @@ class BatchedVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render every episode by its current state."""
-        images = []
+        images: list[Any] = []
         batch_state = self.env._state
         for state in self._state:
             self.env._state = state[None]
@@ -146,7 +149,7 @@ def make_episodes_env(
     spec = gym.spec(env_id)
     creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
     if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
-        env = creator(**{**spec.kwargs, **env_kwargs})
+        env = cast(POMDPEnv, creator(**{**spec.kwargs, **env_kwargs}))
         env.spec = spec
         vec_env: VecEnv = BatchedVecEnv(env, n_envs or n_episodes)
         vec_env.seed(seed)

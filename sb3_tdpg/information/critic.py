@@ -7,7 +7,7 @@ Dimension key: T time steps, N episodes, B minibatch, K marginal samples for eac
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch as th
@@ -155,25 +155,59 @@ class CriticEstimator(InformationEstimator):
         """Gradient ascent on the objective; ``critic`` has one network for each row of ``states`` and ``trvs``."""
         n_rows, n_episodes = trvs.shape[:2]
         n = min(self.batch_size, n_episodes // 2)
-        subset = None if len(steps) == n_rows else steps
-        for _ in range(n_gradient_steps):
-            if alive is None:
-                chosen = th.randperm(n_episodes, device=trvs.device)[: 2 * n]
-                batch_states, batch_trvs = states[:, chosen[:n]], trvs[:, chosen]
+        # Without a critic for every row (a refit) the rows are those of `steps`; otherwise `steps` picks rows.
+        rows = slice(None) if len(steps) == n_rows else steps
+        by_hand = self.activation_fn is nn.ELU
+        for inputs in self._minibatches(states, trvs, alive, n, n_gradient_steps):
+            if by_hand:
+                values, hidden = critic.forward_keeping_hidden(inputs)
+                critic.set_gradients(hidden, self._objective_gradient(values, n, rows, steps))
             else:
-                # Dead episodes sort to the end; steps with fewer than 2n living ones are not in `steps`.
-                priority = th.rand(alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
-                chosen = priority.argsort(dim=1)[:, : 2 * n, None]
-                batch_states = states.take_along_dim(chosen[:, :n], dim=1)
-                batch_trvs = trvs.take_along_dim(chosen, dim=1)
-            inputs = self._pair(batch_states, batch_trvs[:, :n], batch_trvs[:, n:])
-            scores = self._split(critic(inputs), n)
-            if subset is not None:
-                scores = Scores(scores.joint[subset], scores.marginal[subset])
-            loss = -self._objective(scores, steps).sum()
-            optimizer.zero_grad()
-            loss.backward()
+                optimizer.zero_grad()
+                values = critic(inputs)
+                values.backward(self._objective_gradient(values.detach(), n, rows, steps))
             optimizer.step()
+
+    def _minibatches(
+        self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, n: int, n_gradient_steps: int
+    ) -> Iterator[th.Tensor]:
+        """Draw the critics' inputs for each gradient step: n joint samples, and TRVs of n other episodes."""
+        n_rows, n_episodes = trvs.shape[:2]
+        # Many steps are drawn at a time, as far as memory allows: one call costs as much as one step of the network.
+        per_step = n_rows * (n_episodes + self._n_pairs(n) * sum(self.sizes[:1]))
+        chunk = max(1, min(n_gradient_steps, 4_000_000 // per_step))
+        for start in range(0, n_gradient_steps, chunk):
+            size = min(chunk, n_gradient_steps - start)
+            if alive is None:
+                chosen = th.rand(size, 1, n_episodes, device=trvs.device).argsort(dim=2)[..., : 2 * n]
+            else:
+                # Dead episodes sort to the end; steps with fewer than 2n living ones are not trained on.
+                priority = th.rand(size, *alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
+                chosen = priority.argsort(dim=2)[..., : 2 * n]
+            row = th.arange(n_rows, device=trvs.device)[:, None]
+            chosen_trvs = trvs[row, chosen]  # (size, T, 2 n, Z)
+            inputs = self._pair(states[row, chosen[..., :n]], chosen_trvs[..., :n, :], chosen_trvs[..., n:, :])
+            yield from inputs
+
+    def _n_pairs(self, n: int) -> int:
+        """How many samples a minibatch of n makes for the critic."""
+        return 2 * n
+
+    def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
+        """
+        Differentiate minus the objective with respect to the critic's outputs.
+
+        :param values: outputs for the inputs that :meth:`_pair` laid out, ``(T, B + B * K, 1)``
+        :param n: minibatch size B
+        :param rows: the rows of ``values`` that count
+        :param steps: their time steps
+        :return: ``(T, B + B * K, 1)``
+        """
+        with th.enable_grad():
+            values = values.requires_grad_()
+            scores = self._split(values, n)
+            loss = -self._objective(Scores(scores.joint[rows], scores.marginal[rows]), steps).sum()
+            return th.autograd.grad(loss, values)[0]
 
     @th.no_grad()
     def _is_broken(self, batch: InformationBatch) -> th.Tensor:

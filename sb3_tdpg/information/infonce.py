@@ -30,6 +30,9 @@ class InfoNCE(CriticEstimator):
         joint = th.cat([states, trvs], -1)
         return th.cat([joint, th.cat([grid_states, grid_trvs], -1)], dim=-2)
 
+    def _n_pairs(self, n: int) -> int:
+        return n + n * n
+
     def _bound(self, scores: Scores) -> th.Tensor:
         partition = th.logsumexp(scores.marginal, dim=2) - math.log(scores.marginal.shape[2])
         return (scores.joint - partition).mean(dim=1)

@@ -18,7 +18,8 @@ class LeaveOneOut(InformationEstimator):
         \frac{q(\tilde x_i | e_i)}{\frac{1}{N-1} \sum_{j \ne i} q(\tilde x_i | e_j)}\right],
         \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    An upper bound in expectation. It makes no assumption about the shape of q(x~_t), and becomes loose above about ln N.
+    An upper bound in expectation. It makes no assumption about the shape of q(x~_t), and becomes loose above about
+    ln N.
     """
 
     bound = "upper"

@@ -25,8 +25,8 @@ class Mine(CriticEstimator):
 
     :param ema_decay: With it the denominator of the critic's gradient (eq:grad mine) is an exponential moving average
         over the gradient steps, to lessen the bias of minibatches. It is the weight **on the past**: 0.99 averages over
-        about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging. ``None``: each
-        minibatch's own mean.
+        about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging.
+        ``None``: each minibatch's own mean.
     :param kwargs: See :class:`~sb3_tdpg.information.critic.CriticEstimator`.
     :raises ValueError: if ``ema_decay`` is not in [0, 1).
     """
@@ -48,18 +48,26 @@ class Mine(CriticEstimator):
     def _bound(self, scores: Scores) -> th.Tensor:
         return scores.joint.mean(dim=1) - log_mean_exp(scores.marginal)
 
-    def _objective(self, scores: Scores, steps: th.Tensor) -> th.Tensor:
-        if self.ema_decay is None:
-            return self._bound(scores)
-        log_mean = log_mean_exp(scores.marginal)
-        with th.no_grad():
-            past, new = self.log_ema[steps], log_mean.detach()
-            decay = max(self.ema_decay, 1e-38)
-            mixed = th.logaddexp(past + math.log(decay), new + math.log1p(-self.ema_decay))
-            log_ema = th.where(th.isnan(past), new, mixed)
-            self.log_ema[steps] = log_ema
-        # The gradient of log E[e^F] is E[F' e^F] / E[e^F]: the denominator is replaced by its moving average.
-        return scores.joint.mean(dim=1) - th.exp(log_mean - log_ema)
+    def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
+        """Differentiate in closed form (eq:grad mine): -1 / B at the joint samples, a softmax at the marginal ones."""
+        gradient = th.zeros_like(values)
+        marginal = values[rows, n:, 0]
+        gradient[rows, :n, 0] = -1.0 / n
+        weights = th.softmax(marginal, dim=1)
+        if self.ema_decay is not None:
+            log_mean = log_mean_exp(marginal)
+            weights = weights * th.exp(log_mean - self._update_log_ema(log_mean, steps))[:, None]
+        gradient[rows, n:, 0] = weights
+        return gradient
+
+    def _update_log_ema(self, log_mean: th.Tensor, steps: th.Tensor) -> th.Tensor:
+        """Move the average of the denominator towards this minibatch's; in logarithms, since e^F overflows."""
+        assert self.ema_decay is not None
+        past = self.log_ema[steps]
+        log_decay = math.log(self.ema_decay) if self.ema_decay > 0 else -math.inf
+        mixed = th.logaddexp(past + log_decay, log_mean + math.log1p(-self.ema_decay))
+        self.log_ema[steps] = th.where(th.isnan(past), log_mean, mixed)
+        return self.log_ema[steps]
 
     def _forget(self, steps: th.Tensor) -> None:
         self.log_ema[steps] = math.nan

@@ -1,0 +1,60 @@
+"""The state of every random number generator that a training draws from."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv
+
+
+@dataclass(frozen=True)
+class RandomState:
+    """
+    A snapshot of Python's, NumPy's, torch's and the environments' generators.
+
+    :param python: State of :mod:`random`.
+    :param numpy: State of NumPy's global generator.
+    :param torch: State of torch's CPU generator.
+    :param cuda: States of the CUDA generators, one for each device; empty without CUDA.
+    :param env: ``np_random`` of each environment.
+    """
+
+    python: tuple[Any, ...]
+    numpy: dict[str, Any]
+    torch: th.Tensor
+    cuda: list[th.Tensor]
+    env: list[np.random.Generator]
+
+    @classmethod
+    def capture(cls, env: VecEnv) -> RandomState:
+        """Take the snapshot. The environments' generators are shared with them until it is pickled."""
+        return cls(
+            random.getstate(),
+            np.random.get_state(legacy=False),  # noqa: NPY002  (environments of others may still use it)
+            th.get_rng_state(),
+            th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+            env.get_attr("np_random"),
+        )
+
+    def restore(self, env: VecEnv) -> None:
+        """
+        Put all generators back.
+
+        :raises ValueError: if the number of environments is another one.
+        """
+        if len(self.env) != env.num_envs:
+            raise ValueError(
+                f"the checkpoint was made with {len(self.env)} environments, the model now has {env.num_envs}: "
+                "resume with as many"
+            )
+        random.setstate(self.python)
+        np.random.set_state(self.numpy)  # noqa: NPY002
+        th.set_rng_state(self.torch)
+        if th.cuda.is_available() and self.cuda:
+            th.cuda.set_rng_state_all(self.cuda)
+        for i, generator in enumerate(self.env):
+            env.set_attr("np_random", generator, indices=i)

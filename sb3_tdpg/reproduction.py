@@ -1,0 +1,313 @@
+"""The lava problem from training to table and figures: a quick demonstration, and the full reproduction of Table I."""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch as th
+from tqdm import tqdm
+
+from sb3_tdpg.callbacks import write_atomically
+from sb3_tdpg.envs.scenarios import LAVA, LAVA_TABLE_READING
+from sb3_tdpg.evaluation import (
+    add_ratio,
+    aggregate_seeds,
+    comparison_markdown,
+    cost_histograms,
+    lava_trajectories,
+    provenance,
+    save_figure,
+    summary_table,
+    training_curves,
+    write_frame_atomically,
+    write_run_config,
+)
+from sb3_tdpg.runs import Run, complete_run, read_progress
+from sb3_tdpg.tdpg import TDPG
+
+READINGS = ("table", "text")
+"""Readings of the lava problem: the one that fits Table I, and the one that the paper's text describes."""
+
+# Method -> block of hyperparams/tdpg.yml, to which "-table" is added for the table's reading.
+METHODS = {"PG": "Lava-v0-pg", "TDPG": "Lava-v0", "TDPG (log-det)": "Lava-v0-logdet"}
+
+# Goals of the reproduction by reading: the largest mean, standard deviation and ratio (sigma^2 = 1 over training).
+GOALS: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = {
+    "table": {"PG": (14.0, None, None), "TDPG": (28.0, 10.0, 1.05), "TDPG (log-det)": (28.0, 10.0, 1.05)},
+    "text": {"PG": (12.0, None, None), "TDPG": (20.0, 10.0, 1.10), "TDPG (log-det)": (20.0, 10.0, 1.10)},
+}
+
+PAPER_INVERSE_BETAS = (25, 50, 75, 100)
+
+
+def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
+    """
+    Name a run of the lava problem.
+
+    :param method: A key of :data:`METHODS`.
+    :param reading: ``"table"`` or ``"text"``.
+    :param seed: Training seed.
+    :param overrides: Settings that replace those of the block.
+    """
+    return Run(method, "Lava-v0", METHODS[method] + ("-table" if reading == "table" else ""), seed, overrides)
+
+
+def env_kwargs_of(reading: str) -> dict[str, Any]:
+    """Return the environment keywords of a reading."""
+    return dict(LAVA_TABLE_READING) if reading == "table" else {}
+
+
+# -- the demonstration ----------------------------------------------------------------------------------------
+
+
+def demo(
+    out: Path, *, reading: str = "table", seed: int = 0, n_eval_episodes: int = 1000, n_timesteps: int | None = None
+) -> str:
+    """
+    Train PG and TDPG on the lava problem, compare them on the rows of Table I, draw the figures.
+
+    :param out: Folder for ``episodes.csv``, ``table.md``, ``histograms.png``, ``trajectories.png``, ``training.png``,
+        ``config.json`` and the runs with their models.
+    :param reading: ``"table"`` or ``"text"``.
+    :param seed: Training seed.
+    :param n_eval_episodes: Episodes of each row.
+    :param n_timesteps: Environment steps of each training; default: as in the block.
+    :return: the table
+    """
+    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
+    folders = {run.method: out / "runs" / _folder_name(run) for run in runs}
+    with _threads(1):  # the networks are small: more threads are slower
+        for run in runs:
+            print(f"{run.method}: training and evaluating, {folders[run.method]}")
+            complete_run(run, folders[run.method], LAVA, n_eval_episodes=n_eval_episodes, progress_bar=True)
+
+        records = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders.values()], ignore_index=True)
+        models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
+        table = comparison_markdown(summary_table(records).drop(columns="train_seed"), LAVA)
+        write_frame_atomically(records, out / "episodes.csv")
+        write_atomically(out / "table.md", table + "\n")
+        save_figure(cost_histograms(records, LAVA), out / "histograms.png")
+        save_figure(lava_trajectories(models, env_kwargs_of(reading)), out / "trajectories.png")
+        save_figure(training_curves({m: read_progress(f) for m, f in folders.items()}), out / "training.png")
+        for method, model in models.items():
+            model.save(out / f"{method.lower()}.zip")
+    write_run_config(out / "config.json", dict(reading=reading, runs=[run.config for run in runs]))
+    return table
+
+
+# -- the reproduction -----------------------------------------------------------------------------------------
+
+
+def paper_runs(n_seeds: int) -> list[Run]:
+    """
+    List the runs with the paper's own settings, on the table's reading: PG, and TDPG for each beta of the sweep.
+
+    See the block ``Lava-v0-paper`` for what is set as printed.
+    """
+    runs = []
+    for seed in range(n_seeds):
+        base = Run("paper's PG", "Lava-v0", "Lava-v0-paper-pg", seed)
+        runs.append(base)
+        for inverse_beta in PAPER_INVERSE_BETAS:
+            label = f"paper's TDPG, 1/beta = {inverse_beta}"
+            runs.append(replace(base, method=label, block="Lava-v0-paper", overrides={"beta": 1 / inverse_beta}))
+    return runs
+
+
+def reproduce_lava(
+    out: Path,
+    *,
+    n_seeds: int = 10,
+    n_paper_seeds: int = 3,
+    n_eval_episodes: int = 1000,
+    n_timesteps: int | None = None,
+    jobs: int | None = None,
+) -> str:
+    """
+    Train every method on both readings with many seeds, and the paper's own settings; write tables, figures and
+    records.
+
+    Finished runs are kept: the same call goes on where an interrupted one stopped.
+
+    :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes_*.csv.gz``, figures, ``config.json`` and ``runs/``.
+    :param n_seeds: Training seeds of each method.
+    :param n_paper_seeds: Training seeds of the paper's own settings.
+    :param n_eval_episodes: Episodes of each row of Table I.
+    :param n_timesteps: Environment steps of each training; default: as in the blocks.
+    :param jobs: Runs at a time; default: the number of cores.
+    :return: the summary, as Markdown
+    """
+    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    # Longest first, so that the cores finish together.
+    groups: dict[str, list[Run]] = {
+        reading: [lava_run(m, reading, seed, **overrides) for m in reversed(METHODS) for seed in range(n_seeds)]
+        for reading in READINGS
+    }
+    groups["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
+    folders = {group: [out / "runs" / group / _folder_name(run) for run in runs] for group, runs in groups.items()}
+    tasks = [(run, folder) for group in groups for run, folder in zip(groups[group], folders[group], strict=True)]
+    tasks.sort(key=lambda task: task[0].method != "TDPG")
+    _complete_all(tasks, n_eval_episodes, jobs or os.cpu_count() or 1)
+
+    sections, seed_tables = [], []
+    for group in groups:
+        records = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders[group]], ignore_index=True)
+        records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
+        columns = ["model", "train_seed", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
+        write_frame_atomically(records[columns].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
+        seeds = _seed_table(records)
+        seed_tables.append(seeds.assign(group=group))
+        sections.append(_section(group, records, seeds))
+        if group in READINGS:
+            first = {
+                run.method: folder for run, folder in zip(groups[group], folders[group], strict=True) if run.seed == 0
+            }
+            shown = {method: TDPG.load(first[method] / "model.zip", device="cpu") for method in METHODS}
+            one_seed = records[(records["train_seed"] == 0) & records["model"].isin(["PG", "TDPG"])]
+            save_figure(cost_histograms(one_seed, LAVA), out / f"histograms_{group}.png")
+            save_figure(lava_trajectories(shown, env_kwargs_of(group)), out / f"trajectories_{group}.png")
+            save_figure(training_curves({m: read_progress(first[m]) for m in METHODS}), out / f"training_{group}.png")
+    write_frame_atomically(pd.concat(seed_tables, ignore_index=True), out / "seeds.csv")
+    how = provenance()
+    write_run_config(
+        out / "config.json", dict(runs=[run.config for runs in groups.values() for run in runs], provenance=how)
+    )
+    summary = "\n\n".join(["# The lava problem (Table I)", *sections, _how_made(how)]) + "\n"
+    write_atomically(out / "summary.md", summary)
+    return summary
+
+
+def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
+    """
+    Return for each method and seed: mean and standard deviation in training, and the ratio of the noisiest row
+    to it.
+    """
+    summary = add_ratio(summary_table(records))
+    keys = ["model", "train_seed"]
+    training = summary[summary["scenario"] == LAVA[0].name].set_index(keys)[["mean", "std"]]
+    noisiest = summary[summary["scenario"] == LAVA[-1].name].set_index(keys)[["ratio"]]
+    selected = records.groupby(keys)["selected"].first()
+    return training.join(noisiest).join(selected).reset_index()
+
+
+def _section(group: str, records: pd.DataFrame, seeds: pd.DataFrame) -> str:
+    titles = {"table": "The table's reading", "text": "The text's reading", "paper": "The paper's own settings"}
+    parts = [f"## {titles[group]}", comparison_markdown(aggregate_seeds(records), LAVA)]
+    lines = [
+        "| method | seeds | training mean: mean over seeds (worst) | std: mean (worst) | ratio: mean (worst) | goals |"
+    ]
+    lines += ["|---|---|---|---|---|---|"]
+    for method, rows in seeds.groupby("model", sort=False):
+        spread = [f"{rows[c].mean():.3g} ({rows[c].max():.3g})" for c in ("mean", "std", "ratio")]
+        goal = GOALS.get(group, {}).get(str(method))
+        lines.append(f"| {method} | {len(rows)} | {' | '.join(spread)} | {_verdict(rows, goal)} |")
+    parts.append("\n".join(lines))
+    parts.append(
+        "Every seed (cost in training; std over episodes; ratio of the mean at sigma^2 = 1 to that in training; "
+        "selected: "
+        "an epoch met the limits):"
+    )
+    parts.append(_markdown(seeds))
+    return "\n\n".join(parts)
+
+
+def _verdict(rows: pd.DataFrame, goal: tuple[float, float | None, float | None] | None) -> str:
+    """Hold one method's seeds against its goals."""
+    if goal is None:
+        return "none set"
+    mean, std, ratio = goal
+    checks = [f"mean <= {mean:g}: {_met(rows['mean'].mean() <= mean)}"]
+    if std is not None:
+        checks.append(f"std <= {std:g}: {_met(rows['std'].mean() <= std)}")
+    if ratio is not None:
+        checks.append(f"ratio <= {ratio:g}: {(rows['ratio'] <= ratio).sum()} of {len(rows)} seeds")
+    return "; ".join(checks)
+
+
+def _met(condition: bool) -> str:
+    return "met" if condition else "MISSED"
+
+
+def _markdown(frame: pd.DataFrame) -> str:
+    header = [f"| {' | '.join(frame.columns)} |", "|" + "---|" * len(frame.columns)]
+    cells = ([f"{x:.3f}" if isinstance(x, float) else str(x) for x in row] for row in frame.itertuples(index=False))
+    return "\n".join([*header, *(f"| {' | '.join(row)} |" for row in cells)])
+
+
+def _how_made(how: Mapping[str, Any]) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
+    git = how["git"]
+    commit = (
+        "outside a checkout" if git is None else git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
+    )
+    return f"Made by `make reproduce-lava` at commit {commit}, {how['utc_time']}, {versions}. {how['platform']}."
+
+
+# -- running many ---------------------------------------------------------------------------------------------
+
+
+def _complete_all(tasks: Sequence[tuple[Run, Path]], n_eval_episodes: int, jobs: int) -> None:
+    """Complete runs in parallel processes with a progress bar; Ctrl-C keeps what is finished."""
+    context = mp.get_context("spawn")
+    with (
+        tqdm(total=len(tasks), unit="run", smoothing=0.1) as progress,
+        ProcessPoolExecutor(jobs, context, initializer=_init_worker) as pool,
+    ):
+        futures = {pool.submit(complete_run, *task, LAVA, n_eval_episodes=n_eval_episodes): task for task in tasks}
+        try:
+            for future in _as_finished(futures):
+                future.result()
+                progress.set_postfix_str(str(futures[future][1].name), refresh=False)
+                progress.update()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in list(getattr(pool, "_processes", {}).values()):
+                process.terminate()
+            progress.write("stopped; finished runs and checkpoints are kept, and the same command goes on from them")
+            raise
+
+
+def _as_finished(futures: Mapping[Future[Path], Any]) -> Iterator[Future[Path]]:
+    pending = set(futures)
+    while pending:
+        # With a timeout, so that Ctrl-C is seen at once.
+        finished, pending = wait(pending, timeout=1.0, return_when=FIRST_COMPLETED)
+        yield from finished
+
+
+def _init_worker() -> None:
+    th.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+
+
+class _threads:
+    """Run a block of code with this many torch threads."""
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+
+    def __enter__(self) -> None:
+        self.before = th.get_num_threads()
+        th.set_num_threads(self.n)
+
+    def __exit__(self, *_: object) -> None:
+        th.set_num_threads(self.before)
+
+
+def _folder_name(run: Run) -> str:
+    label = "".join(c if c.isalnum() else "-" for c in run.method.lower())
+    return f"{'-'.join(filter(None, label.split('-')))}-seed{run.seed}"
+
+
+def _method_order(column: pd.Series) -> pd.Series:
+    order = {method: i for i, method in enumerate(METHODS)}
+    return column.map(lambda x: order.get(x, len(order))) if column.name == "model" else column

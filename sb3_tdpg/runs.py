@@ -1,0 +1,142 @@
+"""One training run from its settings to its per-episode records, in a folder that can be resumed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from stable_baselines3.common.logger import Logger, make_output_format
+
+from sb3_tdpg.callbacks import TrainingCheckpointCallback
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios, write_frame_atomically, write_run_config
+from sb3_tdpg.evaluation.provenance import jsonable
+from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.training import make_training
+
+CHECKPOINT_EPOCHS = 50
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One method with one seed.
+
+    :param method: The label in tables ("PG", "TDPG").
+    :param env_id: The training environment.
+    :param block: Block of ``hyperparams/tdpg.yml``.
+    :param seed: Training seed.
+    :param overrides: Settings that replace those of the block.
+    """
+
+    method: str
+    env_id: str
+    block: str
+    seed: int
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The block with the overrides."""
+        return {**load_hyperparams(self.block), **self.overrides}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What makes this run."""
+        return dict(method=self.method, env_id=self.env_id, block=self.block, seed=self.seed, settings=self.settings)
+
+
+def complete_run(
+    run: Run,
+    folder: Path,
+    scenarios: Sequence[Scenario],
+    *,
+    n_eval_episodes: int = 1000,
+    progress_bar: bool = False,
+) -> Path:
+    """
+    Train and evaluate, or go on where an earlier call was interrupted, or do nothing if it was finished.
+
+    ``folder`` then holds ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information),
+    ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings, seeds, versions, commit) and,
+    written last, ``episodes.csv`` (a row for each evaluation episode).
+
+    :param run: What to train.
+    :param folder: Where to.
+    :param scenarios: What to evaluate; the environment keywords of the run apply beneath those of a scenario.
+    :param n_eval_episodes: Episodes of each scenario.
+    :param progress_bar: Show progress bars.
+    :return: ``folder``
+    :raises ValueError: if the folder holds a run with other settings; nothing of it is touched.
+    """
+    config = {**run.config, "n_eval_episodes": n_eval_episodes}
+    _check_same_run(folder / "config.json", config)
+    if (folder / "episodes.csv").exists():
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "config.json").exists():
+        write_run_config(folder / "config.json", config)
+
+    model, selected = _train(run, folder, progress_bar)
+    model.save(folder / "model.zip")
+    records = evaluate_scenarios(
+        {run.method: model},
+        scenarios,
+        n_eval_episodes,
+        env_kwargs=run.settings.get("env_kwargs"),
+        labels=dict(train_seed=run.seed, selected=selected),
+        progress_bar=progress_bar,
+    )
+    write_frame_atomically(records, folder / "episodes.csv")
+    (folder / "checkpoint.zip").unlink(missing_ok=True)
+    (folder / "selected.zip").unlink(missing_ok=True)
+    return folder
+
+
+def _check_same_run(path: Path, config: Mapping[str, Any]) -> None:
+    if not path.exists():
+        return
+    found = json.loads(path.read_text())
+    found.pop("provenance")
+    wanted = jsonable(config)
+    if found != wanted:
+        changed = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+        raise ValueError(
+            f"{path.parent} holds a run with another {', '.join(changed)}: choose another folder or remove it"
+        )
+
+
+def _train(run: Run, folder: Path, progress_bar: bool) -> tuple[TDPG, bool]:
+    """Return the selected policy, and whether any epoch met the limits (otherwise it is the last epoch's)."""
+    training = make_training(run.env_id, run.settings, seed=run.seed, device="cpu")
+    checkpoint = folder / "checkpoint.zip"
+    n_timesteps, model = training.n_timesteps, training.model
+    if checkpoint.exists():
+        model = TDPG.load(checkpoint, env=model.env, device="cpu")
+        n_timesteps = model.remaining_timesteps
+    log = make_output_format("csv", str(folder), log_suffix=f"_{model.num_timesteps:08d}")
+    model.set_logger(Logger(str(folder), [log]))
+    callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, CHECKPOINT_EPOCHS)]
+    selection = training.selection
+    if selection is not None:
+        selection.save_path = folder / "selected.zip"
+    model.learn(n_timesteps, callbacks, reset_num_timesteps=not checkpoint.exists(), progress_bar=progress_bar)
+    if selection is None or selection.best is None:
+        return model, False
+    selection.restore(model)
+    return model, True
+
+
+def read_progress(folder: Path) -> pd.DataFrame:
+    """Return the training log of a run, also of one that was resumed, one row for each epoch."""
+    frames = [pd.read_csv(path) for path in sorted(folder.glob("progress_*.csv"))]
+    log = pd.concat([frame for frame in frames if len(frame)], ignore_index=True)
+    # Epochs after the last checkpoint were run again, with the same numbers.
+    return log.drop_duplicates("time/total_timesteps", keep="last").sort_values(
+        "time/total_timesteps", ignore_index=True
+    )

@@ -1,0 +1,69 @@
+"""From a block of ``hyperparams/tdpg.yml`` to a model that is ready to learn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_tdpg.callbacks import SelectionCallback
+from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.vec_env import make_episodes_env
+
+
+class Training(NamedTuple):
+    """A model, what is to be called while it learns, and for how long."""
+
+    model: TDPG
+    callbacks: list[BaseCallback]
+    n_timesteps: int
+
+    @property
+    def selection(self) -> SelectionCallback | None:
+        """The callback that selects the policy, if the block has one."""
+        return next((c for c in self.callbacks if isinstance(c, SelectionCallback)), None)
+
+
+def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Training:
+    """
+    Build model and callbacks from a block of settings, read as rl-zoo3 reads it.
+
+    ``n_timesteps``, ``env_kwargs`` and ``callback`` are the zoo's keys; ``lin_1e-3`` is a learning rate that falls
+    linearly to zero; every other key is an argument of :class:`~sb3_tdpg.tdpg.TDPG`.
+
+    :param env_id: A registered id.
+    :param block: The settings, as :func:`sb3_tdpg.hyperparams.load_hyperparams` gives them.
+    :param overrides: Settings that replace those of the block, or arguments of :class:`TDPG` beside them.
+    """
+    settings = {**block, **overrides}
+    n_timesteps = int(settings.pop("n_timesteps"))
+    callbacks = [_make_callback(entry) for entry in settings.pop("callback", [])]
+    env_kwargs = settings.pop("env_kwargs", {})
+    env = make_episodes_env(
+        env_id, settings.pop("n_envs", None), n_episodes=settings.get("n_episodes", 500), env_kwargs=env_kwargs
+    )
+    rate = settings.get("learning_rate")
+    if isinstance(rate, str):
+        settings["learning_rate"] = _make_schedule(rate)
+    return Training(TDPG(settings.pop("policy"), env, **settings), callbacks, n_timesteps)
+
+
+def _make_callback(entry: str | Mapping[str, Mapping[str, Any]]) -> BaseCallback:
+    """``{"package.module.Class": {keywords}}`` or ``"package.module.Class"``."""
+    (path, keywords), *more = [(entry, {})] if isinstance(entry, str) else entry.items()
+    if more:
+        raise ValueError(f"a callback is one class with its keywords, not {entry}")
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name)(**keywords)
+
+
+def _make_schedule(text: str) -> LinearSchedule:
+    kind, _, value = text.partition("_")
+    if kind != "lin":
+        raise ValueError(
+            f"learning_rate={text!r} must be a number or 'lin_' and a number (YAML: write 1.0e-3, not 1e-3)"
+        )
+    return LinearSchedule(float(value), 0.0, 1.0)

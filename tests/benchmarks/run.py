@@ -1,0 +1,327 @@
+"""
+``make bench``: what batching is worth, as ratios measured in this run on one thread.
+
+Every ratio compares two ways to do the same thing, run in turn (A B A B ...), by the medians of their CPU times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+# Before NumPy and PyTorch start their threads.
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
+REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY))
+
+import numpy as np  # noqa: E402
+import torch as th  # noqa: E402
+from sb3_contrib import RecurrentPPO  # noqa: E402
+from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
+from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
+from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
+from torch import nn  # noqa: E402
+
+from sb3_tdpg import TDPG, make_episodes_env  # noqa: E402
+from sb3_tdpg.information import InformationBatch, Mine  # noqa: E402
+from tests.reference_loop import LoopTDPG, draw_randomness, unbatch  # noqa: E402
+
+PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
+SEED = 0
+
+
+class Sizes(NamedTuple):
+    """How much is measured."""
+
+    n_episodes: int
+    repetitions: int
+    loop_repetitions: int  # of the per-sample loop, which takes many seconds
+    epochs: int  # policy epochs in one measurement of a batched algorithm
+
+
+FULL = Sizes(n_episodes=500, repetitions=7, loop_repetitions=3, epochs=10)
+QUICK = Sizes(n_episodes=100, repetitions=3, loop_repetitions=1, epochs=3)
+
+
+class Row(NamedTuple):
+    """One line of the table; times are medians in seconds."""
+
+    what: str
+    ours: float
+    reference: float
+    lowest: float  # ratio of a repetition
+    highest: float
+    goal: float | None
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster ours is."""
+        return self.reference / self.ours
+
+    @property
+    def met(self) -> str:
+        """Whether the goal is met."""
+        return "-" if self.goal is None else "yes" if self.ratio >= self.goal else "no"
+
+
+def compare(
+    what: str,
+    ours: Callable[[], float],
+    reference: Callable[[], float],
+    repetitions: int,
+    goal: float | None = None,
+) -> Row:
+    """
+    Measure two functions in turn, after one call of each that does not count.
+
+    :param ours: returns its cost in seconds for each unit of work
+    :param reference: likewise
+    """
+    ours()
+    reference()
+    times = [(ours(), reference()) for _ in range(repetitions)]
+    our_time, reference_time = (statistics.median(column) for column in zip(*times, strict=True))
+    ratios = [theirs / mine for mine, theirs in times]
+    row = Row(what, our_time, reference_time, min(ratios), max(ratios), goal)
+    print(f"{row.what}: {row.ratio:.1f}x", flush=True)
+    return row
+
+
+def seconds(function: Callable[[], object], units: int = 1) -> float:
+    """CPU time of a call for each of the units of work that it does: not disturbed by other processes."""
+    start = time.process_time()
+    function()
+    return (time.process_time() - start) / units
+
+
+# -- (a) a policy epoch -----------------------------------------------------------------------------------------------
+
+
+def make_tdpg(n_episodes: int, *, beta: float = 1 / 75, baseline: str = "value") -> TDPG:
+    """TDPG on Lava with its default sizes."""
+    return TDPG("TRVPolicy", "Lava-v0", beta=beta, baseline=baseline, n_episodes=n_episodes, seed=SEED, device="cpu")
+
+
+def learner(model: BaseAlgorithm, epochs: int, steps_per_epoch: int) -> Callable[[], None]:
+    """Return a function that trains a model on for some epochs; the first, with its warm-up, is made here."""
+    model.learn(steps_per_epoch)
+    return lambda: model.learn(epochs * steps_per_epoch, reset_num_timesteps=False)
+
+
+def bench_epoch(sizes: Sizes) -> Iterable[Row]:
+    """Compare an epoch of TDPG with the loop over samples, time steps and critics."""
+    n = sizes.n_episodes
+    # The mean baseline of the paper; the loop makes no regression.
+    model = make_tdpg(n, baseline="mean")
+    loop = LoopTDPG.copy_of(model)
+    learn = learner(model, sizes.epochs, n * model.horizon)
+    rng = np.random.default_rng(SEED)
+    yield compare(
+        f"policy epoch, N={n}, T={model.horizon}, {model.estimator.gradient_steps} MINE steps of "
+        f"{model.estimator.batch_size}: TDPG against a loop over samples",
+        lambda: seconds(learn, sizes.epochs),
+        lambda: seconds(lambda: loop.epoch(draw_randomness(model, rng))),
+        sizes.loop_repetitions,
+        goal=100,
+    )
+
+
+# -- (b) the critics --------------------------------------------------------------------------------------------------
+
+
+def correlated_gaussians(horizon: int, n: int, dim: int = 2) -> InformationBatch:
+    """Make states and TRVs that tell of each other."""
+    generator = th.Generator().manual_seed(SEED)
+    means = th.randn(horizon, n, dim, generator=generator)
+    stds = th.full_like(means, 0.5)
+    return InformationBatch(means, means + stds * th.randn(means.shape, generator=generator), means, stds)
+
+
+def fit_one_by_one(
+    critics: list[nn.Sequential], optimizers: list[th.optim.Adam], batch: InformationBatch, size: int, n_steps: int
+) -> None:
+    """Fit critics in a loop: a network, a backward pass and an optimiser for each."""
+    for _ in range(n_steps):
+        chosen = th.randperm(batch.trvs.shape[1])
+        own, other = chosen[:size], chosen[size : 2 * size]
+        for t, (critic, optimizer) in enumerate(zip(critics, optimizers, strict=True)):
+            states, trvs, others = batch.states[t, own], batch.trvs[t, own], batch.trvs[t, other]
+            # One call for both distributions: the fastest loop.
+            values = critic(th.cat([th.cat([states, trvs], 1), th.cat([states, others], 1)]))
+            joint, marginal = values.chunk(2)
+            loss = -(joint.mean() - marginal.exp().mean().log())
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+
+def bench_critics(sizes: Sizes) -> Iterable[Row]:
+    """Compare one batched network with a loop over T critics, at the sizes of Lava and of grasping."""
+    n_steps = 20 * sizes.epochs
+    for horizon, hidden, size in ((5, 32, 50), (25, 64, 20)):
+        batch = correlated_gaussians(horizon, 500)
+        mine = Mine(
+            horizon,
+            2,
+            2,
+            hidden_sizes=(hidden, hidden),
+            batch_size=size,
+            gradient_steps=n_steps,
+            warmup_gradient_steps=n_steps,
+        )
+        critics = unbatch(mine.critic)
+        optimizers = [th.optim.Adam(critic.parameters(), lr=mine.learning_rate) for critic in critics]
+
+        def fit_batched(mine: Mine = mine, batch: InformationBatch = batch) -> float:
+            return seconds(lambda: mine.fit(batch), n_steps)
+
+        def fit_loop(
+            critics: list[nn.Sequential] = critics,
+            optimizers: list[th.optim.Adam] = optimizers,
+            batch: InformationBatch = batch,
+            size: int = size,
+        ) -> float:
+            return seconds(lambda: fit_one_by_one(critics, optimizers, batch, size, n_steps), n_steps)
+
+        yield compare(
+            f"gradient step of the critics, T={horizon}, hidden {hidden}-{hidden}, B={size}: "
+            "batched against a loop over critics",
+            fit_batched,
+            fit_loop,
+            sizes.repetitions,
+            goal=10,
+        )
+
+
+# -- (c) training -----------------------------------------------------------------------------------------------------
+
+
+def bench_training(sizes: Sizes) -> Iterable[Row]:
+    """Compare the time of training for each environment step with that of RecurrentPPO."""
+    n = sizes.n_episodes
+    for name, beta in (("PG (beta=inf)", float("inf")), ("TDPG (penalty on)", 1 / 75)):
+        model = make_tdpg(n, beta=beta)
+        steps = n * model.horizon
+        learn = learner(model, sizes.epochs, steps)
+        # One pass over all samples at once, as TDPG makes one: smaller minibatches are slower.
+        ppo = RecurrentPPO(
+            "MlpLstmPolicy",
+            make_episodes_env("Lava-v0", n),
+            n_steps=model.horizon,
+            batch_size=steps,
+            n_epochs=1,
+            seed=SEED,
+            device="cpu",
+        )
+        learn_ppo = learner(ppo, 1, steps)
+        yield compare(
+            f"training, for each environment step, n_envs={n}, one pass: {name} against RecurrentPPO",
+            lambda learn=learn, steps=steps: seconds(learn, sizes.epochs * steps),
+            lambda learn=learn_ppo, steps=steps: seconds(learn, steps),
+            sizes.repetitions,
+            goal=3,
+        )
+
+
+# -- (d) the environment ----------------------------------------------------------------------------------------------
+
+
+def bench_environment(sizes: Sizes) -> Iterable[Row]:
+    """Compare the batched environment with SB3's loop over environments."""
+    n = sizes.n_episodes
+
+    def stepper(env: VecEnv, n_steps: int) -> Callable[[], float]:
+        env.reset()
+        actions = np.random.default_rng(SEED).standard_normal((n, 1)).astype(np.float32)
+
+        def run() -> None:
+            for _ in range(n_steps):
+                env.step(actions)
+
+        return lambda: seconds(run, n_steps * n)
+
+    yield compare(
+        f"environment step, n_envs={n}: BatchedVecEnv against DummyVecEnv",
+        stepper(make_episodes_env("Lava-v0", n), 100),
+        stepper(make_vec_env("Lava-v0", n_envs=n), 10),
+        sizes.repetitions,
+    )
+
+
+# -- the table --------------------------------------------------------------------------------------------------------
+
+
+def format_time(value: float) -> str:
+    """Print seconds with a fitting unit and three digits."""
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if value >= scale:
+            return f"{value / scale:.3g} {unit}"
+    return f"{value / 1e-9:.3g} ns"
+
+
+def format_table(rows: Iterable[Row]) -> str:
+    """Lay out the rows as a Markdown table."""
+    lines = ["| what | ours | reference | ratio (lowest-highest) | goal | met |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        goal = "-" if row.goal is None else f"{row.goal:.0f}x"
+        ratio = f"{row.ratio:.1f}x ({row.lowest:.1f}-{row.highest:.1f})"
+        lines.append(
+            f"| {row.what} | {format_time(row.ours)} | {format_time(row.reference)} | {ratio} | {goal} | {row.met} |"
+        )
+    return "\n".join(lines)
+
+
+def describe_machine() -> str:
+    """One line for each of machine, versions, commit."""
+    cpu_info = Path("/proc/cpuinfo")
+    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
+    processor = next((line.split(": ")[1] for line in lines if line.startswith("model name")), platform.processor())
+    versions = ", ".join(f"{package} {version(package)}" for package in PACKAGES)
+    git = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    return "\n".join(
+        [
+            f"- machine: {processor}, {os.cpu_count()} cores, {platform.system()}",
+            f"- versions: Python {platform.python_version()}, {versions}",
+            f"- commit: {git.stdout.strip() or 'unknown'}; torch threads: {th.get_num_threads()}",
+        ]
+    )
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that everything runs (seconds)")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "results" / "bench.md", help="Markdown file to write")
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+    sizes = QUICK if arguments.quick else FULL
+
+    start = time.perf_counter()
+    benches = (bench_epoch, bench_critics, bench_training, bench_environment)
+    rows = [row for bench in benches for row in bench(sizes)]
+    elapsed = time.perf_counter() - start
+    title = "# Speed" + (" (--quick: not the paper's sizes)" if arguments.quick else "")
+    notes = (
+        "CPU time of one thread, medians over repetitions in which both sides take turns; the ratio is that of the "
+        "medians. The first policy epoch, with the critics' warm-up, is not counted. "
+        f"{sizes.repetitions} repetitions ({sizes.loop_repetitions} of the loop over samples), {elapsed:.0f} s in all."
+    )
+    report = "\n\n".join([title, describe_machine(), format_table(rows), notes]) + "\n"
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(report, encoding="utf-8")
+    print(f"\n{report}\nwritten to {arguments.out}")
+
+
+if __name__ == "__main__":
+    main()

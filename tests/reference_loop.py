@@ -1,0 +1,312 @@
+"""
+One policy epoch of TDPG on the lava problem as the plainest loop: one sample, one time step, one critic at a time.
+
+Written from the paper's equations and not from the package, with a module of its own for each time step. The batched
+code must give the same numbers (``test_reference_loop.py``) in a fraction of the time (``benchmarks/run.py``). All that
+is random comes from outside. Only :meth:`LoopTDPG.copy_of` and :func:`draw_randomness` know of the package.
+
+Dimension key: T horizon, N episodes, S gradient steps, B minibatch, X state, Z task-relevant variables (TRVs), U
+action.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.networks import BatchedMLP
+
+GOAL, WALL, LAVA = 3.0, 0.0, 5.0  # m
+
+
+class Minibatch(NamedTuple):
+    """Which episodes the samples of the joint distribution and of the product of its marginals come from."""
+
+    joint: list[int]
+    marginal: list[tuple[int, int]]  # x_t of one episode with x~_t of another
+
+
+class Randomness(NamedTuple):
+    """Everything random of an epoch; arrays are indexed by episode first."""
+
+    initial_distance: np.ndarray  # (N,)
+    sensor_noise: np.ndarray  # (N, T, X), standard normal
+    trv_noise: th.Tensor  # (N, T, Z), eps_t, standard normal
+    action_noise: th.Tensor  # (N, T, U), standard normal
+    minibatches: list[list[Minibatch]]  # T lists of S, to fit the critics
+    pairings: list[Minibatch]  # T, for the estimate that the policy descends
+
+
+@dataclass
+class Episode:
+    """What happened in an episode, one entry for each time step."""
+
+    states: list[th.Tensor] = field(default_factory=list)  # (X,)
+    observations: list[th.Tensor] = field(default_factory=list)  # (X,)
+    trvs: list[th.Tensor] = field(default_factory=list)  # (Z,)
+    actions: list[th.Tensor] = field(default_factory=list)  # (U,)
+    costs: list[float] = field(default_factory=list)
+
+
+@dataclass
+class LoopTDPG:
+    """Modules and optimisers of the loop."""
+
+    encoders: list[nn.Sequential]  # T
+    action_heads: list[nn.Sequential]  # T
+    critics: list[nn.Sequential]  # T
+    policy_learning_rate: float
+    critic_learning_rate: float
+    mi_coef: float
+    encoder_var_floor: float
+    action_var_floor: float
+    sensor_noise_std: float
+    max_action: float
+
+    def __post_init__(self) -> None:
+        self.horizon = len(self.encoders)
+        self.trv_dim = self.encoders[0][-1].out_features // 2
+        parameters = [p for network in self.encoders + self.action_heads for p in network.parameters()]
+        self.optimizer = th.optim.Adam(parameters, lr=self.policy_learning_rate)
+        self.critic_optimizers = [
+            th.optim.Adam(critic.parameters(), lr=self.critic_learning_rate) for critic in self.critics
+        ]
+
+    @classmethod
+    def copy_of(cls, model: TDPG) -> LoopTDPG:
+        """Copy networks and settings of a model of the lava problem whose policy has not been updated yet."""
+        env = model.env.unwrapped.env
+        return cls(
+            encoders=unbatch(model.policy.encoder.mlp),
+            action_heads=unbatch(model.policy.action_head.mlp),
+            critics=unbatch(model.estimator.critic),
+            policy_learning_rate=model.lr_schedule(1.0),
+            critic_learning_rate=model.estimator.learning_rate,
+            mi_coef=1 / model.beta,
+            encoder_var_floor=model.policy.encoder_var_floor,
+            action_var_floor=model.policy.action_var_floor,
+            sensor_noise_std=env.sensor_noise_std,
+            max_action=float(env.action_space.high[0]),
+        )
+
+    def epoch(self, randomness: Randomness) -> None:
+        """Make one policy epoch (alg:trv-policy)."""
+        episodes = self.rollouts(randomness)
+        if self.mi_coef > 0:
+            self.fit_critics(episodes, randomness.minibatches)
+        self.update(episodes, randomness.trv_noise, randomness.pairings, mean_baseline(episodes))
+
+    # -- rollouts -------------------------------------------------------------------------------------------------
+
+    @th.no_grad()
+    def rollouts(self, randomness: Randomness) -> list[Episode]:
+        """Roll out every episode on its own."""
+        return [
+            self.rollout(
+                float(randomness.initial_distance[n]),
+                randomness.sensor_noise[n],
+                randomness.trv_noise[n],
+                randomness.action_noise[n],
+            )
+            for n in range(len(randomness.initial_distance))
+        ]
+
+    def rollout(
+        self, distance: float, sensor_noise: np.ndarray, trv_noise: th.Tensor, action_noise: th.Tensor
+    ) -> Episode:
+        """Roll out one robot."""
+        episode = Episode()
+        velocity = 0.0
+        trv = th.zeros(self.trv_dim)
+        for t in range(self.horizon):
+            observation = th.tensor(
+                [
+                    to_float32(distance + self.sensor_noise_std * float(sensor_noise[t, 0])),
+                    to_float32(velocity + self.sensor_noise_std * float(sensor_noise[t, 1])),
+                ]
+            )
+            mean, variance = self.encode(t, trv, observation)
+            trv = mean + th.sqrt(variance) * trv_noise[t]
+            action_mean, action_variance = self.act(t, trv)
+            action = action_mean + th.sqrt(action_variance) * action_noise[t]
+
+            episode.states.append(th.tensor([distance, velocity]))
+            episode.observations.append(observation)
+            episode.trvs.append(trv)
+            episode.actions.append(action)
+
+            cost = math.hypot(distance - GOAL, velocity)
+            control = min(max(action.item(), -self.max_action), self.max_action)
+            distance, velocity = move(distance, velocity, control)
+            if t == self.horizon - 1:
+                cost += 100 * math.hypot(distance - GOAL, velocity)
+            episode.costs.append(to_float32(cost))
+        return episode
+
+    def encode(self, t: int, prev_trv: th.Tensor, observation: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and variance of q(x~_t | x~_{t-1}, y_t)."""
+        mean, log_variance = self.encoders[t](th.cat([prev_trv, observation])).chunk(2)
+        return mean, th.exp(log_variance) + self.encoder_var_floor
+
+    def act(self, t: int, trv: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and variance of pi(u_t | x~_t)."""
+        mean, log_variance = self.action_heads[t](trv).chunk(2)
+        return mean, th.exp(log_variance) + self.action_var_floor
+
+    # -- mutual information ---------------------------------------------------------------------------------------
+
+    def fit_critics(self, episodes: list[Episode], minibatches: list[list[Minibatch]]) -> None:
+        """Fit one critic after the other (alg:mine)."""
+        for t in range(self.horizon):
+            states = [episode.states[t] for episode in episodes]
+            trvs = [episode.trvs[t] for episode in episodes]
+            for minibatch in minibatches[t]:
+                loss = -self.donsker_varadhan(t, states, trvs, minibatch)
+                self.critic_optimizers[t].zero_grad()
+                loss.backward()
+                self.critic_optimizers[t].step()
+
+    def donsker_varadhan(
+        self, t: int, states: list[th.Tensor], trvs: list[th.Tensor], minibatch: Minibatch
+    ) -> th.Tensor:
+        """The estimate of I[x_t; x~_t] in nats (eq:mine theta fixed), the critic called for one sample at a time."""
+        joint = 0.0
+        for i in minibatch.joint:
+            joint = joint + self.critics[t](th.cat([states[i], trvs[i]]))[0]
+        marginal = 0.0
+        for i, j in minibatch.marginal:
+            marginal = marginal + th.exp(self.critics[t](th.cat([states[i], trvs[j]]))[0])
+        return joint / len(minibatch.joint) - th.log(marginal / len(minibatch.marginal))
+
+    def information(
+        self, episodes: list[Episode], trvs: list[list[th.Tensor]], pairings: list[Minibatch]
+    ) -> list[th.Tensor]:
+        """
+        Estimate I[x_t; x~_t] for every t.
+
+        :param trvs: of each episode at each time step
+        """
+        return [
+            self.donsker_varadhan(t, [e.states[t] for e in episodes], [e[t] for e in trvs], pairings[t])
+            for t in range(self.horizon)
+        ]
+
+    # -- update ---------------------------------------------------------------------------------------------------
+
+    def update(
+        self,
+        episodes: list[Episode],
+        trv_noise: th.Tensor,
+        pairings: list[Minibatch],
+        advantages: list[list[float]],
+    ) -> None:
+        """
+        Make one step of the policy (eq:grad psi, eq:grad phi, eq:lg).
+
+        :param advantages: weight of each log-probability, for each episode and time step
+        """
+        loss = 0.0
+        for n, episode in enumerate(episodes):
+            prev_trv = th.zeros(self.trv_dim)
+            for t in range(self.horizon):
+                log_q = log_density(episode.trvs[t], *self.encode(t, prev_trv, episode.observations[t]))
+                log_pi = log_density(episode.actions[t], *self.act(t, episode.trvs[t]))
+                loss = loss + advantages[n][t] * (log_q + log_pi) / len(episodes)
+                prev_trv = episode.trvs[t]
+        if self.mi_coef > 0:
+            trvs = [self.rebuild_trvs(episode, trv_noise[n]) for n, episode in enumerate(episodes)]
+            for information in self.information(episodes, trvs, pairings):
+                # A critic's estimate may be negative, the mutual information may not.
+                if information > 0:
+                    loss = loss + self.mi_coef * information
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+
+    def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> list[th.Tensor]:
+        """Compute the TRVs of an episode again, now as functions of the encoder's parameters (eq:lg)."""
+        trvs = []
+        trv = th.zeros(self.trv_dim)
+        for t in range(self.horizon):
+            mean, variance = self.encode(t, trv, episode.observations[t])
+            trv = mean + th.sqrt(variance) * noise[t]
+            trvs.append(trv)
+        return trvs
+
+
+def move(distance: float, velocity: float, control: float) -> tuple[float, float]:
+    """Move one robot of the lava problem for one time step."""
+    if distance >= LAVA:
+        return LAVA, 0.0
+    new_distance = distance + velocity
+    if new_distance >= LAVA:
+        return LAVA, 0.0
+    if new_distance < WALL:
+        return WALL, 0.0
+    return new_distance, velocity + control
+
+
+def log_density(x: th.Tensor, mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
+    """Log-density of a diagonal Gaussian, one component at a time."""
+    result = 0.0
+    for i in range(len(x)):
+        result = result - 0.5 * ((x[i] - mean[i]) ** 2 / variance[i] + th.log(2 * math.pi * variance[i]))
+    return result
+
+
+def mean_baseline(episodes: list[Episode]) -> list[list[float]]:
+    """Weight every step with the cost of the whole episode less the mean over episodes."""
+    mean = sum(sum(episode.costs) for episode in episodes) / len(episodes)
+    return [[sum(episode.costs) - mean] * len(episode.costs) for episode in episodes]
+
+
+def to_float32(x: float) -> float:
+    """Round as Stable-Baselines3 does with observations and rewards."""
+    return float(np.float32(x))
+
+
+@th.no_grad()
+def unbatch(mlp: BatchedMLP) -> list[nn.Sequential]:
+    """Copy a batched network into one ``nn.Sequential`` for each of its maps."""
+    networks = []
+    for m in range(mlp.n_maps):
+        modules: list[nn.Module] = []
+        for layer in mlp.layers:
+            linear = nn.Linear(*layer.weight.shape[1:])
+            linear.weight.copy_(layer.weight[m].T)
+            linear.bias.copy_(layer.bias[m].flatten())
+            modules += [linear, type(mlp.activation)()]
+        networks.append(nn.Sequential(*modules[:-1]))
+    return networks
+
+
+def draw_randomness(model: TDPG, rng: np.random.Generator) -> Randomness:
+    """Draw what an epoch of a model needs, minibatches as :class:`~sb3_tdpg.information.Mine` has them."""
+    n, horizon, trv_dim = model.n_episodes, model.horizon, model.policy.trv_dim
+    size = min(model.estimator.batch_size, n // 2)
+
+    def minibatch() -> Minibatch:
+        chosen = rng.permutation(n)[: 2 * size].tolist()
+        return Minibatch(chosen[:size], list(zip(chosen[:size], chosen[size:], strict=True)))
+
+    def pairing() -> Minibatch:
+        order = rng.permutation(n).tolist()
+        return Minibatch(list(range(n)), [(order[k], order[k - 1]) for k in range(n)])
+
+    def normal(*shape: int) -> th.Tensor:
+        return th.as_tensor(rng.standard_normal(shape), dtype=th.get_default_dtype())
+
+    return Randomness(
+        initial_distance=rng.uniform(WALL, LAVA, n),
+        sensor_noise=rng.standard_normal((n, horizon, 2)),
+        trv_noise=normal(n, horizon, trv_dim),
+        action_noise=normal(n, horizon, 1),
+        minibatches=[[minibatch() for _ in range(model.estimator.gradient_steps)] for _ in range(horizon)],
+        pairings=[pairing() for _ in range(horizon)],
+    )
