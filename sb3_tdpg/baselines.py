@@ -68,7 +68,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
     seen = weight > 0
     low = targets.masked_fill(~seen, math.inf).amin(dim=1, keepdim=True)
     high = targets.masked_fill(~seen, -math.inf).amax(dim=1, keepdim=True)
-    return prediction.clamp(low, high)
+    return th.where(seen.any(dim=1, keepdim=True), prediction.clamp(low, high), th.zeros_like(prediction))
 
 
 def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = 20) -> th.Tensor:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.save_util import load_from_zip_file
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
@@ -99,7 +100,7 @@ class SelectionCallback(_TDPGCallback):
             raise ValueError(f"mi_limit={mi_limit} must not be negative")
         self.cost_limit = cost_limit
         self.mi_limit = mi_limit
-        self.save_path = None if save_path is None else Path(save_path).with_suffix(".zip")
+        self.save_path = None if save_path is None else _zip_path(save_path)
         self.best: Candidate | None = None
         self._best_policy: dict[str, th.Tensor] | None = None
 
@@ -111,10 +112,11 @@ class SelectionCallback(_TDPGCallback):
     def _init_callback(self) -> None:
         resumes = self.model.num_timesteps > 0
         if resumes and self.best is None and self.save_path is not None and self.save_path.exists():
-            record = json.loads(self.save_path.with_suffix(".json").read_text())
+            record = json.loads(_record_path(self.save_path).read_text())
             self.best = Candidate(record["epoch"], record["cost"], record["information"])
-            saved = type(self.tdpg).load(self.save_path, device=self.model.device)
-            self._best_policy = saved.policy.state_dict()
+            # Not the whole model: loading that seeds all random number generators.
+            _, parameters, _ = load_from_zip_file(self.save_path, device=self.model.device, load_data=False)
+            self._best_policy = cast("dict[str, th.Tensor]", parameters["policy"])
         elif not resumes:
             self.best, self._best_policy = None, None
 
@@ -131,7 +133,7 @@ class SelectionCallback(_TDPGCallback):
             print(f"epoch {candidate.epoch}: cost {cost:.2f}, information {information:.3f} nat: new {self.criterion}")
         if self.save_path is not None:
             model.save(self.save_path)
-            write_atomically(self.save_path.with_suffix(".json"), json.dumps(candidate._asdict()))
+            write_atomically(_record_path(self.save_path), json.dumps(candidate._asdict()))
 
     def _is_eligible(self, candidate: Candidate) -> bool:
         under_cost = self.cost_limit is None or candidate.cost < self.cost_limit
@@ -154,7 +156,7 @@ class SelectionCallback(_TDPGCallback):
             limits = ", ".join(
                 f"{name} < {limit}"
                 for name, limit in (("cost", self.cost_limit), ("information", self.mi_limit))
-                if limit
+                if limit is not None
             )
             raise ValueError(
                 f"no epoch met the limits ({limits}): train longer or loosen them; the last policy is kept"
@@ -185,7 +187,7 @@ class TrainingCheckpointCallback(_TDPGCallback):
         super().__init__(verbose)
         if save_freq < 1:
             raise ValueError(f"save_freq={save_freq} must be at least 1 (epochs)")
-        self.save_path = Path(save_path).with_suffix(".zip")
+        self.save_path = _zip_path(save_path)
         self.save_freq = save_freq
 
     def _on_rollout_start(self) -> None:
@@ -204,6 +206,16 @@ class TDPGProgressBar(ProgressBarCallback):
         if model.information is not None:
             shown["nats"] = f"{model.information.sum():.2f}"
         self.pbar.set_postfix(shown, refresh=False)
+
+
+def _zip_path(path: str | os.PathLike[str]) -> Path:
+    """Append ``.zip`` unless it is there; a dot in the name (``beta_0.013``) is no suffix."""
+    path = Path(path)
+    return path if path.suffix == ".zip" else path.with_name(path.name + ".zip")
+
+
+def _record_path(path: Path) -> Path:
+    return path.with_suffix(".json")
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -129,8 +129,9 @@ class TRVPolicy(BasePolicy):
         self.action_var_floor = action_var_floor
         default_arch = dict(encoder=[32], action_head=[]) if is_image else dict(encoder=[64, 64], action_head=[64, 64])
         self.net_arch = _check_net_arch(net_arch, default_arch)
-        if self.trv_dim < 1:
-            raise ValueError(f"policy_kwargs: trv_dim={trv_dim} must be at least 1")
+        for name, value in (("horizon", horizon), ("policy_kwargs: trv_dim", self.trv_dim)):
+            if not (isinstance(value, (int, np.integer)) and value >= 1):
+                raise ValueError(f"{name}={value!r} must be an integer of at least 1")
         for name, floor in (("encoder_var_floor", encoder_var_floor), ("action_var_floor", action_var_floor)):
             if not floor >= 0:
                 raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
@@ -312,6 +313,8 @@ class TRVPolicy(BasePolicy):
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
         """
+        if isinstance(observation, dict):
+            raise ValueError("the observation is a dict, but TRVPolicy takes arrays: flatten it (FlattenObservation)")
         self.set_training_mode(False)
         observation_tensor, is_vectorized = self.obs_to_tensor(observation)
         assert isinstance(observation_tensor, th.Tensor)

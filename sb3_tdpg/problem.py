@@ -70,7 +70,8 @@ def read_problem(env: VecEnv) -> Problem:
     horizon = _attribute(env, "horizon")
     if horizon is None:
         spec = _attribute(env, "spec")
-        horizon = None if spec is None else spec.max_episode_steps
+        # A TimeLimit put around by hand is not in the spec.
+        horizon = _attribute(env, "_max_episode_steps") if spec is None else spec.max_episode_steps
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(
             f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer "

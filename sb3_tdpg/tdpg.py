@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_tdpg.baselines import get_baseline
 from sb3_tdpg.buffers import EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
-from sb3_tdpg.checks import check_arguments, check_beta, nearest_multiples
+from sb3_tdpg.checks import check_action_space, check_arguments, check_beta, check_count, nearest_multiples
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.losses import information_loss, policy_gradient_loss
 from sb3_tdpg.policies import TRVPolicy
@@ -116,9 +116,11 @@ class TDPG(OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        check_arguments(policy, beta, n_episodes, n_envs, encoder_gradient, gamma, max_grad_norm)
+        check_arguments(policy, beta, learning_rate, n_episodes, encoder_gradient, gamma, max_grad_norm)
         get_estimator_class(mi_estimator)
         get_baseline(baseline)
+        if n_envs is not None:
+            check_count("n_envs", n_envs)
         if isinstance(env, str):
             env = make_episodes_env(env, n_envs, n_episodes=n_episodes)
         elif n_envs is not None and getattr(env, "num_envs", 1) != n_envs:
@@ -126,6 +128,8 @@ class TDPG(OnPolicyAlgorithm):
                 f"n_envs={n_envs} is for an environment given by its id; "
                 f"the environment given has {getattr(env, 'num_envs', 1)} of its own: leave n_envs out"
             )
+        if env is not None:
+            check_action_space(env.action_space)
         super().__init__(
             policy=policy,  # type: ignore[arg-type]
             env=env,  # type: ignore[arg-type]
@@ -145,7 +149,6 @@ class TDPG(OnPolicyAlgorithm):
             verbose=verbose,
             seed=seed,
             device=device,
-            supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
             _init_setup_model=False,
         )
         self.beta = beta
@@ -169,25 +172,40 @@ class TDPG(OnPolicyAlgorithm):
     # -- construction -----------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
+        # Again: load() sets attributes without the constructor.
+        check_arguments(
+            self.policy_class,
+            self.beta,
+            self.learning_rate,
+            self.n_episodes,
+            self.encoder_gradient,
+            self.gamma,
+            self.max_grad_norm,
+        )
         self._setup_lr_schedule()
         self.beta_schedule = FloatSchedule(self.beta)
         self.set_random_seed(self.seed)
         if self.env is not None:
-            self._set_problem(self.env)
+            self._set_problem(self._read_problem(self.env), self.env)
         elif self.horizon == 0:
             raise ValueError("TDPG needs an environment to learn the horizon and the spaces from: pass env=...")
-        self.policy = cast(
-            TRVPolicy,
-            self.policy_class(
+        try:
+            policy = self.policy_class(
                 self.observation_space, self.action_space, self.lr_schedule, horizon=self.horizon, **self.policy_kwargs
-            ),
-        ).to(self.device)
+            )
+        except TypeError as e:
+            raise ValueError(
+                f"policy_kwargs={self.policy_kwargs!r} must be a dict of keywords of {self.policy_class.__name__}: {e}"
+            ) from e
+        self.policy = cast(TRVPolicy, policy).to(self.device)
         # Built at beta = inf, too: a policy-gradient model must be able to warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         try:
             self.estimator = estimator_class(self.horizon, self.state_dim, self.policy.trv_dim, **self.mi_kwargs)
         except TypeError as e:
-            raise ValueError(f"mi_kwargs={self.mi_kwargs} do not fit {estimator_class.__name__}: {e}") from e
+            raise ValueError(
+                f"mi_kwargs={self.mi_kwargs!r} must be a dict of keywords of {estimator_class.__name__}: {e}"
+            ) from e
         self.estimator.to(self.device)
         self.rollout_buffer = EpisodeBuffer(
             self.horizon,
@@ -200,7 +218,7 @@ class TDPG(OnPolicyAlgorithm):
             trv_dim=self.policy.trv_dim,
         )
 
-    def _set_problem(self, env: VecEnv) -> None:
+    def _read_problem(self, env: VecEnv) -> Problem:
         """Learn horizon and state from the environment, or say why it cannot be used."""
         normalize = unwrap_vec_normalize(env)
         if normalize is not None and normalize.norm_reward:
@@ -220,15 +238,19 @@ class TDPG(OnPolicyAlgorithm):
                 "model was "
                 f"made for horizon={self.horizon} and {self.state_dim}: use an environment of the same shape"
             )
+        return problem
+
+    def _set_problem(self, problem: Problem, env: VecEnv) -> None:
         self._problem = problem
         self.horizon, self.state_dim = problem.horizon, problem.state_dim
         self.n_steps = self.horizon * (self.n_episodes // env.num_envs)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
-        super().set_env(env, force_reset)
-        assert self.env is not None
-        self._set_problem(self.env)
+        wrapped = self._wrap_env(env, self.verbose)
+        problem = self._read_problem(wrapped)  # before the model's own environment is replaced
+        super().set_env(wrapped, force_reset)
+        self._set_problem(problem, wrapped)
 
     @property
     def mi_coef(self) -> float:
@@ -425,15 +447,22 @@ class TDPG(OnPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        if self.env is None:
+            raise ValueError("the model has no environment to learn in: set_env(...) first, or load(path, env=...)")
         if reset_num_timesteps:
             self.epoch = 0
             self._current_progress_remaining = 1.0
-        elif self._random_state is not None:
-            assert self.env is not None
-            self._random_state.restore(self.env)
+        random_state, self._random_state = self._random_state, None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if random_state is not None and not reset_num_timesteps:
+            # Last, since the set-up draws, too. The first rollout then resets the environments once more.
+            random_state.restore(self.env)
             self._last_obs = None
-        self._random_state = None
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        return result
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last epoch may overshoot, and schedules are defined on [0, 1].
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
 
     @property
     def remaining_timesteps(self) -> int:
@@ -477,6 +506,32 @@ class TDPG(OnPolicyAlgorithm):
         with partial.open("wb") as file:
             super().save(file, exclude, include)
         os.replace(partial, target)
+
+    @classmethod
+    def load(
+        cls: type[SelfTDPG],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfTDPG:
+        """
+        Load a saved model; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.load`.
+
+        :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to go on from a policy-gradient model.
+        :raises ValueError: if the file is damaged or was not saved by TDPG.
+        """
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except AssertionError as e:
+            if not str(e).startswith("No "):  # "No data found in the saved file", "No params found ..."
+                raise
+            raise ValueError(
+                f"{path} holds no model of TDPG: it is damaged, or was made by something else ({e})"
+            ) from e
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_problem"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any, cast
 
 import gymnasium as gym
@@ -62,7 +63,7 @@ class BatchedVecEnv(VecEnv):
         self._time = 0
         self._returns = np.zeros(self.num_envs)
         self._state, observation = self.env.reset_batch(self.num_envs)
-        self.reset_infos = [{"state": state} for state in self._state]
+        self.reset_infos = [{"state": state} for state in self._state.copy()]
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -73,11 +74,10 @@ class BatchedVecEnv(VecEnv):
         """Apply the stored actions; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
         self._time += 1
         is_last = self._time == self.env.horizon
-        # A new array each step: the rows that went out in earlier infos stay what they were.
         self._state, observation, cost = self.env.step_batch(self._state, self._actions, is_last=is_last)
         self._returns -= cost
         infos: list[dict[str, Any]] = [
-            {"state": state, "cost": c} for state, c in zip(self._state, cost.tolist(), strict=True)
+            {"state": state, "cost": c} for state, c in zip(self._state.copy(), cost.tolist(), strict=True)
         ]
         if is_last:
             elapsed = round(time.time() - self._start_time, 6)
@@ -146,7 +146,10 @@ def make_episodes_env(
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
-    spec = gym.spec(env_id)
+    module, _, bare_id = env_id.rpartition(":")
+    if module:  # gymnasium.make takes this form, gymnasium.spec does not
+        import_module(module)
+    spec = gym.spec(bare_id)
     creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
     if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
         env = cast(POMDPEnv, creator(**{**spec.kwargs, **env_kwargs}))

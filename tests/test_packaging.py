@@ -14,9 +14,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCES = ("sb3_tdpg", "envs", "hyperparams", "setup.cfg", "pyproject.toml", "LICENSE")
 
 IMPORT_ALL = "import sb3_tdpg, sb3_tdpg.envs, sb3_tdpg.hyperparams; "
-MAKE_LAVA = (
-    "import gymnasium, sb3_tdpg; [gymnasium.make(id).reset() for id in ('Lava-v0', 'sb3_tdpg:Lava-v0')]"
-)
+MAKE_LAVA = "import gymnasium, sb3_tdpg; [gymnasium.make(id).reset() for id in ('Lava-v0', 'sb3_tdpg:Lava-v0')]"
 
 
 def run(*command: object, cwd: Path, pythonpath: Path | None = None) -> str:

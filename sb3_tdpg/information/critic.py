@@ -44,6 +44,7 @@ class CriticEstimator(InformationEstimator):
     :param refit_below: A critic whose estimate on the batch is not finite or is below this value (in nats; the truth is
         never negative) has diverged: it starts anew and is fitted for ``refit_gradient_steps``. A frozen critic's bound
         is unbounded below, and without this guard a policy learns to exploit it.
+    :param refit_above: Likewise for an estimate above this value: no encoder in use carries as many nats.
     :param refit_gradient_steps: See ``refit_below``.
     :param reset_moments: Whether Adam's moments start from zero at each epoch: the data have moved.
     :param standardize: Whether each component of the state is brought to mean 0 and variance 1 at each time step.
@@ -62,6 +63,7 @@ class CriticEstimator(InformationEstimator):
         gradient_steps: int = 50,
         warmup_gradient_steps: int = 2000,
         refit_below: float = -0.5,
+        refit_above: float = 100.0,
         refit_gradient_steps: int = 500,
         reset_moments: bool = True,
         standardize: bool = False,
@@ -78,6 +80,7 @@ class CriticEstimator(InformationEstimator):
         self.gradient_steps = gradient_steps
         self.warmup_gradient_steps = warmup_gradient_steps
         self.refit_below = refit_below
+        self.refit_above = refit_above
         self.refit_gradient_steps = refit_gradient_steps
         self.reset_moments = reset_moments
         self.standardize = standardize
@@ -212,11 +215,11 @@ class CriticEstimator(InformationEstimator):
     @th.no_grad()
     def _is_broken(self, batch: InformationBatch) -> th.Tensor:
         estimate = self(batch)
-        return ~(estimate >= self.refit_below) | ~th.isfinite(estimate)
+        return ~((estimate >= self.refit_below) & (estimate <= self.refit_above))  # NaN compares false
 
     def _refit(self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, broken: th.Tensor) -> None:
         """Give the critics of the steps ``broken`` new weights and fit them, leaving the others alone."""
-        fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(trvs.device)
+        fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(trvs)
         self._forget(broken)
         self.optimizer = self._make_optimizer(self.critic)  # the old moments may not be finite, either
         rows = None if alive is None else alive[broken]

@@ -1,0 +1,247 @@
+"""Bad input is refused before any training, with an error that says what to do."""
+
+import math
+import re
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_problems import ToyEnv, tiny_tdpg, toy_vec_env
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback, TRVPolicy
+from sb3_tdpg.envs.lava import LavaEnv
+
+IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
+
+
+def lava(n=20, **kwargs):
+    return BatchedVecEnv(LavaEnv(**kwargs), n)
+
+
+class WithoutHorizon(ToyEnv):
+    def __init__(self):
+        super().__init__(declares_horizon=False)
+
+
+# Name of the case: what is done, and what the message must say (regular expressions, in any order).
+ARGUMENTS = {
+    "beta zero": (dict(beta=0.0), "beta=0.0", "positive number", "inf"),
+    "beta negative": (dict(beta=-1.0), "beta=-1.0", "positive number"),
+    "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
+    "beta a string": (dict(beta="0.1"), "beta='0.1'", "positive number"),
+    "beta None": (dict(beta=None), "beta=None", "positive number"),
+    "beta a schedule that ends at zero": (dict(beta=lambda progress: progress), "beta=0.0", "positive number"),
+    "beta a schedule that returns a string": (dict(beta=lambda progress: "1"), "beta='1'", "positive number"),
+    "unknown estimator": (
+        dict(mi_estimator="mime"), "mi_estimator='mime'", r"\['infonce', 'logdet', 'loo', 'mine', 'nwj', 'smile'\]"
+    ),
+    "estimator of a wrong class": (dict(mi_estimator=th.nn.Linear), "mi_estimator", "InformationEstimator"),
+    "unknown key of mi_kwargs": (dict(mi_kwargs=dict(hiden_sizes=(8,))), "mi_kwargs", "hiden_sizes"),
+    "mi_kwargs for another estimator": (
+        dict(mi_estimator="logdet", mi_kwargs=dict(batch_size=5)), "mi_kwargs", "batch_size", "LogDet"
+    ),
+    "mi_kwargs out of range": (
+        dict(mi_estimator="mine", mi_kwargs=dict(batch_size=0)), "mi_kwargs: batch_size=0", "positive"
+    ),
+    "mi_kwargs of a wrong type": (dict(mi_kwargs="batch_size=5"), "mi_kwargs", "dict"),
+    "n_episodes no multiple of n_envs": (
+        dict(env=lava(6), n_episodes=20), "n_episodes=20", r"multiple", r"\(6\)", "use 18 or 24"
+    ),
+    "n_episodes below n_envs": (dict(env=lava(6), n_episodes=4), "n_episodes=4", r"use 6"),
+    "n_episodes no multiple of n_envs of an id": (dict(n_envs=6, n_episodes=20), "use 18 or 24"),
+    "n_episodes one": (dict(n_episodes=1), "n_episodes=1", "at least 2"),
+    "n_episodes zero": (dict(n_episodes=0), "n_episodes=0", "integer of at least"),
+    "n_episodes a float": (dict(n_episodes=20.0), "n_episodes=20.0", "integer"),
+    "n_envs zero": (dict(n_envs=0), "n_envs=0", "integer of at least 1"),
+    "n_envs for an environment": (dict(env=lava(20), n_envs=10), "n_envs=10", "leave n_envs out"),
+    "unknown baseline": (dict(baseline="median"), "baseline='median'", r"\['mean', 'value'\]"),
+    "unknown encoder gradient": (
+        dict(encoder_gradient="sore"), "encoder_gradient='sore'", r"\['score', 'pathwise'\]"
+    ),
+    "gamma zero": (dict(gamma=0.0), "gamma=0.0", r"\(0, 1\]"),
+    "gamma above one": (dict(gamma=1.01), "gamma=1.01", r"\(0, 1\]"),
+    "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),
+    "max_grad_norm negative": (dict(max_grad_norm=-1.0), "max_grad_norm=-1.0", "positive, or None"),
+    "max_grad_norm NaN": (dict(max_grad_norm=math.nan), "max_grad_norm=nan", "positive, or None"),
+    "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "not negative|positive"),
+    "learning_rate NaN": (dict(learning_rate=math.nan), "learning_rate=nan", "not negative|positive|finite"),
+    "learning_rate a string": (dict(learning_rate="1e-3"), "learning_rate='1e-3'", "number"),
+    "learning_rate a schedule that goes below zero": (
+        dict(learning_rate=lambda progress: progress - 0.5), "learning_rate=-0.5", "not negative|positive"
+    ),
+    "unknown environment": (dict(env="Larva-v0"), "Larva"),
+    "environment without a horizon": (
+        dict(env=DummyVecEnv([WithoutHorizon])), "finite horizon", "`horizon`", "max_episode_steps"
+    ),
+    "horizon zero": (dict(env=toy_vec_env(horizon=0)), "finite horizon", "horizon=0"),
+    "image without a state": (
+        dict(env=toy_vec_env(observation_space=IMAGE, gives_state=False)), r'info\["state"\]', "state_space", "reset"
+    ),
+    "action bounds that are not finite": (
+        dict(env=toy_vec_env(action_space=spaces.Box(-np.inf, np.inf, (1,), np.float32))), "action", "bound", "finite"
+    ),
+    "action space that is not supported": (
+        dict(env=toy_vec_env(action_space=spaces.Dict(a=spaces.Discrete(2)))), "action space", "Box", "Discrete"
+    ),
+    "observations in a dict": (
+        dict(env=toy_vec_env(observation_space=spaces.Dict(a=spaces.Box(-1, 1, (2,))))), "FlattenObservation"
+    ),
+    "rewards normalised": (dict(env=VecNormalize(lava())), "norm_reward=False", "beta"),
+    "unknown key of policy_kwargs": (dict(policy_kwargs=dict(trv_dims=2)), "policy_kwargs", "trv_dims"),
+    "policy_kwargs of a wrong type": (dict(policy_kwargs="trv_dim=2"), "policy_kwargs", "dict"),
+    "unknown key of net_arch": (
+        dict(policy_kwargs=dict(net_arch=dict(pi=[64]))), "net_arch", r"\['action_head', 'encoder'\]"
+    ),
+    "net_arch a list": (dict(policy_kwargs=dict(net_arch=[64, 64])), "net_arch", r"\['action_head', 'encoder'\]"),
+    "trv_dim zero": (dict(policy_kwargs=dict(trv_dim=0)), "trv_dim=0", "at least 1"),
+    "trv_dim a float": (dict(policy_kwargs=dict(trv_dim=2.5)), "trv_dim=2.5", "integer"),
+    "variance floor negative": (
+        dict(policy_kwargs=dict(encoder_var_floor=-1.0)), "encoder_var_floor=-1.0", "not be negative"
+    ),
+    "variance floor NaN": (dict(policy_kwargs=dict(action_var_floor=math.nan)), "action_var_floor=nan"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ARGUMENTS)
+def test_a_bad_argument_is_refused_with_the_mend(case):
+    kwargs, *fragments = ARGUMENTS[case]
+    kwargs = {"env": "Lava-v0", "n_episodes": 20, "device": "cpu", **kwargs}
+    with pytest.raises((ValueError, gym.error.Error)) as error:
+        TDPG("TRVPolicy", **kwargs)
+    for fragment in fragments:
+        assert re.search(fragment, str(error.value)), f"{fragment!r} is not in {error.value!s}"
+
+
+@pytest.mark.parametrize(("policy", "fragments"), [
+    ("MlpPolicy", ["policy='MlpPolicy'", r"\['TRVPolicy'\]"]),
+    (PPO.policy_aliases["MlpPolicy"], ["ActorCriticPolicy", "TRVPolicy"]),
+    (3, ["policy=3", "TRVPolicy"]),
+], ids=["unknown", "foreign", "no_class"])  # fmt: skip
+def test_a_foreign_policy_is_refused_with_the_mend(policy, fragments):
+    with pytest.raises(ValueError) as error:
+        TDPG(policy, "Lava-v0", n_episodes=20, device="cpu")
+    for fragment in fragments:
+        assert re.search(fragment, str(error.value)), error.value
+
+
+def test_a_misspelt_argument_is_not_swallowed():
+    with pytest.raises(TypeError, match="betta"):
+        TDPG("TRVPolicy", "Lava-v0", betta=1.0)
+
+
+# -- files -----------------------------------------------------------------------------------------------------
+
+
+def corrupt(path):
+    tiny_tdpg().save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+
+
+def text(path):
+    path.write_text("no zip file")
+
+
+def empty_archive(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("readme.txt", "something else")
+
+
+def saved_ppo(path):
+    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(path)
+
+
+@pytest.mark.parametrize(("write", "fragments"), [
+    (corrupt, ["model.zip", "zip|corrupt|damaged|whole"]),
+    (text, ["model.zip", "zip"]),
+    (empty_archive, ["model.zip", "saved|TDPG"]),
+    (saved_ppo, ["TRVPolicy", "class that saved it"]),
+], ids=["corrupt", "no_zip", "foreign_zip", "saved_by_PPO"])  # fmt: skip
+def test_a_file_that_is_no_tdpg_model_is_refused(write, fragments, tmp_path):
+    path = tmp_path / "model.zip"
+    write(path)
+    with pytest.raises(ValueError) as error:
+        TDPG.load(path, device="cpu")
+    for fragment in fragments:
+        assert re.search(fragment, str(error.value)), error.value
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no_such_model"):
+        TDPG.load(tmp_path / "no_such_model", device="cpu")
+
+
+def test_a_model_is_not_loaded_for_an_environment_of_another_horizon(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"horizon=7.*made for horizon=5.*same shape"):
+        TDPG.load(tmp_path / "model", env=lava(horizon=7), device="cpu")
+
+
+def test_a_model_is_not_loaded_for_a_number_of_environments_that_does_not_fit(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    with pytest.raises(ValueError, match="use 18 or 24"):
+        TDPG.load(tmp_path / "model", env=lava(6), device="cpu")
+
+
+def test_a_bad_beta_is_refused_when_a_model_is_loaded_with_it(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"beta=-1.0 must be a positive number"):
+        TDPG.load(tmp_path / "model", env=lava(), beta=-1.0, device="cpu")
+
+
+# -- a model that stands ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("env", "message"), [
+    (lambda: lava(horizon=7), "horizon=7.*made for horizon=5"),
+    (lambda: VecNormalize(lava()), "norm_reward=False"),
+], ids=["horizon", "norm_reward"])  # fmt: skip
+def test_an_environment_that_does_not_fit_cannot_be_set_and_leaves_the_old_one(env, message):
+    model = tiny_tdpg()
+    old = model.env
+    with pytest.raises(ValueError, match=message):
+        model.set_env(env())
+    assert model.env is old
+    model.learn(100)
+
+
+@pytest.mark.parametrize("observation", [
+    np.zeros(3, np.float32), np.zeros((4, 3), np.float32), np.zeros((1, 2, 2), np.float32), np.float32(0),
+], ids=["vector", "batch", "too_deep", "scalar"])  # fmt: skip
+def test_an_observation_of_a_wrong_shape_is_refused_by_predict(observation):
+    with pytest.raises(ValueError, match=r"(?i)observation shape.*\(2,\)"):
+        tiny_tdpg().predict(observation)
+
+
+def test_a_dict_is_refused_by_predict():
+    with pytest.raises(ValueError, match=r"(?i)observation"):
+        tiny_tdpg().predict({"a": np.zeros(2, np.float32)})
+
+
+@pytest.mark.parametrize(("kwargs", "message"), [
+    (dict(), "give cost_limit .* mi_limit .* or both"),
+    (dict(cost_limit=math.nan), "cost_limit is NaN"),
+    (dict(mi_limit=math.nan), "mi_limit is NaN"),
+    (dict(mi_limit=-0.1), "mi_limit=-0.1 must not be negative"),
+], ids=str)  # fmt: skip
+def test_a_selection_without_sensible_limits_is_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        SelectionCallback(**kwargs)
+
+
+@pytest.mark.parametrize("save_freq", [0, -1])
+def test_a_checkpoint_frequency_below_one_is_refused(save_freq, tmp_path):
+    with pytest.raises(ValueError, match=rf"save_freq={save_freq} must be at least 1"):
+        TrainingCheckpointCallback(tmp_path / "checkpoint", save_freq=save_freq)
+
+
+@pytest.mark.parametrize("horizon", [0, -1, 2.5])
+def test_a_policy_of_its_own_needs_a_horizon(horizon):
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    with pytest.raises(ValueError, match=r"horizon.*at least 1"):
+        TRVPolicy(space, space, lambda _: 1e-3, horizon=horizon)

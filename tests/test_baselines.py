@@ -1,0 +1,100 @@
+"""Baselines lower the variance and leave the gradient as it is."""
+
+import pytest
+import torch as th
+
+from sb3_tdpg.baselines import BASELINES, episode_mean_advantages, get_baseline, value_advantages
+from sb3_tdpg.losses import cost_to_go
+
+T, N = 3, 400
+
+
+@pytest.fixture
+def rollouts():
+    states = th.randn(T, N, 2)
+    costs = 10 * states[..., 0] ** 2 + 5 * (states[..., 1] > 0) + th.randn(T, N)
+    return costs, states, th.ones(T, N)
+
+
+def test_the_papers_baseline_is_the_whole_episodes_cost_less_the_mean_at_every_step():
+    costs = th.tensor([[1.0, 2.0], [3.0, 8.0]])
+    advantages = episode_mean_advantages(costs, th.zeros(2, 2, 1), th.ones(2, 2), 1.0)
+    assert advantages.tolist() == [[-3, 3], [-3, 3]]
+
+
+def test_the_value_baseline_uses_the_cost_to_come_only(rollouts):
+    costs, states, alive = rollouts
+    expensive_start = costs.clone()
+    expensive_start[0] += 1000 * th.rand(N)
+    first = value_advantages(costs, states, alive, 1.0)
+    second = value_advantages(expensive_start, states, alive, 1.0)
+    th.testing.assert_close(first[1:], second[1:])
+    assert not th.allclose(first[0], second[0])
+
+
+def test_the_value_baseline_explains_what_the_state_tells_of_the_cost(rollouts):
+    costs, states, alive = rollouts
+    last = value_advantages(costs, states, alive, 1.0)[-1]
+    assert last.var() < 0.35 * costs[-1].var()
+    assert abs(last.mean()) < 0.3
+
+
+def test_the_value_baseline_lowers_the_variance_below_the_mean_baselines(rollouts):
+    value, mean = (BASELINES[name](*rollouts, 1.0) for name in ("value", "mean"))
+    assert value.var() < 0.8 * mean.var()
+
+
+def test_an_episodes_own_cost_never_enters_its_own_baseline(rollouts):
+    costs, states, alive = rollouts
+    targets = cost_to_go(costs)
+    baseline = targets - value_advantages(costs, states, alive, 1.0)
+    changed = costs.clone()
+    changed[:, 6] += 1e4
+    new_baseline = cost_to_go(changed) - value_advantages(changed, states, alive, 1.0)
+    th.testing.assert_close(new_baseline[:, 6], baseline[:, 6], rtol=0, atol=0.02)
+    assert (new_baseline[:, 7] - baseline[:, 7]).abs().max() > 1  # but it does enter those of the other half
+
+
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_the_discount_weights_later_costs(name, rollouts):
+    costs, states, alive = rollouts
+    late = costs.clone()
+    late[-1] += 100 * th.rand(N)
+    differences = [
+        (BASELINES[name](late, states, alive, gamma) - BASELINES[name](costs, states, alive, gamma))[0].abs().max()
+        for gamma in (1.0, 0.1)
+    ]
+    assert differences[1] < 0.1 * differences[0]
+
+
+def test_dead_episodes_do_not_enter_the_regression(rollouts):
+    costs, states, alive = rollouts
+    alive[1:, ::3] = 0.0
+    costs = costs * alive
+    garbage = th.where(alive[..., None] > 0, states, 50 * th.randn_like(states))
+    zeros = th.where(alive[..., None] > 0, states, th.zeros_like(states))
+    living = alive > 0
+    first, second = (value_advantages(costs, x, alive, 1.0)[living] for x in (garbage, zeros))
+    assert th.isfinite(first).all()
+    # Only the places of the bumps may depend on dead states: the quality of the fit must not.
+    assert first.var().item() == pytest.approx(second.var().item(), rel=0.1)
+
+
+@pytest.mark.parametrize("n_episodes", [2, 3])
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_a_batch_of_few_episodes_with_a_constant_state_gives_finite_advantages(name, n_episodes):
+    costs = th.rand(T, n_episodes)
+    advantages = get_baseline(name)(costs, th.zeros(T, n_episodes, 2), th.ones(T, n_episodes), 1.0)
+    assert advantages.shape == (T, n_episodes)
+    assert th.isfinite(advantages).all()
+
+
+def test_a_step_at_which_nobody_lives_gives_finite_advantages(rollouts):
+    costs, states, alive = rollouts
+    alive[2] = 0.0
+    assert th.isfinite(value_advantages(costs * alive, states * alive[..., None], alive, 1.0)).all()
+
+
+def test_an_unknown_baseline_is_refused_with_the_list():
+    with pytest.raises(ValueError, match=r"baseline='median' is unknown: use one of \['mean', 'value'\]"):
+        get_baseline("median")

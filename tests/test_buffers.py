@@ -1,0 +1,90 @@
+"""The buffer keeps whole episodes, time step by episode."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
+
+T, N, X, Z, U = 3, 4, 5, 2, 1
+SHAPES = dict(observations=(2,), states=(X,), noise=(Z,), trvs=(Z,), means=(Z,), stds=(Z,), actions=(U,), costs=())
+
+
+@pytest.fixture
+def buffer():
+    spaces_ = (spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (U,), np.float32))
+    buffer = EpisodeBuffer(T, *spaces_, device="cpu", n_envs=N, state_dim=X, trv_dim=Z)
+    buffer.reset()
+    return buffer
+
+
+def rows(n, value):
+    return {name: np.full((n, *shape), value, np.float32) for name, shape in SHAPES.items()}
+
+
+def test_a_step_is_stored_at_its_time_and_in_its_episode(buffer):
+    buffer.add_step(np.array([0, 2, 1]), np.array([3, 0, 1]), **rows(3, 7.0))
+    expected = np.zeros((T, N), np.float32)
+    expected[[0, 2, 1], [3, 0, 1]] = 1.0
+    np.testing.assert_array_equal(buffer.alive, expected)
+    for name, shape in SHAPES.items():
+        stored = getattr(buffer, name)
+        assert stored.shape == (T, N, *shape)
+        assert (stored[expected == 1] == 7).all()
+        assert (stored[expected == 0] != 7).all()
+
+
+def test_the_batch_has_every_field_as_a_tensor_and_does_not_change_with_the_next_epoch(buffer):
+    for t in range(T):
+        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, float(t)))
+    buffer.full = True
+    batch = buffer.episode_batch()
+    for name in EpisodeBatch._fields:
+        np.testing.assert_array_equal(getattr(batch, name), getattr(buffer, name))
+        assert isinstance(getattr(batch, name), th.Tensor)
+    kept = batch.costs.clone()
+    buffer.reset()
+    buffer.add_step(np.zeros(N, int), np.arange(N), **rows(N, 9.0))
+    th.testing.assert_close(batch.costs, kept)
+
+
+def test_an_incomplete_epoch_is_not_handed_out(buffer):
+    buffer.add_step(np.zeros(N, int), np.arange(N), **rows(N, 1.0))
+    with pytest.raises(AssertionError, match="not complete"):
+        buffer.episode_batch()
+
+
+def test_a_reset_forgets_the_last_epoch(buffer):
+    buffer.add_step(np.zeros(N, int), np.arange(N), **rows(N, 5.0))
+    buffer.full = True
+    buffer.reset()
+    assert not buffer.full
+    assert buffer.alive.sum() == 0
+    assert buffer.costs.sum() == 0
+
+
+def test_the_previous_trvs_are_those_of_the_step_before_and_zero_at_the_start(buffer):
+    for t in range(T):
+        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, t + 1.0))
+    buffer.full = True
+    batch = buffer.episode_batch()
+    assert batch.prev_trvs[:, 0, 0].tolist() == [0, 1, 2]
+
+
+def test_the_cost_of_an_episode_is_the_sum_of_its_steps(buffer):
+    for t in range(T):
+        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, 10.0**t))
+    np.testing.assert_array_equal(buffer.episode_costs, [111.0] * N)
+
+
+def test_the_information_batch_has_a_mask_only_if_an_episode_ended_early(buffer):
+    for t in range(T):
+        buffer.add_step(np.full(N - 1, t), np.arange(N - 1), **rows(N - 1, 1.0))
+    buffer.add_step(np.array([0]), np.array([N - 1]), **rows(1, 1.0))
+    buffer.full = True
+    mask = buffer.episode_batch().information_batch().alive
+    assert mask.dtype == th.bool
+    assert mask.sum(0).tolist() == [3, 3, 3, 1]
+    buffer.add_step(np.array([1, 2]), np.array([N - 1, N - 1]), **rows(2, 1.0))
+    assert buffer.episode_batch().information_batch().alive is None

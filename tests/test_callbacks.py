@@ -1,0 +1,256 @@
+"""Selection, interruption and divergence."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from small_problems import (
+    AtEveryEpoch,
+    AtEveryStep,
+    assert_same_parameters,
+    parameters,
+    same_parameters,
+    tiny_tdpg,
+    toy_vec_env,
+    train_epochs,
+)
+
+from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback, TrainingDivergedError
+from sb3_tdpg.envs.lava import LavaEnv
+
+
+class Scripted(AtEveryEpoch):
+    """Overwrite what each epoch measured; must come before the selection in the list of callbacks."""
+
+    def __init__(self, measured):
+        self.policies = {}
+        super().__init__(self.overwrite)
+        self.measured = measured
+
+    def overwrite(self, model):
+        cost, information = self.measured[model.epoch]
+        model.rollout_buffer.costs[:] = cost / model.horizon
+        model.information = np.full(model.horizon, information / model.horizon)
+        self.policies[model.epoch] = parameters(model.policy)
+
+
+MEASURED = [(50.0, 0.1), (30.0, 3.0), (35.0, 0.4), (25.0, 0.9), (38.0, 0.2), (20.0, 2.0), (60.0, 0.0)]
+
+
+@pytest.mark.parametrize(("limits", "chosen"), [
+    (dict(cost_limit=40.0), 4),  # the paper's rule: the lowest information under a cost
+    (dict(cost_limit=32.0), 3),
+    (dict(mi_limit=1.0), 3),  # the lowest cost under an information
+    (dict(mi_limit=0.3), 4),
+    (dict(mi_limit=5.0), 5),
+    (dict(cost_limit=45.0, mi_limit=0.5), 2),
+    (dict(cost_limit=math.inf), 6),
+], ids=str)  # fmt: skip
+def test_the_epoch_that_the_rule_asks_for_is_kept_and_restored(limits, chosen):
+    script, selection = Scripted(MEASURED), SelectionCallback(**limits)
+    model = train_epochs(tiny_tdpg(), len(MEASURED), callback=[script, selection])
+    best = selection.restore(model)
+    assert best.epoch == chosen
+    assert (best.cost, best.information) == pytest.approx(MEASURED[chosen], rel=1e-5)
+    # The policy is the one that made these rollouts, not the one after their update.
+    assert_same_parameters(parameters(model.policy), script.policies[chosen])
+
+
+def test_a_negative_or_broken_estimate_does_not_win():
+    measured = [(30.0, -50.0), (30.0, math.nan), (20.0, 0.0), (math.nan, 0.0)]
+    script, selection = Scripted(measured), SelectionCallback(cost_limit=40.0)
+    model = tiny_tdpg(baseline="mean", beta=math.inf)  # no update is made from the scripted costs
+    model.train = lambda: setattr(model, "epoch", model.epoch + 1)
+    train_epochs(model, 4, callback=[script, selection])
+    # -50 counts as 0, and the lower cost decides.
+    assert selection.best.epoch == 2
+
+
+def test_without_an_eligible_epoch_the_error_names_the_limits_and_the_model_stays():
+    selection = SelectionCallback(cost_limit=-1.0, mi_limit=0.0)
+    model = train_epochs(tiny_tdpg(), 1, callback=selection)
+    before = parameters(model.policy)
+    with pytest.raises(ValueError, match=r"cost < -1.0, information < 0.0.*train longer or loosen"):
+        selection.restore(model)
+    assert_same_parameters(before, parameters(model.policy))
+
+
+def test_the_selected_model_is_on_disk_with_its_record(tmp_path):
+    script = Scripted(MEASURED)
+    selection = SelectionCallback(cost_limit=40.0, save_path=tmp_path / "best")
+    model = train_epochs(tiny_tdpg(), len(MEASURED), callback=[script, selection])
+    saved = TDPG.load(tmp_path / "best.zip", device="cpu")
+    assert_same_parameters(parameters(saved.policy), script.policies[4])
+    record = json.loads((tmp_path / "best.json").read_text())
+    assert record["epoch"] == 4
+    assert record["cost"] == pytest.approx(38.0)
+    selection.restore(model)
+    assert_same_parameters(parameters(saved.policy), parameters(model.policy))
+
+
+def test_a_selection_goes_on_with_a_resumed_training_and_starts_anew_with_a_new_one(tmp_path):
+    model = tiny_tdpg()
+    path = tmp_path / "best"
+    train_epochs(model, 3, callback=[Scripted(MEASURED), SelectionCallback(cost_limit=40.0, save_path=path)])
+    resumed = SelectionCallback(cost_limit=40.0, save_path=path)
+    # Epochs 3 and 4 are worse than epoch 2 of before.
+    worse = [None] * 3 + [(39.0, 5.0)] * 2
+    train_epochs(model, 2, callback=[Scripted(worse), resumed], reset_num_timesteps=False)
+    assert resumed.best.epoch == 2
+    saved = TDPG.load(path, device="cpu")
+    resumed.restore(model)
+    assert_same_parameters(parameters(saved.policy), parameters(model.policy))
+    fresh = SelectionCallback(cost_limit=40.0, save_path=path)
+    train_epochs(model, 1, callback=[Scripted([(39.0, 5.0)]), fresh])
+    assert fresh.best.epoch == 0
+
+
+def test_going_on_from_a_saved_selection_does_not_repeat_the_random_numbers_of_the_start(tmp_path):
+    model, path = tiny_tdpg(), tmp_path / "best"
+    train_epochs(model, 2, callback=SelectionCallback(cost_limit=1e9, save_path=path))
+    first = []
+    for callback in (None, SelectionCallback(cost_limit=1e9, save_path=path)):
+        th.manual_seed(123)
+        callbacks = [AtEveryEpoch(lambda m: first.append(m.rollout_buffer.noise.copy()))]
+        train_epochs(model, 1, callback=[*callbacks, *([callback] if callback else [])], reset_num_timesteps=False)
+    np.testing.assert_array_equal(*first)
+
+
+def test_the_name_of_a_selection_may_have_a_dot(tmp_path):
+    selection = SelectionCallback(cost_limit=1e9, save_path=tmp_path / "beta_0.013")
+    train_epochs(tiny_tdpg(), 1, callback=selection)
+    assert (tmp_path / "beta_0.013.zip").exists()
+
+
+def test_the_user_s_callbacks_find_the_information_of_the_epoch_that_has_just_been_rolled_out():
+    seen = []
+    model = train_epochs(tiny_tdpg(), 3, callback=AtEveryEpoch(lambda m: seen.append(m.information.copy())))
+    batch = model.rollout_buffer.episode_batch().information_batch()
+    np.testing.assert_allclose(seen[-1], model.estimator(batch).detach(), rtol=1e-5)
+    assert len({x.sum() for x in seen}) == 3
+
+
+# -- interruption ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at_step", [1, 13, 15], ids=["first_step", "mid_rollout", "end_of_rollout"])
+def test_ctrl_c_in_mid_rollout_leaves_a_model_that_predicts_saves_and_learns_on(at_step, tmp_path):
+    after_epoch, model = {}, tiny_tdpg(mi_estimator="mine")
+
+    def interrupt(callback):
+        if callback.n_calls % 5 == 1:
+            after_epoch[model.epoch] = parameters(model.policy)
+        if callback.n_calls == at_step:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_epochs(model, 10, callback=AtEveryStep(interrupt))
+    assert model.epoch == (at_step - 1) // 5
+    assert_same_parameters(parameters(model.policy), after_epoch[model.epoch])
+    action, _ = model.predict(np.zeros((3, 2), np.float32))
+    assert action.shape == (3, 1)
+    model.save(tmp_path / "model")
+    assert_same_parameters(parameters(TDPG.load(tmp_path / "model", device="cpu").policy), parameters(model.policy))
+    epoch = model.epoch
+    train_epochs(model, 2, reset_num_timesteps=False)
+    assert model.epoch >= epoch + 2
+    assert model.rollout_buffer.alive.all()
+    assert (model.rollout_buffer.states[0, :, 1] == 0).all()
+
+
+def test_ctrl_c_while_the_critics_are_fitted_leaves_a_usable_model(tmp_path, monkeypatch):
+    model = train_epochs(tiny_tdpg(mi_estimator="mine"), 1)
+    before, steps, original = parameters(model.policy), [], th.optim.Adam.step
+
+    def interrupt_the_second_step(optimizer, *args, **kwargs):
+        steps.append(optimizer)
+        if len(steps) == 2:
+            raise KeyboardInterrupt
+        return original(optimizer, *args, **kwargs)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(th.optim.Adam, "step", interrupt_the_second_step)
+        train_epochs(model, 2, reset_num_timesteps=False)
+    assert model.policy.optimizer not in steps
+    assert_same_parameters(parameters(model.policy), before)
+    model.save(tmp_path / "model")
+    train_epochs(TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), device="cpu"), 1)
+    train_epochs(model, 2, reset_num_timesteps=False)
+    assert np.isfinite(model.information).all()
+
+
+# -- divergence ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beta", [math.inf, 0.1])
+def test_a_cost_that_is_nan_stops_the_training_and_leaves_the_last_good_parameters(beta, tmp_path):
+    env = toy_vec_env(n_envs=4)
+    model = tiny_tdpg(env, beta=beta)
+    path = tmp_path / "checkpoint.zip"
+    good = {}
+
+    def poison(m):
+        good.update(parameters(m.policy))
+        if m.epoch == 2:
+            m.rollout_buffer.costs[1, 2] = math.nan
+
+    with pytest.raises(TrainingDivergedError, match=r"costs of epoch 2 is NaN or infinite.*Check the environment"):
+        train_epochs(model, 10, callback=[TrainingCheckpointCallback(path, save_freq=1), AtEveryEpoch(poison)])
+    assert model.epoch == 2
+    assert_same_parameters(parameters(model.policy), good)
+    loaded = TDPG.load(path, env=toy_vec_env(n_envs=4), device="cpu")
+    assert loaded.epoch == 2
+    assert_same_parameters(parameters(loaded.policy), good)
+    train_epochs(model, 1, reset_num_timesteps=False)
+    assert not same_parameters(parameters(model.policy), good)
+
+
+def test_a_nan_that_the_environment_itself_returns_is_caught_too():
+    model = tiny_tdpg(toy_vec_env(n_envs=4, nan_cost_in_episode=9))
+    with pytest.raises(TrainingDivergedError, match="Check the environment's costs"):
+        train_epochs(model, 10)
+    assert model.epoch >= 1
+    assert all(value.isfinite().all() for value in parameters(model.policy).values())
+
+
+@pytest.mark.parametrize("field", ["observations", "states"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_nan_in_an_observation_or_a_state_never_reaches_the_parameters(field, value):
+    model = tiny_tdpg(beta=0.1, mi_estimator="mine")
+    good = {}
+
+    def poison(m):
+        if m.epoch == 1:
+            good.update(parameters(m.policy))
+            getattr(m.rollout_buffer, field)[2, 3] = value
+
+    class PoisonBeforeTheCritics(AtEveryEpoch):
+        pass
+
+    original = model.collect_rollouts
+
+    def collect(env, callback, buffer, n_rollout_steps):
+        callback.callbacks.insert(0, poisoner)
+        try:
+            return original(env, callback, buffer, n_rollout_steps)
+        finally:
+            callback.callbacks.remove(poisoner)
+
+    poisoner = PoisonBeforeTheCritics(poison)
+    poisoner.init_callback(model)
+    model.collect_rollouts = collect
+    with pytest.raises(TrainingDivergedError):
+        train_epochs(model, 4)
+    assert_same_parameters(parameters(model.policy), good)
+
+
+def test_an_infinite_gradient_stops_the_training_before_the_step():
+    model = tiny_tdpg(beta=math.inf)
+    train_epochs(model, 1)
+    good = parameters(model.policy)
+    next(model.policy.parameters()).register_hook(lambda gradient: gradient * math.inf)
+    with pytest.raises(TrainingDivergedError, match=r"gradient of epoch 1.*max_grad_norm"):
+        train_epochs(model, 1, reset_num_timesteps=False)
+    assert_same_parameters(parameters(model.policy), good)

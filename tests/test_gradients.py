@@ -1,0 +1,399 @@
+"""
+Both gradient paths of ``train`` against finite differences of losses written here by hand, and against the truth.
+
+Dimension key: T horizon, N episodes, X state, Z TRVs, U action.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_problems import TINY_CRITIC, AtEveryEpoch, LinearProblem, parameters
+from stable_baselines3.common.logger import Logger
+from torch.nn.functional import elu
+
+from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg.envs.lava import LavaEnv
+
+T, N, Z = 3, 6, 2
+
+
+def make_model(**kwargs):
+    """A model in double precision with an epoch of random rollouts, in which two episodes end early."""
+    estimator = kwargs.pop("mi_estimator", "logdet")
+    model = TDPG(
+        "TRVPolicy",
+        BatchedVecEnv(LavaEnv(horizon=T), N),
+        n_episodes=N,
+        baseline="mean",
+        learning_rate=1e-9,
+        mi_estimator=estimator,
+        mi_kwargs={} if estimator == "logdet" else TINY_CRITIC,
+        policy_kwargs=dict(net_arch=dict(encoder=[5], action_head=[4]), optimizer_class=th.optim.SGD),
+        seed=0,
+        device="cpu",
+        **kwargs,
+    )
+    model.set_logger(Logger(None, []))
+    rng = np.random.default_rng(0)
+    buffer = model.rollout_buffer
+    buffer.reset()
+    for t in range(T):
+        alive = np.arange(N) if t < 2 else np.arange(N - 2)
+        n = len(alive)
+        buffer.add_step(
+            np.full(n, t),
+            alive,
+            observations=rng.normal(size=(n, 2)),
+            states=rng.normal(size=(n, 2)),
+            noise=rng.normal(size=(n, Z)),
+            trvs=rng.normal(size=(n, Z)),
+            means=rng.normal(size=(n, Z)),
+            stds=rng.uniform(0.5, 1, (n, Z)),
+            actions=rng.normal(size=(n, 1)),
+            costs=rng.normal(size=n),
+        )
+    buffer.full = True
+    batch = type(buffer.episode_batch())(*(x.double() for x in buffer.episode_batch()))
+    buffer.episode_batch = lambda: batch
+    # Features are single precision by SB3's preprocessing: exact for these observations.
+    model.policy.double()
+    model.estimator.double()
+    return model, batch
+
+
+def train_gradient(model):
+    """Gradient that ``train`` steps along, by parameter."""
+    th.manual_seed(1)
+    before = parameters(model.policy)
+    model.train()
+    # A step of 1e-9 moves nothing that finite differences would see, but is made: undo it.
+    model.policy.load_state_dict(before)
+    return {name: p.grad.clone() for name, p in model.policy.named_parameters()}
+
+
+def finite_differences(model, loss, step=1e-5):
+    """Central differences of a loss in every single parameter of the policy."""
+    gradients = {}
+    with th.no_grad():
+        for name, parameter in model.policy.named_parameters():
+            gradient, flat = th.zeros_like(parameter), parameter.view(-1)
+            for i in range(flat.numel()):
+                value = flat[i].item()
+                sides = []
+                for side in (value + step, value - step):
+                    flat[i] = side
+                    th.manual_seed(1)
+                    sides.append(float(loss()))
+                flat[i] = value
+                gradient.view(-1)[i] = (sides[0] - sides[1]) / (2 * step)
+            gradients[name] = gradient
+    return gradients
+
+
+def assert_close(gradients, expected):
+    assert gradients.keys() == expected.keys()
+    for name, gradient in gradients.items():
+        np.testing.assert_allclose(gradient.numpy(), expected[name].numpy(), rtol=1e-4, atol=1e-7, err_msg=name)
+
+
+# -- the paper's equations, one episode step at a time ---------------------------------------------------------
+
+
+def mlp(network, x, t):
+    weights = [(layer.weight[t], layer.bias[t, 0]) for layer in network.mlp.layers]
+    for weight, bias in weights[:-1]:
+        x = elu(x @ weight + bias)
+    weight, bias = weights[-1]
+    return x @ weight + bias
+
+
+def gaussian(outputs, floor):
+    """Mean and variance."""
+    mean, log_var = outputs.chunk(2, dim=-1)
+    return mean, log_var.exp() + floor
+
+
+def log_density(x, mean, var):
+    return (-0.5 * (x - mean) ** 2 / var - 0.5 * (2 * math.pi * var).log()).sum(-1)
+
+
+def encode(policy, batch, t, prev):
+    return gaussian(mlp(policy.encoder, th.cat([prev, batch.observations[t]], -1), t), 1e-3)
+
+
+def log_pi(policy, batch, t, trv):
+    return log_density(batch.actions[t], *gaussian(mlp(policy.action_head, trv, t), 1e-5))
+
+
+def advantages(batch):
+    episode_cost = batch.costs.sum(0)
+    return episode_cost - episode_cost.mean()  # (N,)
+
+
+def score_objective(model, batch):
+    """sum_t A (log q + log pi) at the stored samples, averaged over episodes (eq:grad psi, eq:grad phi)."""
+    total = 0.0
+    for t in range(T):
+        prev = batch.trvs[t - 1] if t > 0 else th.zeros(N, Z).double()
+        log_q = log_density(batch.trvs[t], *encode(model.policy, batch, t, prev))
+        total = (
+            total + (batch.alive[t] * advantages(batch) * (log_q + log_pi(model.policy, batch, t, batch.trvs[t]))).sum()
+        )
+    return total / N
+
+
+def unrolled(model, batch):
+    """TRVs, means and variances along the recurrence with the noise held fixed (eq:lg)."""
+    trv, out = th.zeros(N, Z).double(), []
+    for t in range(T):
+        mean, var = encode(model.policy, batch, t, trv)
+        trv = mean + var.sqrt() * batch.noise[t]
+        out.append((trv, mean, var))
+    return out
+
+
+def pathwise_objective(model, batch):
+    """sum_t A log pi(u_t | x~_t(noise)), averaged over episodes."""
+    total = 0.0
+    for t, (trv, _, _) in enumerate(unrolled(model, batch)):
+        total = total + (batch.alive[t] * advantages(batch) * log_pi(model.policy, batch, t, trv)).sum()
+    return total / N
+
+
+def logdet_penalty(model, batch):
+    total = 0.0
+    for t, (_, mean, var) in enumerate(unrolled(model, batch)):
+        living = batch.alive[t] > 0
+        mean, var = mean[living], var[living]
+        covariance = th.cov(mean.T) + th.diag(var.mean(0))
+        information = 0.5 * th.logdet(covariance) - 0.5 * var.log().sum(-1).mean()
+        total = total + information.clamp(min=0)
+    return total
+
+
+# -- finite differences ----------------------------------------------------------------------------------------
+
+
+def test_the_score_gradient_is_that_of_the_log_probabilities_at_the_stored_samples():
+    model, batch = make_model(beta=math.inf, encoder_gradient="score")
+    gradients = train_gradient(model)
+    assert_close(gradients, finite_differences(model, lambda: score_objective(model, batch)))
+    assert all(gradient.abs().sum() > 0 for gradient in gradients.values())
+
+
+def test_the_pathwise_gradient_goes_through_the_trvs_and_their_recurrence_with_the_noise_held_fixed():
+    model, batch = make_model(beta=math.inf, encoder_gradient="pathwise")
+    gradients = train_gradient(model)
+    assert_close(gradients, finite_differences(model, lambda: pathwise_objective(model, batch)))
+    assert all(gradient.abs().sum() > 0 for gradient in gradients.values())
+
+
+@pytest.mark.parametrize(("encoder_gradient", "objective"), [
+    ("score", score_objective), ("pathwise", pathwise_objective),
+])  # fmt: skip
+def test_the_penalty_adds_its_gradient_along_the_recurrence_with_the_noise_held_fixed(encoder_gradient, objective):
+    model, batch = make_model(beta=1 / 75, encoder_gradient=encoder_gradient)
+
+    def loss():
+        return objective(model, batch) + 75 * logdet_penalty(model, batch)
+
+    assert_close(train_gradient(model), finite_differences(model, loss))
+
+
+def test_the_penalty_of_a_frozen_critic_is_followed_through_the_trvs():
+    model, batch = make_model(beta=1 / 75, mi_estimator="mine")
+
+    def information_batch():
+        rebuilt = unrolled(model, batch)
+        return batch.information_batch()._replace(
+            trvs=th.stack([trv for trv, _, _ in rebuilt]),
+            means=th.stack([mean for _, mean, _ in rebuilt]),
+            stds=th.stack([var.sqrt() for _, _, var in rebuilt]),
+        )
+
+    # Six episodes are soon learnt by heart, so that the estimates are clearly positive.
+    model.estimator.learning_rate, model.estimator.warmup_gradient_steps = 1e-2, 300
+    model.estimator.refit_below = -1e9
+    model.estimator.fit(information_batch())
+
+    def loss():
+        return score_objective(model, batch) + 75 * model.estimator(information_batch()).clamp(min=0).sum()
+
+    gradients = train_gradient(model)
+    assert_close(gradients, finite_differences(model, loss))
+    without_penalty = finite_differences(model, lambda: score_objective(model, batch))
+    difference = gradients["encoder.mlp.layers.0.weight"] - without_penalty["encoder.mlp.layers.0.weight"]
+    assert difference.abs().max() > 1e-3
+
+
+# -- what must not be reached ----------------------------------------------------------------------------------
+
+
+def without_costs(model, batch):
+    batch = batch._replace(costs=th.zeros_like(batch.costs))
+    model.rollout_buffer.episode_batch = lambda: batch
+
+
+@pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
+def test_the_information_moves_the_encoder_and_nothing_in_the_action_head(encoder_gradient):
+    model, batch = make_model(beta=1 / 75, encoder_gradient=encoder_gradient)
+    without_costs(model, batch)
+    for name, gradient in train_gradient(model).items():
+        if name.startswith("action_head"):
+            assert gradient.abs().sum() == 0, name
+        else:
+            assert gradient.abs().sum() > 0, name
+
+
+def test_the_score_of_the_action_does_not_flow_through_the_trvs():
+    # With log q left out of the loss nothing must be left of the encoder's gradient.
+    model, _ = make_model(beta=math.inf, encoder_gradient="score")
+    original = model.policy.trv_log_prob
+    model.policy.trv_log_prob = lambda *args: original(*args).detach()
+    for name, gradient in ((n, p.grad) for n, p in model.policy.named_parameters()):
+        assert gradient is None, name
+    model.train()
+    for name, parameter in model.policy.named_parameters():
+        reached = parameter.grad is not None and parameter.grad.abs().sum() > 0
+        assert reached == name.startswith("action_head"), name
+
+
+def test_the_critics_are_frozen_while_the_policy_learns():
+    model, _ = make_model(beta=1 / 75, mi_estimator="mine")
+    before = parameters(model.estimator)
+    train_gradient(model)
+    for name, value in parameters(model.estimator).items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+def test_without_a_penalty_the_estimator_is_never_asked():
+    model, _ = make_model(beta=math.inf, mi_estimator="mine")
+    model.estimator = None
+    train_gradient(model)
+
+
+def test_the_weight_of_the_penalty_is_one_over_beta():
+    penalties = []
+    for beta in (1 / 10, 1 / 40):
+        model, batch = make_model(beta=beta)
+        without_costs(model, batch)
+        penalties.append(train_gradient(model)["encoder.mlp.layers.0.weight"])
+    np.testing.assert_allclose(4 * penalties[0], penalties[1], rtol=1e-9)
+
+
+def test_the_norm_of_the_gradient_is_clipped_as_asked():
+    for max_grad_norm in (None, 0.01):
+        model, _ = make_model(beta=math.inf, max_grad_norm=max_grad_norm)
+        norm = th.cat([g.flatten() for g in train_gradient(model).values()]).norm()
+        if max_grad_norm is None:
+            assert norm > 0.1
+        else:
+            assert norm == pytest.approx(0.01, rel=1e-3)
+
+
+# -- the truth -------------------------------------------------------------------------------------------------
+
+
+def simulated_costs(policy, noises):
+    """
+    Cost of each episode of LinearProblem as a function of the parameters, in double precision.
+
+    :param noises: x_0, and for each step: of the sensor, of the TRVs, of the action
+    """
+    x, *steps = noises
+    trv = th.zeros(len(x), policy.trv_dim).double()
+    cost = 0.0
+    for t, (sensor, trv_noise, action_noise) in enumerate(steps):
+        y = x + LinearProblem.sensor_noise_std * sensor
+        mean, var = gaussian(mlp(policy.encoder, th.cat([trv, y], -1), t), 1e-3)
+        trv = mean + var.sqrt() * trv_noise
+        mean, var = gaussian(mlp(policy.action_head, trv, t), 1e-5)
+        u = mean + var.sqrt() * action_noise
+        cost = cost + (x[:, 0] - 1) ** 2 + 0.3 * u[:, 0] ** 2
+        x = x + u
+    return cost + 2 * (x[:, 0] + 0.5) ** 2
+
+
+@pytest.mark.parametrize("baseline", ["mean", "value"])
+@pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
+def test_the_expected_gradient_is_that_of_the_true_expected_cost(encoder_gradient, baseline):
+    n, n_epochs = 10_000, 12
+    model = TDPG(
+        "TRVPolicy",
+        BatchedVecEnv(LinearProblem(), n),
+        n_episodes=n,
+        beta=math.inf,
+        baseline=baseline,
+        encoder_gradient=encoder_gradient,
+        learning_rate=1e-12,
+        policy_kwargs=dict(net_arch=dict(encoder=[4], action_head=[]), optimizer_class=th.optim.SGD),
+        seed=3,
+        device="cpu",
+    )
+    gradients = []
+
+    def flat_gradient(model):
+        if model.epoch > 0:
+            gradients.append(th.cat([p.grad.flatten().double() for p in model.policy.parameters()]))
+
+    model.learn((n_epochs + 1) * n * 2, callback=AtEveryEpoch(flat_gradient))
+    gradients = th.stack(gradients)
+    assert len(gradients) == n_epochs
+
+    model.policy.double()
+    vector = th.nn.utils.parameters_to_vector(model.policy.parameters()).detach()
+    m = 100_000
+    noises = [th.randn(m, 1).double()]
+    noises += [tuple(th.randn(m, d).double() for d in (1, 2, 1)) for _ in range(2)]
+    directions = th.cat([gradients.mean(0)[None], th.randn(4, len(vector)).double()])
+    directions /= directions.norm(dim=1, keepdim=True)
+    with th.no_grad():
+        for i, direction in enumerate(directions):
+            sides = []
+            for sign in (1, -1):
+                th.nn.utils.vector_to_parameters(vector + sign * 1e-4 * direction, model.policy.parameters())
+                sides.append(simulated_costs(model.policy, noises))
+            differences = (sides[0] - sides[1]) / 2e-4
+            truth, truth_error = differences.mean(), differences.std() / math.sqrt(m)
+            along = gradients @ direction
+            error = th.sqrt(along.var() / n_epochs + truth_error**2)
+            assert abs(along.mean() - truth) < 4.5 * error, (i, along.mean(), truth, error)
+            if i == 0:
+                assert truth > 20 * error  # the test could tell a gradient that is 20 % off
+
+
+def test_the_pathwise_gradient_varies_less_than_the_score_gradient():
+    variances = []
+    for encoder_gradient in ("score", "pathwise"):
+        gradients = []
+        model = TDPG(
+            "TRVPolicy",
+            BatchedVecEnv(LinearProblem(), 200),
+            n_episodes=200,
+            beta=math.inf,
+            encoder_gradient=encoder_gradient,
+            learning_rate=1e-12,
+            policy_kwargs=dict(optimizer_class=th.optim.SGD),
+            seed=0,
+            device="cpu",
+        )
+
+        def encoder_gradient_norms(model, gradients=gradients):
+            if model.epoch > 0:
+                gradients.append(th.cat([p.grad.flatten() for p in model.policy.encoder.parameters()]))
+
+        model.learn(31 * 400, callback=AtEveryEpoch(encoder_gradient_norms))
+        variances.append(th.stack(gradients).var(0).sum())
+    assert variances[1] < 0.7 * variances[0]
+
+
+def test_the_actions_density_is_taken_at_the_unclipped_action():
+    # A gradient taken at clipped actions would be biased wherever the bounds bind.
+    env = LavaEnv(horizon=2)
+    env.action_space = spaces.Box(-0.05, 0.05, (1,), np.float32)
+    model = TDPG("TRVPolicy", BatchedVecEnv(env, 50), n_episodes=50, beta=math.inf, seed=0, device="cpu")
+    model.learn(100)
+    assert np.abs(model.rollout_buffer.actions).max() > 0.5

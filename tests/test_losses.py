@@ -1,0 +1,53 @@
+"""The loss functions, by hand."""
+
+import pytest
+import torch as th
+
+from sb3_tdpg.losses import cost_to_go, information_loss, policy_gradient_loss
+
+
+def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes():
+    log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]])
+    advantages = th.tensor([[10.0, 20.0], [30.0, 40.0]])
+    loss = policy_gradient_loss(log_prob, advantages, th.ones(2, 2))
+    assert loss.item() == (10 + 40 + 90 + 160) / 2
+
+
+def test_a_dead_step_counts_nothing_and_still_counts_as_an_episode():
+    log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]])
+    advantages = th.tensor([[10.0, 20.0], [30.0, 40.0]])
+    alive = th.tensor([[1.0, 1.0], [0.0, 1.0]])
+    assert policy_gradient_loss(log_prob, advantages, alive).item() == (10 + 40 + 160) / 2
+
+
+def test_the_loss_is_a_cost_that_falls_when_expensive_samples_become_less_likely():
+    log_prob = th.zeros(1, 2, requires_grad=True)
+    policy_gradient_loss(log_prob, th.tensor([[5.0, -5.0]]), th.ones(1, 2)).backward()
+    assert log_prob.grad[0, 0] > 0 > log_prob.grad[0, 1]
+
+
+def test_no_gradient_flows_into_the_advantages():
+    advantages = th.ones(2, 2, requires_grad=True)
+    policy_gradient_loss(th.ones(2, 2, requires_grad=True), advantages, th.ones(2, 2)).backward()
+    assert advantages.grad is None
+
+
+def test_shapes_that_would_broadcast_are_refused():
+    with pytest.raises(AssertionError):
+        policy_gradient_loss(th.ones(3, 4), th.ones(3, 1), th.ones(3, 4))
+    with pytest.raises(AssertionError):
+        information_loss(th.ones(3, 1))
+
+
+def test_a_negative_estimate_of_the_information_is_neither_rewarded_nor_followed():
+    information = th.tensor([0.5, -3.0, 0.25], requires_grad=True)
+    loss = information_loss(information)
+    loss.backward()
+    assert loss.item() == 0.75
+    assert information.grad.tolist() == [1.0, 0.0, 1.0]
+
+
+def test_the_cost_to_go_sums_from_each_step_to_the_end_with_the_discount():
+    costs = th.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
+    assert cost_to_go(costs).tolist() == [[7, 70], [6, 60], [4, 40]]
+    assert cost_to_go(costs, 0.5).tolist() == [[3, 30], [4, 40], [4, 40]]

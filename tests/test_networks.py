@@ -1,0 +1,70 @@
+"""The batched networks are what a list of ordinary ones would be."""
+
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_tdpg.networks import BatchedLinear, BatchedMLP, TimeMLP
+
+T, N = 3, 5
+
+
+def plain_mlp(network, index):
+    """The same network as torch modules."""
+    layers = []
+    for i, layer in enumerate(network.layers):
+        linear = nn.Linear(layer.weight.shape[1], layer.weight.shape[2])
+        linear.weight.data = layer.weight[index].T.clone()
+        linear.bias.data = layer.bias[index, 0].clone()
+        layers.append(linear)
+        if i < len(network.layers) - 1 or network.activate_output:
+            layers.append(network.activation)
+    return nn.Sequential(*layers)
+
+
+@pytest.mark.parametrize("activate_output", [False, True])
+@pytest.mark.parametrize("activation_fn", [nn.ELU, nn.Tanh])
+def test_a_batched_mlp_is_a_list_of_ordinary_ones(activation_fn, activate_output):
+    network = BatchedMLP(T, [4, 6, 6, 2], activation_fn, activate_output)
+    x = th.randn(T, N, 4)
+    expected = th.stack([plain_mlp(network, t)(x[t]) for t in range(T)])
+    th.testing.assert_close(network(x), expected)
+    th.testing.assert_close(th.stack([network.at(x[t], t) for t in range(T)]), expected)
+
+
+@pytest.mark.parametrize("time_varying", [True, False])
+def test_all_steps_at_once_equal_one_step_at_a_time(time_varying):
+    network = TimeMLP(T, [4, 6, 2], time_varying=time_varying)
+    x = th.randn(T, N, 4)
+    th.testing.assert_close(network(x), th.stack([network.at(x[t], t) for t in range(T)]))
+
+
+def test_weights_vary_in_time_or_are_shared_as_asked():
+    x = th.randn(1, N, 4).expand(T, N, 4)
+    varying, shared = (TimeMLP(T, [4, 6, 2], time_varying=flag)(x) for flag in (True, False))
+    assert not th.allclose(varying[0], varying[1])
+    th.testing.assert_close(shared[0], shared[1])
+    sizes = [sum(p.numel() for p in TimeMLP(T, [4, 6, 2], time_varying=flag).parameters()) for flag in (True, False)]
+    assert sizes[0] == T * sizes[1]
+
+
+def test_the_gradient_of_one_step_leaves_the_weights_of_the_others_alone():
+    network = TimeMLP(T, [4, 6, 2])
+    network(th.randn(T, N, 4))[1].sum().backward()
+    for parameter in network.parameters():
+        assert parameter.grad[1].abs().sum() > 0
+        assert parameter.grad[[0, 2]].abs().sum() == 0
+
+
+def test_the_initialisation_has_the_range_of_torchs_linear():
+    layer = BatchedLinear(50, 16, 40)
+    for parameter in (layer.weight, layer.bias):
+        assert parameter.abs().max() <= 0.25
+        assert parameter.abs().max() > 0.24
+        assert abs(parameter.mean()) < 0.01
+
+
+def test_a_network_without_hidden_layers_is_affine():
+    network = TimeMLP(T, [4, 2])
+    x = th.randn(T, N, 4)
+    th.testing.assert_close(network(2 * x) - network(x), network(x) - network(0 * x), rtol=1e-4, atol=1e-5)

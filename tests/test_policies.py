@@ -1,0 +1,327 @@
+"""The policy step by step, as whole episodes, and with all sorts of spaces."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs
+
+from sb3_tdpg import TDPG, TRVPolicy
+from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
+
+T, N = 4, 6
+VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+CHW = spaces.Box(0, 255, (3, 20, 16), np.uint8)
+HWC = spaces.Box(0, 255, (20, 16, 3), np.uint8)
+ACTION_SPACES = {
+    "box": spaces.Box(-1, 1, (2,), np.float32),
+    "matrix": spaces.Box(-1, 1, (2, 3), np.float32),
+    "lopsided": spaces.Box(np.array([0.0, -5.0]), np.array([0.1, 3.0]), dtype=np.float32),
+    "discrete": spaces.Discrete(4),
+    "multi_discrete": spaces.MultiDiscrete([2, 3]),
+    "multi_binary": spaces.MultiBinary(3),
+}
+
+
+def make_policy(observation_space=VECTOR, action_space=ACTION_SPACES["box"], **kwargs):
+    return TRVPolicy(observation_space, action_space, lambda _: 1e-3, **{"horizon": T, **kwargs})
+
+
+def step_through(policy, observations, deterministic):
+    """Call predict T times; return actions, TRVs and the samples that were drawn, each ``(T, N, ...)``."""
+    recorded, original = [], policy.step
+
+    def record(*args):
+        recorded.append(original(*args))
+        return recorded[-1]
+
+    policy.step = record
+    state, actions, trvs = None, [], []
+    for observation in observations:
+        action, state = policy.predict(observation, state=state, deterministic=deterministic)
+        actions.append(action)
+        trvs.append(state[0])
+    policy.step = original
+    return np.stack(actions), np.stack(trvs), recorded
+
+
+# -- predict and the batched pass ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("time_varying", [True, False])
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("observation_space", [VECTOR, CHW], ids=["vector", "image"])
+def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
+    observation_space, deterministic, time_varying
+):
+    policy = make_policy(observation_space, time_varying=time_varying)
+    observations = np.stack([[observation_space.sample() for _ in range(N)] for _ in range(T)])
+    actions, trvs, steps = step_through(policy, observations, deterministic)
+    noise = th.stack([step.noise for step in steps])
+    assert (noise == 0).all() == deterministic
+
+    features = policy.extract_features(th.as_tensor(observations).flatten(0, 1), policy.features_extractor)
+    rebuilt = policy.rebuild_trvs(features.unflatten(0, (T, N)), noise)
+    np.testing.assert_allclose(rebuilt.trvs.detach(), trvs, rtol=1e-4, atol=1e-6)
+    for name in ("means", "stds"):
+        stepwise = th.stack([getattr(step, name) for step in steps])
+        th.testing.assert_close(getattr(rebuilt, name).detach(), stepwise, rtol=1e-4, atol=1e-6)
+    if deterministic:
+        means = policy.action_head(rebuilt.trvs).chunk(2, dim=-1)[0].detach().numpy()
+        np.testing.assert_allclose(actions, np.clip(means, -1, 1), rtol=1e-4, atol=1e-6)
+
+
+def test_the_log_probabilities_are_those_of_the_samples_that_were_drawn():
+    policy = make_policy(action_space=spaces.Box(-100, 100, (2,), np.float32))
+    observations = np.random.default_rng(0).normal(size=(T, N, 3)).astype(np.float32)
+    actions, trvs, steps = step_through(policy, observations, deterministic=False)
+    for t, step in enumerate(steps):
+        log_q = th.distributions.Normal(step.means, step.stds).log_prob(th.as_tensor(trvs[t])).sum(-1)
+        expected = -0.5 * (step.noise**2 + 2 * step.stds.log() + np.log(2 * np.pi)).sum(-1)
+        th.testing.assert_close(log_q, expected, rtol=1e-3, atol=1e-3)
+    assert not np.allclose(actions[0], actions[1])
+
+
+def test_deterministic_predictions_repeat_and_stochastic_ones_do_not():
+    policy = make_policy()
+    observation = np.ones((N, 3), np.float32)
+    (first, state), (second, _) = (policy.predict(observation, deterministic=True) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    assert len(np.unique(state[0], axis=0)) == 1
+    (first, state), (second, _) = (policy.predict(observation, deterministic=False) for _ in range(2))
+    assert not np.array_equal(first, second)
+    assert len(np.unique(state[0], axis=0)) == N
+
+
+def test_the_memory_matters_and_is_cleared_where_an_episode_starts():
+    policy = make_policy(time_varying=False)
+    observation = np.random.default_rng(0).normal(size=(N, 3)).astype(np.float32)
+    fresh, fresh_state = policy.predict(observation, deterministic=True)
+    _, memory = policy.predict(5 * observation, deterministic=True)
+    start = np.array([True, False] * 3)
+    mixed, mixed_state = policy.predict(observation, memory, start, deterministic=True)
+    np.testing.assert_array_equal(mixed[start], fresh[start])
+    np.testing.assert_array_equal(mixed_state[0][start], fresh_state[0][start])
+    assert (np.abs(mixed_state[0] - fresh_state[0])[~start] > 1e-5).all()
+    assert mixed_state[1].tolist() == [1, 2] * 3
+
+
+def test_the_state_that_is_passed_in_is_not_changed():
+    policy = make_policy()
+    observation = np.ones((N, 3), np.float32)
+    _, state = policy.predict(observation)
+    kept = [x.copy() for x in state]
+    policy.predict(observation, state, np.ones(N, bool))
+    for x, expected in zip(state, kept, strict=True):
+        np.testing.assert_array_equal(x, expected)
+
+
+@pytest.mark.parametrize("time_varying", [True, False])
+def test_environments_at_different_time_steps_in_one_call_equal_separate_calls(time_varying):
+    policy = make_policy(time_varying=time_varying)
+    rng = np.random.default_rng(0)
+    observation = rng.normal(size=(N, 3)).astype(np.float32)
+    trv, t = rng.normal(size=(N, 2)).astype(np.float32), np.array([2, 0, 3, 2, 1, 0])
+    together, (trvs, next_t) = policy.predict(observation, (trv, t), deterministic=True)
+    for i in range(N):
+        rows = slice(i, i + 1)
+        alone, (alone_trv, _) = policy.predict(observation[rows], (trv[rows], t[rows]), deterministic=True)
+        np.testing.assert_allclose(together[rows], alone, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(trvs[rows], alone_trv, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(next_t, t + 1)
+
+
+def test_a_single_observation_gives_a_single_action_and_equals_a_batch_of_one():
+    policy = make_policy()
+    observations = np.random.default_rng(0).normal(size=(T, 3)).astype(np.float32)
+    single, batch = None, None
+    for observation in observations:
+        action, single = policy.predict(observation, single, deterministic=True)
+        batched, batch = policy.predict(observation[None], batch, deterministic=True)
+        assert action.shape == (2,)
+        np.testing.assert_array_equal(action, batched[0])
+    assert policy.predict(observations[0], None, np.ones(1, bool))[0].shape == (2,)
+
+
+def test_an_episode_beyond_the_horizon_is_refused_with_the_mend():
+    policy = make_policy()
+    state = None
+    for _ in range(T):
+        _, state = policy.predict(np.zeros((N, 3), np.float32), state)
+    with pytest.raises(ValueError, match=rf"step {T + 1} of an episode.*horizon is {T}.*episode_start=True"):
+        policy.predict(np.zeros((N, 3), np.float32), state)
+    policy.predict(np.zeros((N, 3), np.float32), state, np.ones(N, bool))
+
+
+def test_a_state_for_another_number_of_environments_is_refused():
+    policy = make_policy()
+    _, state = policy.predict(np.zeros((N, 3), np.float32))
+    with pytest.raises(ValueError, match="same number of environments"):
+        policy.predict(np.zeros((2, 3), np.float32), state)
+
+
+@pytest.mark.parametrize("shape", [(4,), (N, 4), (2, 3, 3), ()])
+def test_an_observation_of_a_wrong_shape_is_refused(shape):
+    with pytest.raises(ValueError, match=r"(?i)observation.*\(3,\)"):
+        make_policy().predict(np.zeros(shape, np.float32))
+
+
+def test_predicting_leaves_no_trace_in_the_policy():
+    policy = make_policy()
+    policy.train()
+    _, state = policy.predict(np.zeros((N, 3), np.float32), deterministic=True)
+    again, _ = policy.predict(np.zeros((N, 3), np.float32), deterministic=True)
+    policy.predict(np.ones((2, 3), np.float32))  # an evaluation in between, as EvalCallback does
+    same, _ = policy.predict(np.zeros((N, 3), np.float32), deterministic=True)
+    np.testing.assert_array_equal(again, same)
+    assert isinstance(state, tuple)
+    assert all(isinstance(x, np.ndarray) for x in state)
+
+
+def test_actions_are_clipped_to_their_bounds():
+    policy = make_policy(action_space=ACTION_SPACES["lopsided"])
+    actions, _ = policy.predict(10 * np.ones((200, 3), np.float32))
+    low, high = ACTION_SPACES["lopsided"].low, ACTION_SPACES["lopsided"].high
+    assert (actions >= low).all()
+    assert (actions <= high).all()
+    assert (actions[:, 0] == low[0]).any()
+    assert (actions[:, 0] == high[0]).any()
+
+
+# -- what the policy is made of --------------------------------------------------------------------------------
+
+
+def test_the_action_head_sees_the_trvs_and_nothing_else():
+    policy = make_policy()
+    step = policy.step(th.randn(N, 3), th.randn(N, 2), np.zeros(N, int), deterministic=True)
+    means = policy.action_head.at(step.trvs, 0).chunk(2, dim=-1)[0]
+    th.testing.assert_close(step.actions, means)
+    assert policy.action_head.mlp.layers[0].weight.shape[1] == policy.trv_dim
+
+
+def test_weights_vary_in_time_up_to_a_horizon_and_are_shared_beyond():
+    for horizon, expected in ((MAX_TIME_VARYING_HORIZON, True), (MAX_TIME_VARYING_HORIZON + 1, False)):
+        assert make_policy(horizon=horizon, net_arch=dict(encoder=[2], action_head=[2])).time_varying == expected
+    assert not make_policy(time_varying=False).time_varying
+
+
+def test_the_variances_have_the_floors_and_offsets_that_were_asked_for():
+    kwargs = dict(encoder_var_floor=0.25, action_var_floor=0.09)
+    policy = make_policy(encoder_log_var_init=-50.0, action_log_var_init=-50.0, **kwargs)
+    step = policy.step(th.randn(N, 3), th.zeros(N, 2), np.zeros(N, int))
+    th.testing.assert_close(step.stds, th.full((N, 2), 0.5))
+    std = policy._action_distribution(policy.action_head.at(step.trvs, 0)).distribution.stddev
+    th.testing.assert_close(std, th.full((N, 2), 0.3))
+    louder = make_policy(encoder_log_var_init=4.0).step(th.randn(N, 3), th.zeros(N, 2), np.zeros(N, int))
+    assert louder.stds.min() > 4
+
+
+def test_sizes_and_activations_are_those_of_the_policy_kwargs():
+    policy = make_policy(trv_dim=5, net_arch=dict(encoder=[7, 9], action_head=[]), activation_fn=th.nn.Tanh)
+    assert [tuple(layer.weight.shape) for layer in policy.encoder.mlp.layers] == [(T, 8, 7), (T, 7, 9), (T, 9, 10)]
+    assert [tuple(layer.weight.shape) for layer in policy.action_head.mlp.layers] == [(T, 5, 4)]
+    assert isinstance(policy.encoder.mlp.activation, th.nn.Tanh)
+
+
+def test_the_paper_s_convolutions_stand_before_the_encoder_of_images():
+    policy = make_policy(CHW)
+    assert policy.trv_dim == 8
+    assert [layer.out_channels for layer in policy.features_extractor.cnn if isinstance(layer, th.nn.Conv2d)] == [6, 6]
+    dark, bright = (
+        policy.predict(np.full((1, *CHW.shape), value, np.uint8), deterministic=True)[1][0] for value in (0, 255)
+    )
+    assert not np.allclose(dark, bright)
+
+
+def test_a_saved_policy_predicts_the_same(tmp_path):
+    policy = make_policy(trv_dim=3, encoder_var_floor=0.5, time_varying=False, action_log_var_init=1.0)
+    policy.save(tmp_path / "policy.zip")
+    loaded = TRVPolicy.load(tmp_path / "policy.zip", device="cpu")
+    observation = np.ones((N, 3), np.float32)
+    results = []
+    for p in (policy, loaded):
+        th.manual_seed(1)
+        results.append(p.predict(observation)[0])
+    np.testing.assert_array_equal(*results)
+
+
+# -- spaces ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
+@pytest.mark.parametrize("name", ACTION_SPACES)
+def test_every_kind_of_action_space_trains_and_gives_valid_actions(name, encoder_gradient, tmp_path):
+    # ToyEnv itself asserts that each action is in the space.
+    model = tiny_tdpg(toy_vec_env(action_space=ACTION_SPACES[name]), encoder_gradient=encoder_gradient, beta=0.1)
+    train_epochs(model, 2)
+    observation = model.observation_space.sample()
+    for deterministic in (True, False):
+        action, _ = model.predict(observation, deterministic=deterministic)
+        assert ACTION_SPACES[name].contains(action if np.ndim(action) else np.int64(action))
+        batch, _ = model.predict(np.stack([observation] * 5), deterministic=deterministic)
+        assert batch.shape == (5, *ACTION_SPACES[name].shape)
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", device="cpu")
+    expected, _ = model.predict(observation, deterministic=True)
+    np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], expected)
+
+
+@pytest.mark.parametrize("name", ACTION_SPACES)
+def test_the_log_probability_of_an_action_is_that_of_its_distribution(name):
+    space = ACTION_SPACES[name]
+    model = tiny_tdpg(toy_vec_env(action_space=space), beta=np.inf)
+    train_epochs(model, 1)
+    batch = model.rollout_buffer.episode_batch()
+    log_probs = model.policy.action_log_prob(batch.trvs, batch).detach()
+    assert log_probs.shape == (3, 20)
+    outputs = model.policy.action_head(batch.trvs).detach()
+    actions = batch.actions
+    if name == "discrete":
+        expected = th.distributions.Categorical(logits=outputs).log_prob(actions[..., 0])
+    elif name == "multi_discrete":
+        parts = [th.distributions.Categorical(logits=o) for o in outputs.split([2, 3], dim=-1)]
+        expected = sum(part.log_prob(actions[..., i]) for i, part in enumerate(parts))
+    elif name == "multi_binary":
+        expected = th.distributions.Bernoulli(logits=outputs).log_prob(actions).sum(-1)
+    else:
+        mean, log_var = outputs.chunk(2, dim=-1)
+        expected = th.distributions.Normal(mean, (log_var.exp() + 1e-5).sqrt()).log_prob(actions).sum(-1)
+    th.testing.assert_close(log_probs, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("space", [CHW, HWC], ids=["CHW", "HWC"])
+def test_images_train_in_either_layout(space, tmp_path):
+    model = tiny_tdpg(toy_vec_env(observation_space=space), beta=0.1, mi_estimator="mine", policy_kwargs={})
+    train_epochs(model, 2)
+    assert model.rollout_buffer.observations.dtype == np.uint8
+    assert model.rollout_buffer.observations.shape == (3, 20, 3, 20, 16)
+    state = model.rollout_buffer.states[0, :, 0]
+    shown = model.rollout_buffer.observations[0, :, 0, 0, 0]
+    np.testing.assert_array_equal(shown, (127 * (state + 1)).astype(np.uint8))
+    env = ToyEnv(observation_space=space)
+    observation, _ = env.reset(seed=0)
+    for batch in (observation, np.stack([observation] * 3)):  # as the user's environment gives them
+        assert model.predict(batch)[0].shape == (*batch.shape[:-3], 1)
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=toy_vec_env(observation_space=space), device="cpu")
+    train_epochs(loaded, 1)
+
+
+def test_a_discrete_observation_is_taken_as_the_state():
+    space = spaces.Discrete(2)
+
+    class Coin(ToyEnv):
+        def _observe(self):
+            return int(self.x > 0)
+
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    model = tiny_tdpg(DummyVecEnv([lambda: Coin(space, gives_state=False)] * 2), beta=0.1)
+    train_epochs(model, 2)
+    assert model.predict(1)[0].shape == (1,)
+
+
+def test_an_environment_without_a_true_state_is_taken_as_fully_observed():
+    model = tiny_tdpg(toy_vec_env(gives_state=False), beta=0.1)
+    train_epochs(model, 1)
+    np.testing.assert_array_equal(model.rollout_buffer.states, model.rollout_buffer.observations)

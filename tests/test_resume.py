@@ -1,0 +1,228 @@
+"""A training that is killed and resumed ends with the very numbers of one that was not."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from small_problems import AtEveryStep, assert_same_parameters, parameters, tiny_tdpg
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback
+from sb3_tdpg.envs.lava import LavaEnv
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SAVE_FREQ = 2
+# Seven epochs of 20 episodes on Lava, about as many on CartPole, of 8 episodes of varying length.
+TOTAL = {"lava": 700, "lava_in_dummy_vec_env": 700, "cartpole": 1600}
+
+ENVIRONMENTS = {
+    "lava": lambda: BatchedVecEnv(LavaEnv(), 20),
+    "lava_in_dummy_vec_env": lambda: make_vec_env("Lava-v0", n_envs=4),
+    "cartpole": lambda: make_vec_env("CartPole-v1", n_envs=4),
+}
+KEEPS_ALL = "mine that keeps its moments and an average"
+SETTINGS = {
+    "mine": dict(mi_estimator="mine"),
+    KEEPS_ALL: dict(
+        mi_estimator="mine",
+        mi_kwargs=dict(
+            hidden_sizes=(8,),
+            batch_size=5,
+            gradient_steps=2,
+            warmup_gradient_steps=4,
+            reset_moments=False,
+            ema_decay=0.9,
+        ),
+    ),
+    "logdet and schedules": dict(
+        beta=lambda progress: 0.1 + progress, learning_rate=lambda progress: 1e-2 * progress, max_grad_norm=1.0
+    ),
+    "policy gradient without a seed": dict(beta=float("inf"), seed=None),
+}
+
+
+def make_model(env, settings):
+    return tiny_tdpg(ENVIRONMENTS[env](), n_episodes=8 if env == "cartpole" else 20, **SETTINGS[settings])
+
+
+def train(model, total_timesteps, path, callbacks=(), **kwargs):
+    return model.learn(total_timesteps, callback=[TrainingCheckpointCallback(path, SAVE_FREQ), *callbacks], **kwargs)
+
+
+def resume(env, path, callbacks=()):
+    model = TDPG.load(path, env=ENVIRONMENTS[env](), device="cpu")
+    # Nothing of what the process has drawn in the meantime may matter.
+    th.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002
+    return train(model, model.remaining_timesteps, path, callbacks, reset_num_timesteps=False)
+
+
+def moments(optimizer):
+    return {
+        f"{group}.{name}": value
+        for group, state in optimizer.state_dict()["state"].items()
+        for name, value in state.items()
+        if isinstance(value, th.Tensor)
+    }
+
+
+def assert_same_training(first, second):
+    assert (first.epoch, first.num_timesteps) == (second.epoch, second.num_timesteps)
+    assert_same_parameters(parameters(first.policy), parameters(second.policy))
+    assert_same_parameters(parameters(first.estimator), parameters(second.estimator))
+    assert_same_parameters(moments(first.policy.optimizer), moments(second.policy.optimizer))
+    if hasattr(first.estimator, "optimizer"):
+        assert_same_parameters(moments(first.estimator.optimizer), moments(second.estimator.optimizer))
+    np.testing.assert_array_equal(first.rollout_buffer.observations, second.rollout_buffer.observations)
+    assert first.policy.optimizer.param_groups[0]["lr"] == second.policy.optimizer.param_groups[0]["lr"]
+
+
+class Stop(Exception):
+    """Ends a training at once, as a kill would."""
+
+
+def stop_in_epoch(epoch):
+    def stop(callback):
+        if callback.model.epoch == epoch and callback.n_calls % 2 == 0:
+            raise Stop
+
+    return AtEveryStep(stop)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_a_training_that_stopped_anywhere_goes_on_bit_for_bit(env, settings, tmp_path):
+    total, stop = TOTAL[env], stop_in_epoch(3)
+    if SETTINGS[settings].get("seed", 0) is None:  # two models differ then: both go on from the same file
+        start = tmp_path / "start.zip"
+        with pytest.raises(Stop):
+            train(make_model(env, settings), total, start, [stop_in_epoch(1)])
+        (tmp_path / "b.zip").write_bytes(start.read_bytes())
+        uninterrupted = resume(env, start)
+        with pytest.raises(Stop):
+            resume(env, tmp_path / "b.zip", [stop])
+    else:
+        uninterrupted = train(make_model(env, settings), total, tmp_path / "a.zip")
+        with pytest.raises(Stop):
+            train(make_model(env, settings), total, tmp_path / "b.zip", [stop])
+    assert TDPG.load(tmp_path / "b.zip", device="cpu").epoch == 2
+    assert_same_training(uninterrupted, resume(env, tmp_path / "b.zip"))
+
+
+def test_a_training_may_be_resumed_more_than_once(tmp_path):
+    uninterrupted = train(make_model("lava", "mine"), 700, tmp_path / "a.zip")
+    path = tmp_path / "b.zip"
+    with pytest.raises(Stop):
+        train(make_model("lava", "mine"), 700, path, [stop_in_epoch(2)])
+    for epoch in (3, 5):
+        with pytest.raises(Stop):
+            resume("lava", path, [stop_in_epoch(epoch)])
+    assert_same_training(uninterrupted, resume("lava", path))
+
+
+def test_a_selection_goes_on_as_if_nothing_had_happened(tmp_path):
+    def selection(name):
+        return SelectionCallback(mi_limit=1e3, save_path=tmp_path / name)
+
+    def train_with(name, **stop):
+        chosen = selection(name)
+        model = train(make_model("lava", "mine"), 700, tmp_path / f"{name}_checkpoint.zip", [chosen, *stop.values()])
+        return model, chosen
+
+    uninterrupted, expected = train_with("a")
+    with pytest.raises(Stop):
+        train_with("b", stop=stop_in_epoch(5))
+    chosen = selection("b")
+    resumed = resume("lava", tmp_path / "b_checkpoint.zip", [chosen])
+    assert_same_training(uninterrupted, resumed)
+    assert chosen.best == expected.best
+    expected.restore(uninterrupted)
+    chosen.restore(resumed)
+    assert_same_parameters(parameters(uninterrupted.policy), parameters(resumed.policy))
+
+
+def test_a_checkpoint_of_other_environments_is_refused_with_the_mend(tmp_path):
+    path = tmp_path / "c.zip"
+    train(make_model("lava_in_dummy_vec_env", "mine"), 100, path)
+    model = TDPG.load(path, env=make_vec_env("Lava-v0", n_envs=2), device="cpu")
+    with pytest.raises(ValueError, match=r"made with 4 environments, .* has 2: resume with as many"):
+        model.learn(100, reset_num_timesteps=False)
+
+
+def test_an_ordinary_file_has_no_random_state_in_it(tmp_path):
+    model = train(make_model("lava", "mine"), 100, tmp_path / "c.zip")
+    model.save(tmp_path / "model.zip")
+    assert TDPG.load(tmp_path / "model.zip", device="cpu")._random_state is None
+
+
+# -- with a real kill ------------------------------------------------------------------------------------------
+
+SCRIPT = """
+    import os, signal, sys, zipfile
+    sys.path.insert(0, {tests!r})
+    import torch as th
+    th.set_num_threads(1)
+    import stable_baselines3.common.save_util
+    from small_problems import AtEveryStep
+    from test_resume import TOTAL, make_model, train
+
+    def kill_in_mid_rollout(callback):
+        if callback.model.epoch == 5 and callback.n_calls % 2 == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    original, models = zipfile.ZipFile.open, []
+
+    def kill_in_mid_save(archive, name, mode="r", **kwargs):
+        if mode == "w" and name == "policy.pth":
+            models.append(name)
+            if len(models) == 4:  # at epoch 6
+                archive.fp.flush()
+                os.kill(os.getpid(), signal.SIGKILL)
+        return original(archive, name, mode, **kwargs)
+
+    callbacks = []
+    if {where!r} == "mid_save":
+        zipfile.ZipFile.open = kill_in_mid_save
+    else:
+        callbacks = [AtEveryStep(kill_in_mid_rollout)]
+    train(make_model({env!r}, {settings!r}), TOTAL[{env!r}], {path!r}, callbacks)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
+@pytest.mark.parametrize(("env", "where"), [("lava", "mid_rollout"), ("lava", "mid_save"), ("cartpole", "mid_rollout")])
+def test_a_process_killed_with_sigkill_leaves_a_whole_checkpoint_to_go_on_from(env, where, tmp_path):
+    path = tmp_path / "killed.zip"
+    script = textwrap.dedent(SCRIPT).format(
+        tests=str(REPOSITORY / "tests"), env=env, where=where, settings=KEEPS_ALL, path=str(path)
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    if where == "mid_save":
+        assert list(tmp_path.glob("*.partial")), "the kill came too late"
+    assert TDPG.load(path, device="cpu").epoch == 4
+    uninterrupted = train(make_model(env, KEEPS_ALL), TOTAL[env], tmp_path / "whole.zip")
+    assert uninterrupted.epoch >= 7
+    assert_same_training(uninterrupted, resume(env, path))
+
+
+@pytest.mark.parametrize("failing", ["os.replace", "stable_baselines3.common.base_class.save_to_zip_file"])
+def test_a_save_that_fails_half_way_leaves_the_old_file(failing, tmp_path, monkeypatch):
+    model = tiny_tdpg()
+    model.save(tmp_path / "model.zip")
+    before = (tmp_path / "model.zip").read_bytes()
+
+    def fail(*args, **kwargs):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(failing, fail)
+    with pytest.raises(OSError, match="no space"):
+        model.save(tmp_path / "model.zip")
+    assert (tmp_path / "model.zip").read_bytes() == before

@@ -1,0 +1,205 @@
+"""The batched VecEnv is the same environment as the one that gymnasium.make gives."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_problems import tiny_tdpg, train_epochs
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from sb3_tdpg import BatchedVecEnv, make_episodes_env
+from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.scenarios import LAVA_TABLE_READING
+
+N = 7
+
+
+def lava_vec_env(n=N, **kwargs):
+    return BatchedVecEnv(LavaEnv(**kwargs), n)
+
+
+@pytest.mark.parametrize("reading", [{}, LAVA_TABLE_READING], ids=["text", "table"])
+def test_every_row_is_what_the_single_environment_gives_for_the_same_state_and_action(reading):
+    kwargs = dict(sensor_noise_std=0.0, **reading)
+    rng = np.random.default_rng(0)
+    vec_env = lava_vec_env(40, **kwargs)
+    vec_env.seed(1)
+    observations = vec_env.reset()
+    singles = [LavaEnv(**kwargs) for _ in range(40)]
+    for single, info, observation in zip(singles, vec_env.reset_infos, observations, strict=True):
+        single.reset()
+        single._state = info["state"][None].copy()
+        np.testing.assert_array_equal(observation, info["state"].astype(np.float32))
+    for t in range(5):
+        actions = rng.uniform(-4, 4, (40, 1)).astype(np.float32)
+        observations, rewards, dones, infos = vec_env.step(actions)
+        for i, single in enumerate(singles):
+            observation, reward, terminated, truncated, info = single.step(actions[i])
+            np.testing.assert_array_equal(infos[i]["state"], info["state"])
+            assert infos[i]["cost"] == info["cost"]
+            assert rewards[i] == np.float32(reward)
+            assert dones[i] == terminated == (t == 4)
+            assert not truncated
+            last = infos[i]["terminal_observation"] if dones[i] else observations[i]
+            np.testing.assert_array_equal(last, observation)
+
+
+def test_the_batch_draws_the_same_noise_as_a_single_environment_with_the_same_seed():
+    vec_env, single = lava_vec_env(1, sensor_noise_std=0.5), LavaEnv(sensor_noise_std=0.5)
+    vec_env.seed(5)
+    np.testing.assert_array_equal(vec_env.reset()[0], single.reset(seed=5)[0])
+    for _ in range(4):
+        np.testing.assert_array_equal(vec_env.step(np.ones((1, 1)))[0][0], single.step(np.ones(1))[0])
+
+
+def test_a_finished_episode_is_reset_at_once_and_its_last_observation_is_kept():
+    vec_env = lava_vec_env(sensor_noise_std=0.0)
+    vec_env.seed(0)
+    vec_env.reset()
+    first = np.array([info["state"] for info in vec_env.reset_infos])
+    for _ in range(4):
+        _, _, dones, infos = vec_env.step(np.zeros((N, 1)))
+        assert not dones.any()
+        assert all("terminal_observation" not in info and "episode" not in info for info in infos)
+    observations, _, dones, infos = vec_env.step(np.zeros((N, 1)))
+    assert dones.all()
+    second = np.array([info["state"] for info in vec_env.reset_infos])
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(observations, second.astype(np.float32))
+    for info, x_0 in zip(infos, first, strict=True):
+        np.testing.assert_array_equal(info["state"], x_0)  # a robot at rest that is not pushed stays
+        np.testing.assert_array_equal(info["terminal_observation"], x_0.astype(np.float32))
+        assert info["TimeLimit.truncated"] is False
+
+
+def test_the_episode_info_has_the_return_and_the_length_of_each_episode():
+    vec_env = lava_vec_env()
+    vec_env.reset()
+    for _ in range(2):
+        total = np.zeros(N)
+        for _ in range(5):
+            _, rewards, _, infos = vec_env.step(np.full((N, 1), 0.2))
+            total += rewards
+        np.testing.assert_allclose([info["episode"]["r"] for info in infos], total, rtol=1e-6)
+        assert {info["episode"]["l"] for info in infos} == {5}
+
+
+def test_states_that_went_out_earlier_are_not_overwritten_later():
+    vec_env = lava_vec_env()
+    vec_env.reset()
+    x_0 = [info["state"] for info in vec_env.reset_infos]
+    kept_x_0 = np.array(x_0)
+    _, _, _, infos = vec_env.step(np.ones((N, 1)))
+    x_1 = [info["state"] for info in infos]
+    kept_x_1 = np.array(x_1)
+    for _ in range(5):
+        vec_env.step(np.ones((N, 1)))
+    np.testing.assert_array_equal(x_0, kept_x_0)
+    np.testing.assert_array_equal(x_1, kept_x_1)
+
+
+def test_overwriting_a_state_in_an_info_does_not_move_the_environment():
+    vec_env, untouched = lava_vec_env(), lava_vec_env()
+    for env in (vec_env, untouched):
+        env.seed(0)
+        env.reset()
+    for info in vec_env.reset_infos:
+        info["state"][:] = 4.9
+    _, _, _, infos = vec_env.step(np.ones((N, 1)))
+    _, _, _, expected = untouched.step(np.ones((N, 1)))
+    np.testing.assert_array_equal([i["state"] for i in infos], [i["state"] for i in expected])
+
+
+def test_the_same_seed_gives_the_same_episodes_and_the_seed_is_used_once():
+    def two_resets(seed):
+        vec_env = lava_vec_env()
+        vec_env.seed(seed)
+        return np.concatenate([vec_env.reset(), vec_env.reset()])
+
+    np.testing.assert_array_equal(two_resets(3), two_resets(3))
+    assert not np.array_equal(two_resets(3), two_resets(4))
+    first, second = np.split(two_resets(3), 2)
+    assert not np.array_equal(first, second)
+
+
+def test_episodes_side_by_side_differ_from_each_other():
+    vec_env = lava_vec_env(100)
+    vec_env.reset()
+    assert len({float(info["state"][0]) for info in vec_env.reset_infos}) == 100
+
+
+def test_reset_options_are_refused_with_the_mend():
+    vec_env = lava_vec_env()
+    vec_env.set_options({"sensor_noise_std": 1.0})
+    with pytest.raises(ValueError, match="keywords of its constructor"):
+        vec_env.reset()
+
+
+@pytest.mark.parametrize("wrap", [
+    lambda env: VecNormalize(env, norm_reward=False),
+    VecMonitor,
+    lambda env: VecMonitor(VecNormalize(env, norm_reward=False)),
+], ids=["VecNormalize", "VecMonitor", "both"])  # fmt: skip
+def test_the_model_sees_the_true_states_through_sb3s_wrappers(wrap):
+    env = lava_vec_env(20, sensor_noise_std=0.0)
+    model = tiny_tdpg(wrap(env))
+    train_epochs(model, 2)
+    states = model.rollout_buffer.states
+    assert (states[0, :, 1] == 0).all()  # x_0, not what is left of the last episode
+    assert states[0, :, 0].min() >= 0
+    assert len(np.unique(states[0, :, 0])) == 20
+    if not isinstance(model.env, VecNormalize) and not isinstance(getattr(model.env, "venv", None), VecNormalize):
+        np.testing.assert_allclose(model.rollout_buffer.observations, states, rtol=1e-6)
+
+
+def test_attributes_and_methods_of_the_environment_can_be_reached():
+    vec_env = lava_vec_env()
+    assert vec_env.get_attr("horizon") == [5] * N
+    vec_env.set_attr("sensor_noise_std", 0.25)
+    assert vec_env.get_attr("sensor_noise_std", indices=[0, 2]) == [0.25, 0.25]
+    assert vec_env.has_attr("state_space")
+    assert not vec_env.has_attr("no_such_attribute")
+    assert vec_env.env_method("render", indices=0) == [None]
+    assert vec_env.env_is_wrapped(gym.Wrapper) == [False] * N
+
+
+def test_every_episode_of_the_batch_is_rendered_by_its_own_state():
+    vec_env = lava_vec_env(2, render_mode="rgb_array")
+    vec_env.reset()
+    images = vec_env.get_images()
+    assert [image.shape for image in images] == [(96, 480, 3)] * 2
+    assert not np.array_equal(*images)
+
+
+# -- make_episodes_env ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", ["Lava-v0", "sb3_tdpg:Lava-v0"])
+def test_an_environment_of_this_plugin_becomes_one_batch(env_id):
+    env = make_episodes_env(env_id, n_episodes=30, env_kwargs=dict(sensor_noise_std=0.2), seed=1)
+    assert isinstance(env, BatchedVecEnv)
+    assert env.num_envs == 30
+    assert env.get_attr("sensor_noise_std")[0] == 0.2
+    again = make_episodes_env(env_id, n_episodes=30, env_kwargs=dict(sensor_noise_std=0.2), seed=1)
+    np.testing.assert_array_equal(env.reset(), again.reset())
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_any_other_environment_becomes_a_dummy_vec_env(env_id):
+    env = make_episodes_env(env_id, n_episodes=120, seed=1)
+    assert isinstance(env, DummyVecEnv)
+    assert env.num_envs == 40  # the largest divisor of 120 up to 50
+    np.testing.assert_array_equal(env.reset(), make_episodes_env(env_id, n_episodes=120, seed=1).reset())
+    assert make_episodes_env(env_id, 3, n_episodes=120).num_envs == 3
+
+
+def test_an_unknown_id_is_refused():
+    with pytest.raises(gym.error.Error, match="NoSuchEnv"):
+        make_episodes_env("NoSuchEnv-v0")
+
+
+def test_lava_trains_in_sb3s_own_vec_env_too():
+    model = tiny_tdpg(make_vec_env("Lava-v0", n_envs=4))
+    train_epochs(model, 2)
+    assert model.rollout_buffer.alive.all()
+    assert (model.rollout_buffer.states[0, :, 1] == 0).all()
