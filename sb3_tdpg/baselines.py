@@ -13,10 +13,13 @@ import torch as th
 
 from sb3_tdpg.losses import cost_to_go
 
-AdvantageFunction = Callable[[th.Tensor, th.Tensor, th.Tensor, float], th.Tensor]
+AdvantageFunction = Callable[..., th.Tensor]
+"""``(costs, states, alive, gamma, gae_lambda) -> advantages``, see the functions below."""
 
 
-def episode_mean_advantages(costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float) -> th.Tensor:
+def episode_mean_advantages(
+    costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
+) -> th.Tensor:
     """
     Subtract the batch's mean from the cost of the whole episode, as the paper does.
 
@@ -24,34 +27,42 @@ def episode_mean_advantages(costs: th.Tensor, states: th.Tensor, alive: th.Tenso
     :param states: ``(T, N, X)``, unused
     :param alive: ``(T, N)``
     :param gamma: discount
+    :param gae_lambda: unused: there is no value function
     :return: ``(T, N)``
     """
     episode_cost = cost_to_go(costs, gamma)[0]
     return (episode_cost - episode_cost.mean()).expand_as(costs)
 
 
-def value_advantages(costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float) -> th.Tensor:
+def value_advantages(
+    costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
+) -> th.Tensor:
     """
-    Subtract from the cost to come its regression on the true state, one regression per time step.
+    Estimate advantages (Schulman et al., 2016) with a value V_t(x_t) of the true state, one regression per time step.
 
-    The true state is known in training only, and only the baseline sees it: the gradient stays unbiased, since x_t
-    precedes the noise of step t. Each half of the episodes is predicted from the other half, so that no episode's own
-    cost enters its baseline.
+    With ``gae_lambda=1`` this is the cost to come less its regression on the state. The true state is known in training
+    only, and only the baseline sees it: the gradient stays unbiased, since x_t precedes the noise of step t. Each
+    half of
+    the episodes is predicted from the other half, so that no episode's own cost enters its baseline. A smaller
+    ``gae_lambda`` replaces later costs by V, which removes their noise; V knows nothing of the policy's memory, so that
+    what the TRVs carry from step to step is then credited less than it should be.
 
     :param costs: ``(T, N)``
     :param states: x_t, ``(T, N, X)``
     :param alive: ``(T, N)``
     :param gamma: discount
+    :param gae_lambda: 1: costs as they were; 0: the next state's value instead of all later costs
     :return: ``(T, N)``
     """
     targets = cost_to_go(costs, gamma)
     features = _state_features(states, alive)  # (T, N, F)
     fold = th.arange(costs.shape[1], device=costs.device) % 2
-    prediction = th.zeros_like(targets)
+    values = th.zeros_like(targets)
     for held_out in (0, 1):
-        weight = alive * (fold != held_out)
-        prediction += (fold == held_out) * _ridge(features, targets, weight)
-    return targets - prediction
+        values += (fold == held_out) * alive * _ridge(features, targets, alive * (fold != held_out))
+    next_values = th.cat([values[1:], th.zeros_like(values[:1])])
+    residuals = costs + gamma * next_values - values
+    return cost_to_go(residuals, gamma * gae_lambda)
 
 
 def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: float = 0.5) -> th.Tensor:

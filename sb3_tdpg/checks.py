@@ -23,6 +23,7 @@ def check_arguments(
     n_episodes: int,
     encoder_gradient: str,
     gamma: float,
+    gae_lambda: float,
     max_grad_norm: float | None,
 ) -> None:
     """
@@ -47,6 +48,8 @@ def check_arguments(
         raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
     if not 0.0 < gamma <= 1.0:
         raise ValueError(f"gamma={gamma} must be in (0, 1]; the paper's problems have gamma=1")
+    if not 0.0 <= gae_lambda <= 1.0:
+        raise ValueError(f"gae_lambda={gae_lambda} must be in [0, 1]; 1 leaves the gradient unbiased")
     if max_grad_norm is not None and not max_grad_norm > 0:
         raise ValueError(f"max_grad_norm={max_grad_norm} must be positive, or None for no clipping")
 

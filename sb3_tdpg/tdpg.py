@@ -76,6 +76,8 @@ class TDPG(OnPolicyAlgorithm):
         ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the
         second varies less.
     :param gamma: Discount factor; the paper has none.
+    :param gae_lambda: Bias against variance of the advantages with ``baseline="value"``: 1 uses the costs as they
+        were, 0 the regression at the next state in their place, which is less noisy and blind to the policy's memory.
     :param max_grad_norm: Clip the norm of the policy's gradient to this; ``None``: no clipping.
     :param stats_window_size: Episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
@@ -107,6 +109,7 @@ class TDPG(OnPolicyAlgorithm):
         baseline: str = "value",
         encoder_gradient: str = "score",
         gamma: float = 1.0,
+        gae_lambda: float = 1.0,
         max_grad_norm: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -116,7 +119,7 @@ class TDPG(OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        check_arguments(policy, beta, learning_rate, n_episodes, encoder_gradient, gamma, max_grad_norm)
+        check_arguments(policy, beta, learning_rate, n_episodes, encoder_gradient, gamma, gae_lambda, max_grad_norm)
         get_estimator_class(mi_estimator)
         get_baseline(baseline)
         if n_envs is not None:
@@ -136,8 +139,8 @@ class TDPG(OnPolicyAlgorithm):
             learning_rate=learning_rate,
             n_steps=0,  # known once the horizon is
             gamma=gamma,
-            # What follows belongs to value-based on-policy algorithms and is not used.
-            gae_lambda=1.0,
+            gae_lambda=gae_lambda,
+            # What follows belongs to algorithms with a value network and is not used.
             ent_coef=0.0,
             vf_coef=0.0,
             max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
@@ -180,6 +183,7 @@ class TDPG(OnPolicyAlgorithm):
             self.n_episodes,
             self.encoder_gradient,
             self.gamma,
+            self.gae_lambda,
             self.max_grad_norm,
         )
         self._setup_lr_schedule()
@@ -352,7 +356,7 @@ class TDPG(OnPolicyAlgorithm):
         self._update_learning_rate(self.policy.optimizer)
         mi_coef = self.mi_coef
         batch = self.rollout_buffer.episode_batch()
-        advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma)
+        advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
 
         features = self.policy.episode_features(batch)
         rebuilt = None

@@ -55,6 +55,25 @@ def test_an_episodes_own_cost_never_enters_its_own_baseline(rollouts):
     assert (new_baseline[:, 7] - baseline[:, 7]).abs().max() > 1  # but it does enter those of the other half
 
 
+def test_a_smaller_lambda_keeps_the_noise_of_later_costs_out(rollouts):
+    costs, states, alive = rollouts
+    noisy_end = costs.clone()
+    noisy_end[-1] += 100 * th.randn(N)
+    all_of_it, little = (value_advantages(noisy_end, states, alive, gae_lambda=x)[0].std() for x in (1.0, 0.0))
+    assert all_of_it > 90
+    assert little < 60
+
+
+def test_with_lambda_zero_the_advantage_is_the_residual_of_one_step():
+    # The state foretells the last cost exactly: the first step must not be blamed for it.
+    states = th.randn(2, N, 1)
+    states[1] = states[0]
+    costs = th.stack([th.zeros(N), 50 * states[1, :, 0]])
+    advantages = value_advantages(costs, states, th.ones(2, N), gae_lambda=0.0)
+    assert advantages.abs().median() < 1
+    assert costs[1].abs().median() > 10
+
+
 @pytest.mark.parametrize("name", sorted(BASELINES))
 def test_the_discount_weights_later_costs(name, rollouts):
     costs, states, alive = rollouts
