@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -202,10 +202,10 @@ class TDPGProgressBar(ProgressBarCallback):
 
     def _on_rollout_end(self) -> None:
         model = cast("TDPG", self.model)
-        shown: dict[str, Any] = {"cost": f"{model.rollout_buffer.episode_costs.mean():.2f}"}
+        shown = f"cost {model.rollout_buffer.episode_costs.mean():.2f}"
         if model.information is not None:
-            shown["nats"] = f"{model.information.sum():.2f}"
-        self.pbar.set_postfix(shown, refresh=False)
+            shown += f", {model.information.sum():.2f} nat"
+        self.pbar.set_description(shown, refresh=False)  # tqdm.rich shows no postfix
 
 
 def _zip_path(path: str | os.PathLike[str]) -> Path:

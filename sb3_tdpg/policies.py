@@ -94,7 +94,7 @@ class TRVPolicy(BasePolicy):
         net_arch: dict[str, Sequence[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ELU,
         time_varying: bool | None = None,
-        squash_trv_mean: bool = False,
+        squash_trv_mean: bool = True,
         encoder_log_var_init: float = 0.0,
         action_log_var_init: float = 0.0,
         encoder_var_floor: float = 1e-3,

@@ -75,8 +75,7 @@ def read_problem(env: VecEnv) -> Problem:
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(
             f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer "
-            "attribute "
-            "`horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
+            "attribute `horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
     state_space = _attribute(env, "state_space")
     if state_space is not None:
@@ -85,8 +84,7 @@ def read_problem(env: VecEnv) -> Problem:
     if observation_shape is None or len(observation_shape) > 1:
         raise ValueError(
             f"the mutual information is that of the true state, and an observation of shape {observation_shape} "
-            "cannot stand "
-            f"in for it: {BRING_THE_STATE}"
+            f"cannot stand in for it: {BRING_THE_STATE}"
         )
     return Problem(int(horizon), max(1, int(np.prod(observation_shape))), state_is_observation=True)
 

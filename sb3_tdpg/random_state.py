@@ -1,4 +1,4 @@
-"""The state of every random number generator that a training draws from."""
+"""What a checkpoint must know beside the model: random number generators and running statistics."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
 @dataclass(frozen=True)
 class RandomState:
     """
-    A snapshot of Python's, NumPy's, torch's and the environments' generators.
+    A snapshot of Python's, NumPy's, torch's and the environments' generators, and of what ``VecNormalize`` has learned.
 
     :param python: State of :mod:`random`.
     :param numpy: State of NumPy's global generator.
     :param torch: State of torch's CPU generator.
     :param cuda: States of the CUDA generators, one for each device; empty without CUDA.
     :param env: ``np_random`` of each environment.
+    :param obs_rms: Running statistics of ``VecNormalize``; None without it.
     """
 
     python: tuple[Any, ...]
@@ -28,16 +29,19 @@ class RandomState:
     torch: th.Tensor
     cuda: list[th.Tensor]
     env: list[np.random.Generator]
+    obs_rms: Any
 
     @classmethod
     def capture(cls, env: VecEnv) -> RandomState:
-        """Take the snapshot. The environments' generators are shared with them until it is pickled."""
+        """Take the snapshot. What belongs to the environments is shared with them until it is pickled."""
+        normalize = unwrap_vec_normalize(env)
         return cls(
             random.getstate(),
             np.random.get_state(legacy=False),  # noqa: NPY002  (environments of others may still use it)
             th.get_rng_state(),
             th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
             env.get_attr("np_random"),
+            None if normalize is None else normalize.obs_rms,
         )
 
     def restore(self, env: VecEnv) -> None:
@@ -58,3 +62,6 @@ class RandomState:
             th.cuda.set_rng_state_all(self.cuda)
         for i, generator in enumerate(self.env):
             env.set_attr("np_random", generator, indices=i)
+        normalize = unwrap_vec_normalize(env)
+        if normalize is not None and self.obs_rms is not None:
+            normalize.obs_rms = self.obs_rms

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.baselines import get_baseline
@@ -35,6 +35,10 @@ from sb3_tdpg.random_state import RandomState
 from sb3_tdpg.vec_env import make_episodes_env
 
 SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
+
+
+# One update an epoch and a noisy gradient: what the last epochs gain, they gain from a falling rate.
+DEFAULT_LEARNING_RATE = LinearSchedule(2e-3, 0.0, 1.0)
 
 
 class TrainingDivergedError(ValueError):
@@ -62,8 +66,8 @@ class TDPG(OnPolicyAlgorithm):
     :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
     :param beta: Weight of the cost against the information, a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty.
-    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress. The
-        critics have their own (``mi_kwargs``).
+    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress; default: from
+        2e-3 linearly to 0. The critics have their own (``mi_kwargs``).
     :param n_episodes: Episodes N of a policy epoch.
     :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this
         plugin, otherwise the largest divisor of N up to 50.
@@ -101,7 +105,7 @@ class TDPG(OnPolicyAlgorithm):
         env: GymEnv | str | None = None,
         *,
         beta: float | Schedule = 1 / 75,
-        learning_rate: float | Schedule = 1.6e-3,
+        learning_rate: float | Schedule = DEFAULT_LEARNING_RATE,
         n_episodes: int = 500,
         n_envs: int | None = None,
         mi_estimator: str | type[InformationEstimator] = "mine",
@@ -109,7 +113,7 @@ class TDPG(OnPolicyAlgorithm):
         baseline: str = "value",
         encoder_gradient: str = "score",
         gamma: float = 1.0,
-        gae_lambda: float = 1.0,
+        gae_lambda: float = 0.95,
         max_grad_norm: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -231,15 +235,13 @@ class TDPG(OnPolicyAlgorithm):
             )
         if self.n_episodes % env.num_envs != 0:
             raise ValueError(
-                f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), "
-                "so that "
-                f"each runs as many episodes: use {nearest_multiples(self.n_episodes, env.num_envs)}"
+                f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), so "
+                f"that each runs as many episodes: use {nearest_multiples(self.n_episodes, env.num_envs)}"
             )
         problem = read_problem(env)
         if self.horizon not in (0, problem.horizon) or self.state_dim not in (0, problem.state_dim):
             raise ValueError(
-                f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, but the "
-                "model was "
+                f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, it was "
                 f"made for horizon={self.horizon} and {self.state_dim}: use an environment of the same shape"
             )
         return problem
@@ -333,8 +335,7 @@ class TDPG(OnPolicyAlgorithm):
             if (t[column < self.n_episodes] >= self.horizon).any():
                 raise ValueError(
                     f"an episode did not end after horizon={self.horizon} steps: the environment must return "
-                    "terminated "
-                    "or truncated there (or declare its true horizon)"
+                    "terminated or truncated there (or declare its true horizon)"
                 )
             obs = cast(np.ndarray, new_obs)
 
@@ -404,10 +405,9 @@ class TDPG(OnPolicyAlgorithm):
         self._last_obs = None
         return TrainingDivergedError(
             f"the {name} of epoch {self.epoch} is NaN or infinite (after {self.num_timesteps} timesteps). The model "
-            "keeps the "
-            "parameters from before this update. Check the environment's costs and observations; a smaller "
-            "learning_rate, "
-            "max_grad_norm=1, or a larger encoder_var_floor in policy_kwargs help against exploding log-probabilities"
+            "keeps the parameters from before this update. Check the environment's costs and observations; a smaller "
+            "learning_rate, max_grad_norm=1, or a larger encoder_var_floor in policy_kwargs help against exploding "
+            "log-probabilities"
         )
 
     # -- learn, save, resume ----------------------------------------------------------------------------------

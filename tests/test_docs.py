@@ -5,7 +5,6 @@ import warnings
 from pathlib import Path
 
 import gymnasium as gym
-import matplotlib
 import pytest
 
 from sb3_tdpg import TDPG
@@ -56,12 +55,12 @@ def registry(monkeypatch):
 @pytest.mark.parametrize("page", [p for p in PAGES if any(python_blocks(p))], ids=name_of)
 def test_the_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch, brief_training, registry):
     monkeypatch.chdir(tmp_path)
-    matplotlib.use("Agg")
     namespace = {"__name__": "__main__"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what a page shows must not warn
         # Not of the page's making: tqdm.rich, which SB3's progress bar uses, calls itself experimental.
         warnings.filterwarnings("ignore", message="rich is experimental")
+        warnings.filterwarnings("ignore", module=r"torch\.")
         for line, code in python_blocks(page):
             # Blank lines in front, so that a traceback shows the line of the page.
             exec(compile("\n" * (line - 1) + code, str(page), "exec"), namespace)

@@ -1,0 +1,48 @@
+"""Sphinx configuration: MyST Markdown, the Read the Docs theme, and docstrings of the code itself."""
+
+from pathlib import Path
+
+from docutils import nodes
+from docutils.parsers.rst.directives.images import Figure
+from sphinx.application import Sphinx
+
+import sb3_tdpg
+
+project = "sb3_tdpg"
+author = "the sb3_tdpg developers"
+copyright = f"2026, {author}"
+release = version = sb3_tdpg.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx_copybutton"]
+exclude_patterns = ["_build", "results/lava/*"]  # what is in there is included by results/lava.md
+nitpicky = False
+
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+suppress_warnings = ["myst.header"]  # the changelog's headings are SB3's
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # the signature is long enough without; the text says what is expected
+autodoc_class_signature = "mixed"
+
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+
+html_theme = "sphinx_rtd_theme"
+html_theme_options = {"navigation_depth": 3}
+html_static_path = ["_static"]
+html_css_files = ["custom.css"]
+
+
+class FigureIfMade(Figure):
+    """A figure, or, before the script that draws it has been run, the command to run."""
+
+    def run(self) -> list[nodes.Node]:
+        page = Path(self.state.document.current_source or "").parent
+        if (page / self.arguments[0]).is_file():
+            return super().run()
+        return [nodes.paragraph("", f"(figure {self.arguments[0]}: not made yet)")]
+
+
+def setup(app: Sphinx) -> None:
+    app.add_directive("figure-if-made", FigureIfMade)
