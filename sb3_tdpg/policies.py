@@ -6,6 +6,7 @@ Dimension key: T horizon, N episodes or environments, Z TRVs, U action, F featur
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -25,8 +26,9 @@ from sb3_tdpg.networks import TimeMLP
 
 # Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
 MAX_TIME_VARYING_HORIZON = 50
-# A standard deviation of e^4, about 55.
-MAX_LOG_VAR = 8.0
+# Standard deviations of at most 7.4 for a TRV and 55 for an action.
+MAX_TRV_VAR = math.exp(4)
+MAX_ACTION_VAR = math.exp(8)
 
 
 class PolicyStep(NamedTuple):
@@ -71,7 +73,7 @@ class TRVPolicy(BasePolicy):
         then no observation, however unlike those in training, drives the TRVs to where the action head has never been.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it.
     :param action_log_var_init: The same for the action head (Box actions).
-    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``.
+    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded.
     :param action_var_floor: Smallest variance of an action, likewise.
     :param features_extractor_class: What stands in front of the encoder; default: nothing (flatten) for vectors, the
         paper's two convolutional layers for images.
@@ -197,13 +199,13 @@ class TRVPolicy(BasePolicy):
         mean, log_var = parameters.chunk(2, dim=-1)
         if self.squash_trv_mean:
             mean = th.tanh(mean)
-        return mean, _variance(log_var + self.encoder_log_var_init, self.encoder_var_floor).sqrt()
+        return mean, _variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor).sqrt()
 
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
         """Distribution of the action from the head's outputs, ``(n, ...)``: one dimension of samples only."""
         if isinstance(self.action_dist, DiagGaussianDistribution):
             mean, log_var = parameters.chunk(2, dim=-1)
-            variance = _variance(log_var + self.action_log_var_init, self.action_var_floor)
+            variance = _variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
             return self.action_dist.proba_distribution(mean, 0.5 * th.log(variance))
         return self.action_dist.proba_distribution(parameters)
 
@@ -345,10 +347,10 @@ class TRVPolicy(BasePolicy):
         return (actions if is_vectorized else actions[0]), (step.trvs.cpu().numpy(), t + 1)
 
 
-def _variance(log_var: th.Tensor, floor: float) -> th.Tensor:
-    # Bounded: observations unlike any in training drive an unbounded log-variance, and through it the recurrence,
-    # to inf.
-    return th.exp(log_var.clamp(max=MAX_LOG_VAR)) + floor
+def _variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
+    # exp(log_var), bounded: observations unlike any in training would drive it to inf, and a TRV that is all noise
+    # drowns the action head. Bounded softly: a clamp has no gradient to come back on.
+    return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
 
 def _check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:

@@ -54,6 +54,11 @@ class Episode:
     costs: list[float] = field(default_factory=list)
 
 
+def bounded_exp(x: th.Tensor, log_maximum: float) -> th.Tensor:
+    """``exp(x)`` that levels off at ``exp(log_maximum)``."""
+    return 1 / (th.exp(-x) + math.exp(-log_maximum))
+
+
 @dataclass
 class LoopTDPG:
     """Modules and optimisers of the loop."""
@@ -152,12 +157,12 @@ class LoopTDPG:
     def encode(self, t: int, prev_trv: th.Tensor, observation: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and variance of q(x~_t | x~_{t-1}, y_t)."""
         mean, log_variance = self.encoders[t](th.cat([prev_trv, observation])).chunk(2)
-        return mean, th.exp(log_variance) + self.encoder_var_floor
+        return th.tanh(mean), bounded_exp(log_variance, 4) + self.encoder_var_floor
 
     def act(self, t: int, trv: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and variance of pi(u_t | x~_t)."""
         mean, log_variance = self.action_heads[t](trv).chunk(2)
-        return mean, th.exp(log_variance) + self.action_var_floor
+        return mean, bounded_exp(log_variance, 8) + self.action_var_floor
 
     # -- mutual information ---------------------------------------------------------------------------------------
 

@@ -110,10 +110,10 @@ def mlp(network, x, t):
     return x @ weight + bias
 
 
-def gaussian(outputs, floor):
-    """Mean and variance."""
+def gaussian(outputs, floor, log_maximum):
+    """Mean, and variance: the exponential, which levels off at a maximum, and the floor."""
     mean, log_var = outputs.chunk(2, dim=-1)
-    return mean, log_var.exp() + floor
+    return mean, 1 / ((-log_var).exp() + math.exp(-log_maximum)) + floor
 
 
 def log_density(x, mean, var):
@@ -121,11 +121,12 @@ def log_density(x, mean, var):
 
 
 def encode(policy, batch, t, prev):
-    return gaussian(mlp(policy.encoder, th.cat([prev, batch.observations[t]], -1), t), 1e-3)
+    mean, var = gaussian(mlp(policy.encoder, th.cat([prev, batch.observations[t]], -1), t), 1e-3, 4)
+    return mean.tanh(), var
 
 
 def log_pi(policy, batch, t, trv):
-    return log_density(batch.actions[t], *gaussian(mlp(policy.action_head, trv, t), 1e-5))
+    return log_density(batch.actions[t], *gaussian(mlp(policy.action_head, trv, t), 1e-5, 8))
 
 
 def advantages(batch):
@@ -308,9 +309,9 @@ def simulated_costs(policy, noises):
     cost = 0.0
     for t, (sensor, trv_noise, action_noise) in enumerate(steps):
         y = x + LinearProblem.sensor_noise_std * sensor
-        mean, var = gaussian(mlp(policy.encoder, th.cat([trv, y], -1), t), 1e-3)
-        trv = mean + var.sqrt() * trv_noise
-        mean, var = gaussian(mlp(policy.action_head, trv, t), 1e-5)
+        mean, var = gaussian(mlp(policy.encoder, th.cat([trv, y], -1), t), 1e-3, 4)
+        trv = mean.tanh() + var.sqrt() * trv_noise
+        mean, var = gaussian(mlp(policy.action_head, trv, t), 1e-5, 8)
         u = mean + var.sqrt() * action_noise
         cost = cost + (x[:, 0] - 1) ** 2 + 0.3 * u[:, 0] ** 2
         x = x + u
@@ -327,6 +328,7 @@ def test_the_expected_gradient_is_that_of_the_true_expected_cost(encoder_gradien
         n_episodes=n,
         beta=math.inf,
         baseline=baseline,
+        gae_lambda=1.0,
         encoder_gradient=encoder_gradient,
         learning_rate=1e-12,
         policy_kwargs=dict(net_arch=dict(encoder=[4], action_head=[]), optimizer_class=th.optim.SGD),

@@ -285,7 +285,8 @@ def test_the_log_probability_of_an_action_is_that_of_its_distribution(name):
         expected = th.distributions.Bernoulli(logits=outputs).log_prob(actions).sum(-1)
     else:
         mean, log_var = outputs.chunk(2, dim=-1)
-        expected = th.distributions.Normal(mean, (log_var.exp() + 1e-5).sqrt()).log_prob(actions).sum(-1)
+        variance = 1 / ((-log_var).exp() + np.exp(-8)) + 1e-5  # exp(log_var), which levels off
+        expected = th.distributions.Normal(mean, variance.sqrt()).log_prob(actions).sum(-1)
     th.testing.assert_close(log_probs, expected, rtol=1e-4, atol=1e-4)
 
 

@@ -68,6 +68,7 @@ def make_model(case: Case) -> TDPG:
         "Lava-v0",
         beta=case.beta,
         baseline=case.baseline,
+        gae_lambda=1.0,
         n_episodes=N_EPISODES,
         seed=SEED,
         device="cpu",

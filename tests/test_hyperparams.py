@@ -1,0 +1,95 @@
+"""The YAML blocks: every key is an argument, every number a number, and every block trains."""
+
+import inspect
+from importlib import resources
+
+import pytest
+import yaml
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_tdpg import TDPG, SelectionCallback, hyperparams
+from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.information import get_estimator_class
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.training import make_training
+
+BLOCKS = sorted(yaml.safe_load(resources.files(hyperparams).joinpath("tdpg.yml").read_text()))
+ZOO_KEYS = {"n_timesteps", "env_kwargs", "callback"}
+
+
+def env_id_of(block):
+    return block[: block.index("-v") + 3]
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_every_key_of_a_block_is_an_argument(block):
+    settings = load_hyperparams(block)
+    assert set(settings) <= ZOO_KEYS | set(inspect.signature(TDPG).parameters)
+    assert set(settings["policy_kwargs"]) <= set(inspect.signature(TRVPolicy).parameters)
+    estimator = get_estimator_class(settings["mi_estimator"])
+    accepted = {name for cls in estimator.__mro__[:-1] for name in inspect.signature(cls.__init__).parameters}
+    assert set(settings.get("mi_kwargs", {})) <= accepted
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_no_number_of_a_block_is_read_as_text(block):
+    """PyYAML takes 1e-3 for a string."""
+
+    def texts(value):
+        if isinstance(value, dict):
+            return [text for item in value.values() for text in texts(item)]
+        if isinstance(value, list):
+            return [text for item in value for text in texts(item)]
+        return [value] if isinstance(value, str) else []
+
+    for text in texts(load_hyperparams(block)):
+        with pytest.raises(ValueError):
+            float(text)
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_every_block_trains_for_an_epoch(block):
+    settings = load_hyperparams(block)
+    cheap = {"mi_kwargs": {**settings.get("mi_kwargs", {}), "gradient_steps": 2, "warmup_gradient_steps": 2}}
+    if settings["mi_estimator"] != "mine":
+        cheap = {}
+    training = make_training(env_id_of(block), settings, n_timesteps=100, n_episodes=20, seed=0, **cheap)
+    training.model.learn(training.n_timesteps, training.callbacks)
+    assert training.model.epoch == 1
+
+
+def test_a_baseline_block_differs_from_its_tdpg_block_by_no_penalty_and_no_selection():
+    pg, tdpg = (
+        make_training("Lava-v0", load_hyperparams("Lava-v0-pg")),
+        make_training("Lava-v0", load_hyperparams("Lava-v0")),
+    )
+    assert pg.model.mi_coef == 0 < tdpg.model.mi_coef
+    assert pg.selection is None
+    assert isinstance(tdpg.selection, SelectionCallback)
+    assert tdpg.selection.mi_limit == 0.05
+
+
+def test_the_tables_reading_reaches_the_environment():
+    env = make_training("Lava-v0", load_hyperparams("Lava-v0-table")).model.env
+    assert env.get_attr("lava_terminal_cost")[0] == 300.0
+
+
+def test_a_learning_rate_may_fall_linearly_as_in_the_zoo():
+    model = make_training("Lava-v0", load_hyperparams("Lava-v0"), learning_rate="lin_1.0e-3").model
+    assert isinstance(model.learning_rate, LinearSchedule)
+    assert [model.lr_schedule(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
+
+
+def test_another_schedule_is_refused_with_the_mend():
+    with pytest.raises(ValueError, match=r"'cos_1e-3' must be a number or 'lin_' and a number"):
+        make_training("Lava-v0", load_hyperparams("Lava-v0"), learning_rate="cos_1e-3")
+
+
+def test_an_unknown_block_is_refused_with_the_list():
+    with pytest.raises(KeyError, match=r"no block 'Lava-v9'; it has .*Lava-v0-pg"):
+        load_hyperparams("Lava-v9")
+
+
+def test_a_block_that_was_changed_by_its_reader_is_whole_for_the_next():
+    load_hyperparams("Lava-v0")["policy_kwargs"].clear()
+    assert load_hyperparams("Lava-v0")["policy_kwargs"]

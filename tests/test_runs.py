@@ -1,0 +1,156 @@
+"""From the command line to results in a folder, with tiny settings: train, evaluate, interrupt, go on."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.callbacks import TDPGProgressBar
+from sb3_tdpg.cli import main
+from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.reproduction import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
+from sb3_tdpg.runs import Run, complete_run, read_progress
+
+TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
+CHEAP = dict(n_timesteps=800, n_episodes=20, mi_kwargs=dict(gradient_steps=2, warmup_gradient_steps=2))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Small epochs, so that a run of a few hundred steps has several."""
+    block = Run.settings.fget
+    monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 20}))
+
+
+def tiny_run(seed=0, **overrides):
+    return lava_run("TDPG", "table", seed, **{**CHEAP, **overrides})
+
+
+def policy_of(folder):
+    return TDPG.load(folder / "model.zip", device="cpu").policy.state_dict()
+
+
+def test_demo_writes_everything_that_it_promises(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    assert main(["demo", "--out", str(tmp_path), *TINY]) == 0
+
+    printed = capsys.readouterr().out
+    assert "PG (paper)" in printed
+    assert "31.04 (7.19)" in printed
+    assert (tmp_path / "table.md").read_text().strip() in printed
+    records = pd.read_csv(tmp_path / "episodes.csv")
+    assert len(records) == 2 * len(LAVA) * 8
+    assert set(records["model"]) == {"PG", "TDPG"}
+    assert np.isfinite(records["cost"]).all()
+    for picture in ("histograms.png", "trajectories.png", "training.png"):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert [run["seed"] for run in config["runs"]] == [0, 0]
+    assert config["provenance"]["versions"]["torch"]
+    model = TDPG.load(tmp_path / "tdpg.zip")
+    assert model.predict(np.zeros(2, np.float32), deterministic=True)[0].shape == (1,)
+    assert TDPG.load(tmp_path / "pg.zip").mi_coef == 0
+
+
+def test_demo_called_again_trains_nothing_and_prints_the_same(tmp_path, capsys, monkeypatch):
+    main(["demo", "--out", str(tmp_path), *TINY])
+    first = capsys.readouterr().out.split("\n\n")[1]
+    monkeypatch.setattr(TDPG, "learn", lambda *args, **kwargs: pytest.fail("it trains again"))
+    assert main(["demo", "--out", str(tmp_path), *TINY]) == 0
+    assert capsys.readouterr().out.split("\n\n")[1] == first
+
+
+def test_a_folder_with_another_run_is_refused_and_left_alone(tmp_path, capsys):
+    complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=r"holds a run with another seed: choose another folder or remove it"):
+        complete_run(tiny_run(seed=1), tmp_path, LAVA[:1], n_eval_episodes=4)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_command_line_tells_bad_input_in_one_line_with_exit_code_2(tmp_path, capsys):
+    main(["demo", "--out", str(tmp_path), *TINY])
+    assert main(["demo", "--out", str(tmp_path), "--n-timesteps", "900", "--n-eval-episodes", "8"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: ")
+    assert "settings" in error
+    with pytest.raises(SystemExit) as refused:
+        main(["demo", "--n-timesteps", "0"])
+    assert refused.value.code == 2
+
+
+def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_tdpg.runs.CHECKPOINT_EPOCHS", 2)
+    complete_run(tiny_run(), tmp_path / "whole", LAVA, n_eval_episodes=4)
+
+    def interrupt(callback):
+        if callback.model.epoch == 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TDPGProgressBar, "_on_rollout_end", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        complete_run(tiny_run(), tmp_path / "halved", LAVA, n_eval_episodes=4, progress_bar=True)
+    assert (tmp_path / "halved" / "checkpoint.zip").exists()
+    assert not (tmp_path / "halved" / "episodes.csv").exists()
+    complete_run(tiny_run(), tmp_path / "halved", LAVA, n_eval_episodes=4)
+
+    whole, halved = policy_of(tmp_path / "whole"), policy_of(tmp_path / "halved")
+    assert all(bool((whole[name] == halved[name]).all()) for name in whole)
+    for name in ("episodes.csv",):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "halved" / name).read_bytes()
+    logs = [
+        read_progress(tmp_path / name).drop(columns=["time/fps", "time/time_elapsed"]) for name in ("whole", "halved")
+    ]
+    assert logs[0]["time/total_timesteps"].tolist() == logs[1]["time/total_timesteps"].tolist()
+    pd.testing.assert_series_equal(logs[0]["rollout/ep_cost_mean"], logs[1]["rollout/ep_cost_mean"])
+
+
+def test_a_run_keeps_the_selected_policy_and_says_whether_an_epoch_met_the_limits(tmp_path):
+    complete_run(tiny_run(), tmp_path / "none", LAVA[:1], n_eval_episodes=4)
+    assert not pd.read_csv(tmp_path / "none" / "episodes.csv")["selected"].any()
+    loose = [{"sb3_tdpg.callbacks.SelectionCallback": {"cost_limit": 1e6}}]
+    complete_run(tiny_run(callback=loose), tmp_path / "some", LAVA[:1], n_eval_episodes=4)
+    assert pd.read_csv(tmp_path / "some" / "episodes.csv")["selected"].all()
+    assert {"epoch", "cost", "information"} == set(json.loads((tmp_path / "some" / "selected.json").read_text()))
+
+
+def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    # In this process: the workers would not see the small epochs of this module.
+    monkeypatch.setattr(
+        "sb3_tdpg.reproduction._complete_all",
+        lambda tasks, n, jobs: [complete_run(*task, LAVA, n_eval_episodes=n) for task in tasks],
+    )
+    summary = reproduce_lava(tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200)
+
+    assert (tmp_path / "summary.md").read_text() == summary
+    for title in ("The table's reading", "The text's reading", "The paper's own settings"):
+        assert f"## {title}" in summary
+    assert "MISSED" in summary, "two epochs reach no goal, and the summary must say so"
+    for reading in READINGS:
+        records = pd.read_csv(tmp_path / f"episodes_{reading}.csv.gz")
+        assert len(records) == len(METHODS) * 2 * len(LAVA) * 4
+        assert (tmp_path / f"trajectories_{reading}.png").exists()
+    seeds = pd.read_csv(tmp_path / "seeds.csv")
+    assert len(seeds) == 2 * len(METHODS) * 2 + len(paper_runs(1))
+    recomputed = (
+        pd.read_csv(tmp_path / "episodes_text.csv.gz")
+        .query("model == 'PG' and train_seed == 1 and scenario == 'Training'")["cost"]
+        .mean()
+    )
+    found = seeds.query("group == 'text' and model == 'PG' and train_seed == 1")["mean"].item()
+    assert found == pytest.approx(recomputed, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_the_reproduction_runs_in_worker_processes(tmp_path):
+    arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]
+    assert main([*arguments, "--n-timesteps", "2500", "--n-eval-episodes", "4"]) == 0
+    assert len(list(tmp_path.glob("runs/*/*/episodes.csv"))) == 2 * len(METHODS) + len(paper_runs(1))
+
+
+def test_every_method_of_the_reproduction_has_goals_on_both_readings():
+    assert set(GOALS) == set(READINGS)
+    assert all(set(goals) == set(METHODS) for goals in GOALS.values())
