@@ -61,7 +61,7 @@ bench: $(STAMP) ## measure the speed of the environments, the critics and an epo
 reproduce: reproduce-lava ## reproduce every experiment
 
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
-	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction
+	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

@@ -51,6 +51,7 @@ def _make_parser() -> argparse.ArgumentParser:
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
     reproduce.add_argument("experiment", choices=("lava",))
     reproduce.add_argument("--out", type=Path, default=Path("results/lava_reproduction"), help="folder for the results")
+    reproduce.add_argument("--publish", type=Path, default=None, help="copy all but the runs to this folder")
     reproduce.add_argument("--n-seeds", type=_positive, default=10, help="training seeds of each method")
     reproduce.add_argument(
         "--n-paper-seeds", type=_positive, default=3, help="training seeds of the paper's own settings"

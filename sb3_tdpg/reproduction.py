@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing as mp
 import os
+import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -131,6 +132,7 @@ def reproduce_lava(
     n_eval_episodes: int = 1000,
     n_timesteps: int | None = None,
     jobs: int | None = None,
+    publish: Path | None = None,
 ) -> str:
     """
     Train every method on both readings with many seeds, and the paper's own settings; write tables, figures and
@@ -144,6 +146,7 @@ def reproduce_lava(
     :param n_eval_episodes: Episodes of each row of Table I.
     :param n_timesteps: Environment steps of each training; default: as in the blocks.
     :param jobs: Runs at a time; default: the number of cores.
+    :param publish: Folder that gets a copy of everything but ``runs/``.
     :return: the summary, as Markdown
     """
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
@@ -183,6 +186,11 @@ def reproduce_lava(
     )
     summary = "\n\n".join(["# The lava problem (Table I)", *sections, _how_made(how)]) + "\n"
     write_atomically(out / "summary.md", summary)
+    if publish is not None:
+        publish.mkdir(parents=True, exist_ok=True)
+        for path in out.iterdir():
+            if path.is_file():
+                shutil.copy2(path, publish / path.name)
     return summary
 
 

@@ -123,9 +123,13 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
         "sb3_tdpg.reproduction._complete_all",
         lambda tasks, n, jobs: [complete_run(*task, LAVA, n_eval_episodes=n) for task in tasks],
     )
-    summary = reproduce_lava(tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200)
+    tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
+    summary = reproduce_lava(
+        tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200, publish=published
+    )
 
     assert (tmp_path / "summary.md").read_text() == summary
+    assert {path.name for path in published.iterdir()} == {path.name for path in tmp_path.iterdir()} - {"runs"}
     for title in ("The table's reading", "The text's reading", "The paper's own settings"):
         assert f"## {title}" in summary
     assert "MISSED" in summary, "two epochs reach no goal, and the summary must say so"
