@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing as mp
-import os
 import shutil
-import signal
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch as th
-from tqdm import tqdm
 
 from sb3_tdpg.callbacks import write_atomically
 from sb3_tdpg.envs.scenarios import LAVA, LAVA_TABLE_READING
@@ -31,7 +25,7 @@ from sb3_tdpg.evaluation import (
     write_frame_atomically,
     write_run_config,
 )
-from sb3_tdpg.runs import Run, complete_run, read_progress
+from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 
 READINGS = ("table", "text")
@@ -85,8 +79,8 @@ def demo(
     """
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
-    folders = {run.method: out / "runs" / _folder_name(run) for run in runs}
-    with _threads(1):  # the networks are small: more threads are slower
+    folders = {run.method: out / "runs" / run.folder_name for run in runs}
+    with torch_threads(1):  # the networks are small: more threads are slower
         for run in runs:
             print(f"{run.method}: training and evaluating, {folders[run.method]}")
             complete_run(run, folders[run.method], LAVA, n_eval_episodes=n_eval_episodes, progress_bar=True)
@@ -156,10 +150,10 @@ def reproduce_lava(
         for reading in READINGS
     }
     groups["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
-    folders = {group: [out / "runs" / group / _folder_name(run) for run in runs] for group, runs in groups.items()}
+    folders = {group: [out / "runs" / group / run.folder_name for run in runs] for group, runs in groups.items()}
     tasks = [(run, folder) for group in groups for run, folder in zip(groups[group], folders[group], strict=True)]
     tasks.sort(key=lambda task: task[0].method != "TDPG")
-    _complete_all(tasks, n_eval_episodes, jobs or os.cpu_count() or 1)
+    complete_runs(tasks, LAVA, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
     sections, seed_tables = [], []
     for group in groups:
@@ -258,62 +252,6 @@ def _how_made(how: Mapping[str, Any]) -> str:
         "outside a checkout" if git is None else git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
     )
     return f"Made by `make reproduce-lava` at commit {commit}, {how['utc_time']}, {versions}. {how['platform']}."
-
-
-# -- running many ---------------------------------------------------------------------------------------------
-
-
-def _complete_all(tasks: Sequence[tuple[Run, Path]], n_eval_episodes: int, jobs: int) -> None:
-    """Complete runs in parallel processes with a progress bar; Ctrl-C keeps what is finished."""
-    context = mp.get_context("spawn")
-    with (
-        tqdm(total=len(tasks), unit="run", smoothing=0.1) as progress,
-        ProcessPoolExecutor(jobs, context, initializer=_init_worker) as pool,
-    ):
-        futures = {pool.submit(complete_run, *task, LAVA, n_eval_episodes=n_eval_episodes): task for task in tasks}
-        try:
-            for future in _as_finished(futures):
-                future.result()
-                progress.set_postfix_str(str(futures[future][1].name), refresh=False)
-                progress.update()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in list(getattr(pool, "_processes", {}).values()):
-                process.terminate()
-            progress.write("stopped; finished runs and checkpoints are kept, and the same command goes on from them")
-            raise
-
-
-def _as_finished(futures: Mapping[Future[Path], Any]) -> Iterator[Future[Path]]:
-    pending = set(futures)
-    while pending:
-        # With a timeout, so that Ctrl-C is seen at once.
-        finished, pending = wait(pending, timeout=1.0, return_when=FIRST_COMPLETED)
-        yield from finished
-
-
-def _init_worker() -> None:
-    th.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-
-
-class _threads:
-    """Run a block of code with this many torch threads."""
-
-    def __init__(self, n: int) -> None:
-        self.n = n
-
-    def __enter__(self) -> None:
-        self.before = th.get_num_threads()
-        th.set_num_threads(self.n)
-
-    def __exit__(self, *_: object) -> None:
-        th.set_num_threads(self.before)
-
-
-def _folder_name(run: Run) -> str:
-    label = "".join(c if c.isalnum() else "-" for c in run.method.lower())
-    return f"{'-'.join(filter(None, label.split('-')))}-seed{run.seed}"
 
 
 def _method_order(column: pd.Series) -> pd.Series:

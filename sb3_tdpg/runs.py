@@ -1,15 +1,22 @@
-"""One training run from its settings to its per-episode records, in a folder that can be resumed."""
+"""Training runs, from settings to per-episode records in folders that can be resumed; one at a time or many."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import multiprocessing as mp
+import os
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch as th
 from stable_baselines3.common.logger import Logger, make_output_format
+from tqdm import tqdm
 
 from sb3_tdpg.callbacks import TrainingCheckpointCallback
 from sb3_tdpg.envs.scenarios import Scenario
@@ -44,6 +51,12 @@ class Run:
     def settings(self) -> dict[str, Any]:
         """The block with the overrides."""
         return {**load_hyperparams(self.block), **self.overrides}
+
+    @property
+    def folder_name(self) -> str:
+        """A name that tells the method and the seed."""
+        label = "".join(c if c.isalnum() else "-" for c in self.method.lower())
+        return f"{'-'.join(filter(None, label.split('-')))}-seed{self.seed}"
 
     @property
     def config(self) -> dict[str, Any]:
@@ -140,3 +153,64 @@ def read_progress(folder: Path) -> pd.DataFrame:
     return log.drop_duplicates("time/total_timesteps", keep="last").sort_values(
         "time/total_timesteps", ignore_index=True
     )
+
+
+def complete_runs(
+    tasks: Sequence[tuple[Run, Path]],
+    scenarios: Sequence[Scenario],
+    *,
+    n_eval_episodes: int = 1000,
+    jobs: int | None = None,
+) -> None:
+    """
+    Complete runs in parallel processes, with a progress bar; Ctrl-C keeps what is finished.
+
+    :param tasks: Runs and their folders, see :func:`complete_run`.
+    :param scenarios: What to evaluate.
+    :param n_eval_episodes: Episodes of each scenario.
+    :param jobs: Runs at a time; default: the number of cores.
+    """
+    jobs = jobs or os.cpu_count() or 1
+    with (
+        tqdm(total=len(tasks), unit="run", smoothing=0.1) as progress,
+        ProcessPoolExecutor(jobs, mp.get_context("spawn"), initializer=_init_worker) as pool,
+    ):
+        futures = {
+            pool.submit(complete_run, run, folder, scenarios, n_eval_episodes=n_eval_episodes): folder
+            for run, folder in tasks
+        }
+        try:
+            for future in _as_finished(futures):
+                future.result()
+                progress.set_postfix_str(futures[future].name, refresh=False)
+                progress.update()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in list(getattr(pool, "_processes", {}).values()):
+                process.terminate()
+            progress.write("stopped; finished runs and checkpoints are kept, and the same command goes on from them")
+            raise
+
+
+def _as_finished(futures: Mapping[Future[Path], Path]) -> Iterator[Future[Path]]:
+    pending = set(futures)
+    while pending:
+        # With a timeout, so that Ctrl-C is seen at once.
+        finished, pending = wait(pending, timeout=1.0, return_when=FIRST_COMPLETED)
+        yield from finished
+
+
+def _init_worker() -> None:
+    th.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+
+
+@contextmanager
+def torch_threads(n: int) -> Iterator[None]:
+    """Run a block of code with this many torch threads."""
+    before = th.get_num_threads()
+    th.set_num_threads(n)
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)

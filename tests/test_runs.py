@@ -120,8 +120,10 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
     pytest.importorskip("matplotlib")
     # In this process: the workers would not see the small epochs of this module.
     monkeypatch.setattr(
-        "sb3_tdpg.reproduction._complete_all",
-        lambda tasks, n, jobs: [complete_run(*task, LAVA, n_eval_episodes=n) for task in tasks],
+        "sb3_tdpg.reproduction.complete_runs",
+        lambda tasks, scenarios, *, n_eval_episodes, jobs: [
+            complete_run(*task, scenarios, n_eval_episodes=n_eval_episodes) for task in tasks
+        ],
     )
     tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
     summary = reproduce_lava(
