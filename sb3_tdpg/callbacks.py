@@ -12,6 +12,8 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_tdpg.files import write_atomically
+
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
 
@@ -216,10 +218,3 @@ def _zip_path(path: str | os.PathLike[str]) -> Path:
 
 def _record_path(path: Path) -> Path:
     return path.with_suffix(".json")
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that at no time a half-written one is there."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    os.replace(partial, path)

@@ -10,7 +10,6 @@ from typing import Any
 
 import pandas as pd
 
-from sb3_tdpg.callbacks import write_atomically
 from sb3_tdpg.envs.scenarios import LAVA, LAVA_TABLE_READING
 from sb3_tdpg.evaluation import (
     add_ratio,
@@ -25,6 +24,7 @@ from sb3_tdpg.evaluation import (
     write_frame_atomically,
     write_run_config,
 )
+from sb3_tdpg.files import write_atomically
 from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 

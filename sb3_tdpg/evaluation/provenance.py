@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.callbacks import write_atomically
+from sb3_tdpg.files import write_atomically
 
 PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "pandas", "pybullet")
 
