@@ -40,6 +40,9 @@ GOALS: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = {
     "text": {"PG": (12.0, None, None), "TDPG": (20.0, 10.0, 1.10), "TDPG (log-det)": (20.0, 10.0, 1.10)},
 }
 
+# Seeds 0 to 9 were seen while the blocks were tuned.
+FIRST_SEED = 100
+
 PAPER_INVERSE_BETAS = (25, 50, 75, 100)
 
 
@@ -109,7 +112,7 @@ def paper_runs(n_seeds: int) -> list[Run]:
     See the block ``Lava-v0-paper`` for what is set as printed.
     """
     runs = []
-    for seed in range(n_seeds):
+    for seed in range(FIRST_SEED, FIRST_SEED + n_seeds):
         base = Run("paper's PG", "Lava-v0", "Lava-v0-paper-pg", seed)
         runs.append(base)
         for inverse_beta in PAPER_INVERSE_BETAS:
@@ -144,9 +147,10 @@ def reproduce_lava(
     :return: the summary, as Markdown
     """
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     # Longest first, so that the cores finish together.
     groups: dict[str, list[Run]] = {
-        reading: [lava_run(m, reading, seed, **overrides) for m in reversed(METHODS) for seed in range(n_seeds)]
+        reading: [lava_run(m, reading, seed, **overrides) for m in reversed(METHODS) for seed in seeds]
         for reading in READINGS
     }
     groups["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
@@ -161,15 +165,15 @@ def reproduce_lava(
         records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
         columns = ["model", "train_seed", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
         write_frame_atomically(records[columns].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
-        seeds = _seed_table(records)
-        seed_tables.append(seeds.assign(group=group))
-        sections.append(_section(group, records, seeds))
+        by_seed = _seed_table(records)
+        seed_tables.append(by_seed.assign(group=group))
+        sections.append(_section(group, records, by_seed))
         if group in READINGS:
             first = {
                 run.method: folder for run, folder in zip(groups[group], folders[group], strict=True) if run.seed == 0
             }
             shown = {method: TDPG.load(first[method] / "model.zip", device="cpu") for method in METHODS}
-            one_seed = records[(records["train_seed"] == 0) & records["model"].isin(["PG", "TDPG"])]
+            one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]
             save_figure(cost_histograms(one_seed, LAVA), out / f"histograms_{group}.png")
             save_figure(lava_trajectories(shown, env_kwargs_of(group)), out / f"trajectories_{group}.png")
             save_figure(training_curves({m: read_progress(first[m]) for m in METHODS}), out / f"training_{group}.png")
