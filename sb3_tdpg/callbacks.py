@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -201,6 +201,19 @@ class TrainingCheckpointCallback(_TDPGCallback):
 
 class TDPGProgressBar(ProgressBarCallback):
     """SB3's progress bar, with the epoch's cost and information beside it."""
+
+    _open: ClassVar[TDPGProgressBar | None] = None
+
+    def _on_training_start(self) -> None:
+        # A training that was interrupted has left its bar open, and rich shows only one at a time.
+        if TDPGProgressBar._open is not None:
+            TDPGProgressBar._open.pbar.close()
+        super()._on_training_start()
+        TDPGProgressBar._open = self
+
+    def _on_training_end(self) -> None:
+        super()._on_training_end()
+        TDPGProgressBar._open = None
 
     def _on_rollout_end(self) -> None:
         model = cast("TDPG", self.model)

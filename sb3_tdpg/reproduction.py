@@ -170,7 +170,9 @@ def reproduce_lava(
         sections.append(_section(group, records, by_seed))
         if group in READINGS:
             first = {
-                run.method: folder for run, folder in zip(groups[group], folders[group], strict=True) if run.seed == 0
+                run.method: folder
+                for run, folder in zip(groups[group], folders[group], strict=True)
+                if run.seed == FIRST_SEED
             }
             shown = {method: TDPG.load(first[method] / "model.zip", device="cpu") for method in METHODS}
             one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]

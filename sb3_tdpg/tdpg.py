@@ -38,7 +38,7 @@ SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
 
 
 # One update an epoch and a noisy gradient: what the last epochs gain, they gain from a falling rate.
-DEFAULT_LEARNING_RATE = LinearSchedule(2e-3, 0.0, 1.0)
+DEFAULT_LEARNING_RATE = LinearSchedule(2e-3, 2e-5, 1.0)
 
 
 class TrainingDivergedError(ValueError):
@@ -67,7 +67,7 @@ class TDPG(OnPolicyAlgorithm):
     :param beta: Weight of the cost against the information, a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty.
     :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress; default: from
-        2e-3 linearly to 0. The critics have their own (``mi_kwargs``).
+        2e-3 linearly to 2e-5. The critics have their own (``mi_kwargs``).
     :param n_episodes: Episodes N of a policy epoch.
     :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this
         plugin, otherwise the largest divisor of N up to 50.

@@ -254,3 +254,14 @@ def test_an_infinite_gradient_stops_the_training_before_the_step():
     with pytest.raises(TrainingDivergedError, match=r"gradient of epoch 1.*max_grad_norm"):
         train_epochs(model, 1, reset_num_timesteps=False)
     assert_same_parameters(parameters(model.policy), good)
+
+
+def test_after_an_interrupted_training_with_a_progress_bar_the_next_one_shows_its_own():
+    def interrupt(model):
+        raise KeyboardInterrupt
+
+    model = tiny_tdpg()
+    with pytest.raises(KeyboardInterrupt):
+        train_epochs(model, 2, callback=AtEveryEpoch(interrupt), progress_bar=True)
+    train_epochs(model, 2, progress_bar=True)
+    assert model.epoch == 2
