@@ -326,3 +326,28 @@ def test_an_environment_without_a_true_state_is_taken_as_fully_observed():
     model = tiny_tdpg(toy_vec_env(gives_state=False), beta=0.1)
     train_epochs(model, 1)
     np.testing.assert_array_equal(model.rollout_buffer.states, model.rollout_buffer.observations)
+
+
+def test_no_observation_drives_the_trv_means_out_of_the_unit_box_unless_asked_to():
+    far_off = th.full((5, 3), 1e6)
+    for squash, bounded in ((True, True), (False, False)):
+        policy = make_policy(squash_trv_mean=squash)
+        means = policy.step(far_off, th.zeros(5, 2), np.zeros(5, int)).means
+        assert bool((means.abs() <= 1).all()) == bounded
+
+
+def test_the_variance_of_a_trv_levels_off_and_keeps_a_gradient_to_come_back_on():
+    policy = make_policy(encoder_log_var_init=12.0)
+    stds = policy.step(th.zeros(5, 3), th.zeros(5, 2), np.zeros(5, int)).stds
+    assert stds.max() <= np.exp(2) + 1e-2
+    stds.sum().backward()
+    assert policy.encoder.mlp.layers[-1].bias.grad.abs().max() > 0
+
+
+def test_observations_without_bounds_give_finite_actions():
+    policy = make_policy()
+    observation = np.full((4, 3), 1e30, np.float32)
+    state = None
+    for _ in range(policy.horizon):
+        actions, state = policy.predict(observation, state=state)
+        assert np.isfinite(actions).all()
