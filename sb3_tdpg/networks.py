@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import torch as th
 from torch import nn
+from torch.nn.functional import elu
 
 
 class BatchedLinear(nn.Module):
@@ -72,23 +73,20 @@ class BatchedMLP(nn.Module):
                 x = self.activation(x)
         return x
 
-    @th.no_grad()
     def forward_keeping_hidden(self, x: th.Tensor) -> tuple[th.Tensor, list[th.Tensor]]:
         """
-        Evaluate without autograd, for :meth:`set_gradients`.
+        Evaluate for :meth:`set_gradients`; both are to be called under ``torch.no_grad()``.
 
         :return: the output ``(M, N, O)``, and the input of every layer
         """
-        inputs = []
-        last = len(self.layers) - 1
-        for i, layer in enumerate(self.layers):
+        # Direct calls, which are a third of a small network's time less than those through nn.Module.
+        *hidden, last = ((layer.bias, layer.weight) for layer in self.layers)
+        inputs = [x]
+        for bias, weight in hidden:
+            x = elu(th.baddbmm(bias, x, weight))
             inputs.append(x)
-            x = layer(x)
-            if i < last:
-                x = self.activation(x)
-        return x, inputs
+        return th.baddbmm(last[0], x, last[1]), inputs
 
-    @th.no_grad()
     def set_gradients(self, inputs: list[th.Tensor], grad_output: th.Tensor) -> None:
         """
         Back-propagate by hand into the parameters' ``grad``: less than half the time that autograd takes for so small a

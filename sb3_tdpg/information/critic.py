@@ -145,6 +145,7 @@ class CriticEstimator(InformationEstimator):
             self._refit(states, trvs, batch.alive, broken)
         return {"critic_refits": float(len(broken))}
 
+    @th.no_grad()
     def _ascend(
         self,
         critic: BatchedMLP,
@@ -167,7 +168,8 @@ class CriticEstimator(InformationEstimator):
                 critic.set_gradients(hidden, self._objective_gradient(values, n, rows, steps))
             else:
                 optimizer.zero_grad()
-                values = critic(inputs)
+                with th.enable_grad():
+                    values = critic(inputs)
                 values.backward(self._objective_gradient(values.detach(), n, rows, steps))
             optimizer.step()
 
