@@ -40,8 +40,8 @@ GOALS: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = {
     "text": {"PG": (12.0, None, None), "TDPG": (20.0, 10.0, 1.10), "TDPG (log-det)": (20.0, 10.0, 1.10)},
 }
 
-# Seeds 0 to 9 were seen while the blocks were tuned.
-FIRST_SEED = 100
+# Seeds below 200 were seen while the blocks were tuned.
+FIRST_SEED = 200
 
 PAPER_INVERSE_BETAS = (25, 50, 75, 100)
 
