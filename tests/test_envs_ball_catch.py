@@ -273,7 +273,7 @@ def test_subprocesses_give_the_same_numbers_as_a_loop():
             images.append(observation)
             rewards.append(reward)
         env.close()
-        return np.array(images), np.array(rewards)
+        return np.array(images), np.array(rewards, np.float32)  # SubprocVecEnv has them in double precision
 
     for in_loop, in_processes in zip(episode(DummyVecEnv), episode(SubprocVecEnv), strict=True):
         np.testing.assert_array_equal(in_processes, in_loop)
