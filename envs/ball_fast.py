@@ -68,38 +68,41 @@ class FastRenderer:
 
     def __init__(self, scene: BallScene) -> None:
         self.scene = scene
-        pitch, slope = np.deg2rad(scene.camera_pitch), np.tan(np.deg2rad(scene.fov) / 2)
-        self._slope = slope
-        steps = np.arange(IMAGE_SIZE)
-        upward = (2 * (IMAGE_SIZE - 1 - steps) / IMAGE_SIZE - 1) * slope
-        # A ray (x, y, z) of depth 1 along the camera's axis; x and z depend on the row, y on the column.
-        self._ray_x = np.cos(pitch) - upward * np.sin(pitch)
-        self._ray_z = np.sin(pitch) + upward * np.cos(pitch)
-        self._ray_y = -(2 * steps / IMAGE_SIZE - 1) * slope
-        self._ray_length_squared = (self._ray_x**2 + self._ray_z**2)[:, None] + self._ray_y**2  # (64, 64)
-        self._ray_to_light = (self._ray_x * TO_LIGHT[0] + self._ray_z * TO_LIGHT[2])[:, None] + self._ray_y * TO_LIGHT[
-            1
-        ]
-        self._axis = np.array([np.cos(pitch), np.sin(pitch)])  # x and z of the camera's axis, and of its upward one
-        self._up = np.array([-np.sin(pitch), np.cos(pitch)])
-
-        shaded = shade(scene.texture, (-1.0, 0.0, 0.0))
-        self._texels_v, self._texels_u = shaded.shape[:2]
-        # u (upward) is the slow index, v (to the left) the fast one.
-        self._wall_texels = pack(shaded[::-1].transpose(1, 0, 2)).ravel()
-        # Texture coordinates, in copies, of the points where rays meet a wall at a distance of 1 m.
-        copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m
-        ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)
-        self._u_at_zero = PLANE_COPIES / 2 + (scene.camera_height - WALL_CENTRE_Z) / copy
-        self._u_per_metre = self._ray_z / ahead / copy  # (64,)
-        self._v_per_metre = np.divide.outer(self._ray_y / copy, ahead).T.astype(np.float32)  # (64, 64)
-        self._v_per_metre = np.ascontiguousarray(self._v_per_metre)
+        self._prepare_rays()
+        self._prepare_wall()
+        self._behind, self._floor_depth = self._draw_floor()
+        self._behind_packed = pack(self._behind.transpose(1, 2, 0))
+        self._nearest_floor = self._floor_depth.min(axis=1)
         # Fresh arrays of this size come from the operating system page by page, which takes longer than the arithmetic.
         size = CHUNK * IMAGE_SIZE**2
         self._scratch = tuple(np.empty(size, dtype) for dtype in (np.float32, np.float32, np.int32, np.uint32))
-        self._behind, self._floor_depth = self._draw_floor()
-        self._nearest_floor = self._floor_depth.min(axis=1)
-        self._behind_packed = pack(self._behind.transpose(1, 2, 0))
+
+    def _prepare_rays(self) -> None:
+        """Make a ray (x, y, z) of depth 1 for each pixel; x and z depend on its row, y on its column."""
+        pitch = np.deg2rad(self.scene.camera_pitch)
+        self._slope = np.tan(np.deg2rad(self.scene.fov) / 2)
+        steps = np.arange(IMAGE_SIZE)
+        upward = (2 * (IMAGE_SIZE - 1 - steps) / IMAGE_SIZE - 1) * self._slope
+        x, z = np.cos(pitch) - upward * np.sin(pitch), np.sin(pitch) + upward * np.cos(pitch)
+        y = -(2 * steps / IMAGE_SIZE - 1) * self._slope
+        self._ray_x, self._ray_y, self._ray_z = x, y, z  # (64,)
+        self._ray_length_squared = (x**2 + z**2)[:, None] + y**2  # (64, 64)
+        self._ray_to_light = (x * TO_LIGHT[0] + z * TO_LIGHT[2])[:, None] + y * TO_LIGHT[1]  # (64, 64)
+        # x and z of the camera's own directions
+        self._axis = np.array([np.cos(pitch), np.sin(pitch)])
+        self._up = np.array([-np.sin(pitch), np.cos(pitch)])
+
+    def _prepare_wall(self) -> None:
+        """Shade the texture, and find the texture coordinates that a ray has on a wall 1 m ahead."""
+        shaded = shade(self.scene.texture, (-1.0, 0.0, 0.0))
+        self._texels_v, self._texels_u = shaded.shape[:2]
+        # u (upward) is the slow index, v (to the left) the fast one.
+        self._wall_texels = pack(shaded[::-1].transpose(1, 0, 2)).ravel()
+        copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m of wall to a copy of the texture
+        ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)
+        self._u_at_zero = PLANE_COPIES / 2 + (self.scene.camera_height - WALL_CENTRE_Z) / copy
+        self._u_per_metre = self._ray_z / ahead / copy  # (64,)
+        self._v_per_metre = (self._ray_y / copy / ahead[:, None]).astype(np.float32)  # (64, 64)
 
     @staticmethod
     def _depth_of(distance: float | np.ndarray, ray: np.ndarray) -> np.ndarray:

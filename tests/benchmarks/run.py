@@ -35,6 +35,7 @@ from sb3_tdpg import TDPG, make_episodes_env  # noqa: E402
 from sb3_tdpg.envs.ball_bullet import BulletRenderer  # noqa: E402
 from sb3_tdpg.envs.ball_catch import BallCatchEnv  # noqa: E402
 from sb3_tdpg.envs.ball_fast import FastRenderer  # noqa: E402
+from sb3_tdpg.envs.ball_scene import Renderer  # noqa: E402
 from sb3_tdpg.information import InformationBatch, Mine  # noqa: E402
 from tests.reference_loop import LoopTDPG, draw_randomness, unbatch  # noqa: E402
 
@@ -275,10 +276,15 @@ def bench_camera(sizes: Sizes) -> Iterable[Row]:
         states.append(env.step_batch(state, action[:, None], is_last=False).state)
     fast, reference = FastRenderer(env.scene), BulletRenderer(env.scene)
     some = max(1, n // 50)  # of the images by PyBullet, which draws them one by one anyway
+
+    def draw(renderer: Renderer, n_images: int) -> None:
+        for state in states:  # as in a rollout, images are let go before the next ones are drawn
+            renderer.images(state[:n_images])
+
     yield compare(
         f"camera image, {n} at a time: batched ray caster against PyBullet's TinyRenderer",
-        lambda: seconds(lambda: [fast.images(state) for state in states], n * len(states)),
-        lambda: seconds(lambda: [reference.images(state[:some]) for state in states], some * len(states)),
+        lambda: seconds(lambda: draw(fast, n), n * len(states)),
+        lambda: seconds(lambda: draw(reference, some), some * len(states)),
         sizes.repetitions,
         goal=50,
     )
