@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.ball_view import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
 OPEN_LOOP = (-5.0, 0.0, 1.5, 0.0, -1.5)
@@ -28,5 +31,68 @@ def lava(path: Path) -> None:
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
+def side_by_side(images: list[np.ndarray], gap: int = 6) -> np.ndarray:
+    """Images of one height ``(H, W, 3)`` in a row, on white."""
+    space = np.full((images[0].shape[0], gap, 3), 255, np.uint8)
+    return np.concatenate([part for image in images for part in (image, space)][:-1], axis=1)
+
+
+def fly(texture: str = TRAINING_TEXTURE) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """
+    An episode of a policy that knows where the ball lands and drives there at an even speed.
+
+    :return: what ``render`` drew and what the camera saw, 26 times each
+    """
+    env = BallCatchEnv(render_mode="rgb_array", texture=texture, robot_range=(-1.7, -1.7))
+    observation, info = env.reset(seed=0)
+    d, ball_x, _, speed_x, _ = info["state"]
+    lands = ball_x + speed_x * env.dt * env.horizon
+    speed = (lands - d) / (env.control_gain * env.horizon)
+    pictures, observations = [env.render()], [observation]
+    for _ in range(env.horizon):
+        observations.append(env.step(np.array([speed]))[0])
+        pictures.append(env.render())
+    env.close()
+    return pictures, [image.transpose(1, 2, 0) for image in observations]
+
+
+def ball_textures(path: Path) -> None:
+    """The eight textures, upright as on the wall, and under each what the camera makes of it."""
+    columns = []
+    for name in (TRAINING_TEXTURE, *TEST_TEXTURES):
+        (observation, _) = BallCatchEnv(renderer="fast", texture=name, robot_range=(0, 0)).reset(seed=0)
+        upright = np.rot90(load_texture(name))
+        columns.append(np.concatenate([upright, np.full((6, 128, 3), 255, np.uint8), enlarge(
+            observation.transpose(1, 2, 0), 2)]))  # fmt: skip
+    Image.fromarray(side_by_side(columns)).quantize(224, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)
+
+
+def ball_camera(path: Path) -> None:
+    """What the camera sees early, in the middle and late in the ball's flight."""
+    _, observations = fly()
+    Image.fromarray(side_by_side([enlarge(observations[t], 4) for t in (1, 9, 18)])).save(path, optimize=True)
+
+
+def ball_catch(path: Path) -> None:
+    """The scene from the side and from the camera, at two thirds of the real speed."""
+    pictures, observations = fly()
+    frames = []
+    for picture, observation in zip(pictures, observations, strict=True):
+        scene = Image.fromarray(picture[:, :512]).resize((320, 160), Image.Resampling.LANCZOS)
+        seen = Image.fromarray(observation).resize((160, 160), Image.Resampling.NEAREST)
+        frames.append(Image.fromarray(side_by_side([np.array(scene), np.array(seen)])))
+    # One palette for all, since a palette for each frame flickers. Ball and robot are small but keep their colours.
+    rare = np.array([(0, 120, 0), (0, 155, 0), (0, 190, 0), (10, 30, 80), (15, 60, 130), (35, 35, 40)], np.uint8)
+    patches = rare[None].repeat(81, axis=1)[:, : frames[0].width].repeat(600, axis=0)
+    palette = Image.fromarray(np.concatenate([*frames[::6], patches])).quantize(64)
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    durations = [100] * (len(frames) - 1) + [2000]  # ms
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+
+
 if __name__ == "__main__":
-    lava(Path(__file__).parent / "environments" / "lava.gif")
+    folder = Path(__file__).parent / "environments"
+    lava(folder / "lava.gif")
+    ball_textures(folder / "ball_textures.png")
+    ball_camera(folder / "ball_camera.png")
+    ball_catch(folder / "ball_catch.gif")

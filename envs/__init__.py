@@ -5,6 +5,7 @@ import gymnasium as gym
 # String entry points: an environment's module (and with it PyBullet) is imported only when it is made.
 ENTRY_POINTS = {
     "Lava-v0": "sb3_tdpg.envs.lava:LavaEnv",
+    "BallCatch-v0": "sb3_tdpg.envs.ball_catch:BallCatchEnv",
 }
 
 for _env_id, _entry_point in ENTRY_POINTS.items():

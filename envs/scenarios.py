@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from .textures import TEST_TEXTURES
+
 LAVA_TABLE_READING: Mapping[str, Any] = MappingProxyType(
     dict(action_cost=1.0, lava_stage_cost=3.0, lava_terminal_cost=300.0)
 )
@@ -16,12 +18,34 @@ does.
 """
 
 
+BALL_PUBLISHED_READING: Mapping[str, Any] = MappingProxyType(dict(control_gain=0.1, gravity=9.8, horizon=24))
+"""
+Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` that fit the numbers of Table II better than the paper's
+text does. In the 24 controls of this reading the ball goes from 8.0 m to 0.8 m.
+"""
+
+BALL_VARYING_LAUNCH: Mapping[str, Any] = MappingProxyType(
+    dict(ball_start_range=((7.0, 1.0), (9.0, 1.0)), ball_speed_range=((-5.0, 7.85), (-4.0, 7.85)))
+)
+"""
+Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` for a launch that varies, our own: the ball lands anywhere
+between -1.3 m and 2.3 m, so that a robot must see it. With the paper's fixed launch it need only know where it is.
+"""
+
+
 @dataclass(frozen=True)
 class PaperResult:
-    """The mean and the standard deviation over episodes of the cost that the paper prints in a row."""
+    """
+    What the paper prints in a row.
+
+    :param mean: Mean cost over episodes.
+    :param std: Standard deviation of the cost over episodes; ``None`` where the paper has none (Table II).
+    :param distance: Mean distance between robot and ball at the end, in m (Table II only).
+    """
 
     mean: float
-    std: float
+    std: float | None = None
+    distance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -56,4 +80,40 @@ LAVA: tuple[Scenario, ...] = (
     _lava("Sensor noise 1e-2", 1e-2, PaperResult(35.69, 15.68), PaperResult(36.00, 22.32)),
     _lava("Sensor noise 1e-1", 1e-1, PaperResult(66.29, 36.48), PaperResult(36.20, 21.85)),
     _lava("Sensor noise 1e0", 1.0, PaperResult(172.40, 88.08), PaperResult(37.39, 25.60)),
+)
+
+
+def _ball(name: str, pg: tuple[float, float], tdpg: tuple[float, float], **env_kwargs: Any) -> Scenario:
+    (pg_cost, pg_distance), (tdpg_cost, tdpg_distance) = pg, tdpg
+    paper = dict(PG=PaperResult(pg_cost, distance=pg_distance), TDPG=PaperResult(tdpg_cost, distance=tdpg_distance))
+    return Scenario(name, "BallCatch-v0", env_kwargs, paper)
+
+
+# cost and final distance of PG, then of TDPG, as Table II prints them
+_BACKGROUNDS = (
+    ((182.1, 1.828), (122.7, 1.225)),
+    ((214.3, 2.141), (79.90, 0.797)),
+    ((138.7, 1.385), (26.62, 0.264)),
+    ((95.38, 0.952), (28.11, 0.279)),
+    ((82.01, 0.818), (36.95, 0.367)),
+    ((208.5, 2.083), (166.4, 0.166)),  # 0.166 m cannot cost 166.4: the paper probably means 1.66 m
+    ((9.180, 0.090), (14.92, 0.147)),
+)
+
+# Table II. The textures are ours: seven other hues and patterns than the training brick, the last one reddish, too.
+BALL_CATCH: tuple[Scenario, ...] = (
+    _ball("Training", (8.702, 0.085), (18.577, 0.184)),
+    _ball("Sensor noise 0.10", (19.12, 0.189), (19.48, 0.193), pixel_noise_std=0.10),
+    _ball("Sensor noise 0.15", (46.68, 0.464), (20.12, 0.199), pixel_noise_std=0.15),
+    _ball("Sensor noise 0.20", (124.63, 1.244), (21.59, 0.214), pixel_noise_std=0.20),
+    _ball("Sensor noise 0.25", (187.53, 1.874), (27.11, 0.274), pixel_noise_std=0.25),
+    *(
+        _ball(f"Test background {i}", *paper, texture=texture)
+        for i, (texture, paper) in enumerate(zip(TEST_TEXTURES, _BACKGROUNDS, strict=True), start=1)
+    ),
+)
+
+# The same rows where the launch varies: a comparison of our own, without numbers of the paper.
+BALL_CATCH_VARYING_LAUNCH: tuple[Scenario, ...] = tuple(
+    Scenario(row.name, row.env_id, {**BALL_VARYING_LAUNCH, **row.env_kwargs}) for row in BALL_CATCH
 )

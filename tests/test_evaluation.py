@@ -335,6 +335,13 @@ def test_the_markdown_table_has_ours_beside_the_papers_and_the_best_in_bold():
     ]
 
 
+def test_a_paper_without_standard_deviations_is_shown_without_them():
+    (row,) = (Scenario("a|b", "Lava-v0", paper=dict(A=PaperResult(8.702, distance=0.085))),)
+    lines = comparison_markdown(summary_table(some_records({"A": {"a|b": [4.0, 6.0]}})), [row]).splitlines()
+    assert lines[2] == r"| a\|b | 5.00 (1.41) | 8.70 |"
+    assert "the paper's columns: mean. " in lines[4]
+
+
 def test_the_markdown_table_over_seeds_shows_the_interval_and_says_so():
     records = pd.concat([some_records({"ours": {"a|b": [float(i)] * 2}}, train_seed=i) for i in range(4)])
     text = comparison_markdown(aggregate_seeds(records), SCENARIOS[:1])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.envs.scenarios import PaperResult, Scenario
 
 
 def summary_table(records: pd.DataFrame, by: Sequence[str] = ("model", "scenario")) -> pd.DataFrame:
@@ -137,11 +137,16 @@ def comparison_markdown(summary: pd.DataFrame, scenarios: Sequence[Scenario]) ->
         for model in models:
             row.append(_bold_if(_our_cell(ours[model]), _is_lowest(model, value)) if model in ours else "")
             if model in in_paper and (result := scenario.paper.get(model)):
-                row.append(_bold_if(f"{result.mean:.2f} ({result.std:.2f})", _is_lowest(model, of_paper)))
+                row.append(_bold_if(_paper_cell(result), _is_lowest(model, of_paper)))
             elif model in in_paper:
                 row.append("")
         lines.append(_line(row))
-    return "\n".join([*lines, "", _footer(summary, in_paper=bool(in_paper)), ""])
+    results = [scenario.paper[model] for scenario in scenarios for model in in_paper if model in scenario.paper]
+    return "\n".join([*lines, "", _footer(summary, results), ""])
+
+
+def _paper_cell(result: PaperResult) -> str:
+    return f"{result.mean:.2f}" if result.std is None else f"{result.mean:.2f} ({result.std:.2f})"
 
 
 def _our_cell(cell: pd.Series) -> str:
@@ -150,7 +155,7 @@ def _our_cell(cell: pd.Series) -> str:
     return f"{cell['mean']:.2f} ({cell['std']:.2f})"
 
 
-def _footer(summary: pd.DataFrame, *, in_paper: bool) -> str:
+def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult]) -> str:
     """Say what the numbers are and how they were made."""
     if "iqm" in summary.columns:
         what = (
@@ -159,8 +164,9 @@ def _footer(summary: pd.DataFrame, *, in_paper: bool) -> str:
         )
     else:
         what = "Mean cost of an episode (standard deviation over episodes)"
-    if in_paper:
-        what += "; the paper's columns: mean (standard deviation)"
+    if paper:
+        what += "; the paper's columns: mean"
+        what += " (standard deviation)" if any(result.std is not None for result in paper) else ""
     kinds = {False: "stochastic policy", True: "deterministic policy"}
     how = [f"{_all(summary['n'])} episodes a scenario"] if "n" in summary.columns else []
     how += [f"evaluation seed {_all(summary['seed'])}"] if "seed" in summary.columns else []

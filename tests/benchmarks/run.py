@@ -32,6 +32,10 @@ from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 from torch import nn  # noqa: E402
 
 from sb3_tdpg import TDPG, make_episodes_env  # noqa: E402
+from sb3_tdpg.envs.ball_bullet import BulletRenderer  # noqa: E402
+from sb3_tdpg.envs.ball_catch import BallCatchEnv  # noqa: E402
+from sb3_tdpg.envs.ball_fast import FastRenderer  # noqa: E402
+from sb3_tdpg.envs.ball_scene import Renderer  # noqa: E402
 from sb3_tdpg.information import InformationBatch, Mine  # noqa: E402
 from tests.reference_loop import LoopTDPG, draw_randomness, unbatch  # noqa: E402
 
@@ -257,6 +261,36 @@ def bench_environment(sizes: Sizes) -> Iterable[Row]:
     )
 
 
+# -- (e) the camera ---------------------------------------------------------------------------------------------------
+
+
+def bench_camera(sizes: Sizes) -> Iterable[Row]:
+    """Compare the two renderers of the ball-catching camera over whole episodes of robots that drive to the ball."""
+    n = sizes.n_episodes
+    env = BallCatchEnv(renderer="fast")
+    states = [env.reset_batch(n)[0]]
+    for remaining in range(env.horizon, 0, -1):
+        state = states[-1]
+        lands = state[:, 1] + state[:, 3] * env.dt * remaining
+        action = (lands - state[:, 0]) / (env.control_gain * remaining)
+        states.append(env.step_batch(state, action[:, None], is_last=False).state)
+    fast, reference = FastRenderer(env.scene), BulletRenderer(env.scene)
+    some = max(1, n // 50)  # of the images by PyBullet, which draws them one by one anyway
+
+    def draw(renderer: Renderer, n_images: int) -> None:
+        for state in states:  # as in a rollout, images are let go before the next ones are drawn
+            renderer.images(state[:n_images])
+
+    yield compare(
+        f"camera image, {n} at a time: batched ray caster against PyBullet's TinyRenderer",
+        lambda: seconds(lambda: draw(fast, n), n * len(states)),
+        lambda: seconds(lambda: draw(reference, some), some * len(states)),
+        sizes.repetitions,
+        goal=50,
+    )
+    reference.close()
+
+
 # -- the table --------------------------------------------------------------------------------------------------------
 
 
@@ -308,7 +342,7 @@ def main() -> None:
     sizes = QUICK if arguments.quick else FULL
 
     start = time.perf_counter()
-    benches = (bench_epoch, bench_critics, bench_training, bench_environment)
+    benches = (bench_epoch, bench_critics, bench_training, bench_environment, bench_camera)
     rows = [row for bench in benches for row in bench(sizes)]
     elapsed = time.perf_counter() - start
     title = "# Speed" + (" (--quick: not the paper's sizes)" if arguments.quick else "")

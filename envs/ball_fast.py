@@ -1,0 +1,260 @@
+"""
+The picture of the ball-catching camera in NumPy: the scene of PyBullet's TinyRenderer, all images in one call.
+
+A ray caster that agrees with the reference in 99.8 % of the pixels and is tens of times faster. What it rests on:
+
+- A pixel's ray goes through its corner, not its centre.
+- The camera does not turn about the vertical, so that in a row of pixels depth and height on floor and wall are
+  constant. The rows of an image are sky, wall or floor as a whole, and only the ball is drawn pixel by pixel.
+- A texture's nearest texel counts, and a surface has one brightness, which is multiplied into its texels once.
+- TinyRenderer's sphere is a mesh inside the sphere: what is seen is a sphere of 0.965 times the radius.
+
+Dimension key: N images, K side of the window around a ball; images are ``(N, 3, 64, 64)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .ball_scene import (
+    AMBIENT,
+    DIFFUSE,
+    FAR,
+    IMAGE_SIZE,
+    LIGHT,
+    NEAR,
+    PLANE_COPIES,
+    PLANE_HALF,
+    SPECULAR,
+    WALL_CENTRE_Z,
+    WALL_SCALE,
+    WALL_X,
+    BallScene,
+    floor_texture,
+)
+
+MESH_RADIUS = 0.965  # what is seen of a sphere mesh, as a fraction of its radius
+WINDOWS = (4, 8, 16, 32, IMAGE_SIZE)  # K
+CHUNK = 64  # images whose walls are drawn at once
+WINDOW_PIXELS = 12_800  # pixels of balls drawn at once
+SKY = 255
+
+TO_LIGHT = LIGHT / np.linalg.norm(LIGHT)
+
+
+def brightness(towards_light: np.ndarray, upward: np.ndarray) -> np.ndarray:
+    """Factor on a texel, from the normal's component towards the light and its upward one; see :mod:`.ball_scene`."""
+    reflected_up = 2 * upward * towards_light - TO_LIGHT[2]
+    return AMBIENT + DIFFUSE * np.maximum(towards_light, 0) + SPECULAR * np.maximum(reflected_up, 0) ** 2
+
+
+def shade(texture: np.ndarray, normal: tuple[float, float, float]) -> np.ndarray:
+    """Multiply a flat surface's brightness into its texels."""
+    return np.minimum(texture * brightness(normal @ TO_LIGHT, np.asarray(normal[2])), 255).astype(np.uint8)
+
+
+def pack(colours: np.ndarray) -> np.ndarray:
+    """Make one number ``(...)`` uint32 of each colour ``(..., 3)`` uint8: one look-up in place of three. Red is low."""
+    red, green, blue = np.moveaxis(colours.astype(np.uint32), -1, 0)
+    return red | green << np.uint32(8) | blue << np.uint32(16)
+
+
+class FastRenderer:
+    """
+    A batched ray caster of the scene.
+
+    :param scene: What is drawn.
+    """
+
+    def __init__(self, scene: BallScene) -> None:
+        self.scene = scene
+        self._prepare_rays()
+        self._prepare_wall()
+        self._behind, self._floor_depth = self._draw_floor()
+        self._behind_packed = pack(self._behind.transpose(1, 2, 0))
+        self._nearest_floor = self._floor_depth.min(axis=1)
+        # Fresh arrays of this size come from the operating system page by page, which takes longer than the arithmetic.
+        size = CHUNK * IMAGE_SIZE**2
+        self._scratch = tuple(np.empty(size, dtype) for dtype in (np.float32, np.float32, np.int32, np.uint32))
+
+    def _prepare_rays(self) -> None:
+        """Make a ray (x, y, z) of depth 1 for each pixel; x and z depend on its row, y on its column."""
+        pitch = np.deg2rad(self.scene.camera_pitch)
+        self._slope = np.tan(np.deg2rad(self.scene.fov) / 2)
+        steps = np.arange(IMAGE_SIZE)
+        upward = (2 * (IMAGE_SIZE - 1 - steps) / IMAGE_SIZE - 1) * self._slope
+        x, z = np.cos(pitch) - upward * np.sin(pitch), np.sin(pitch) + upward * np.cos(pitch)
+        y = -(2 * steps / IMAGE_SIZE - 1) * self._slope
+        self._ray_x, self._ray_y, self._ray_z = x, y, z  # (64,)
+        self._ray_length_squared = (x**2 + z**2)[:, None] + y**2  # (64, 64)
+        self._ray_to_light = (x * TO_LIGHT[0] + z * TO_LIGHT[2])[:, None] + y * TO_LIGHT[1]  # (64, 64)
+        # x and z of the camera's own directions
+        self._axis = np.array([np.cos(pitch), np.sin(pitch)])
+        self._up = np.array([-np.sin(pitch), np.cos(pitch)])
+
+    def _prepare_wall(self) -> None:
+        """Shade the texture, and find the texture coordinates that a ray has on a wall 1 m ahead."""
+        shaded = shade(self.scene.texture, (-1.0, 0.0, 0.0))
+        self._texels_v, self._texels_u = shaded.shape[:2]
+        # u (upward) is the slow index, v (to the left) the fast one.
+        self._wall_texels = pack(shaded[::-1].transpose(1, 0, 2)).ravel()
+        copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m of wall to a copy of the texture
+        ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)
+        self._u_at_zero = PLANE_COPIES / 2 + (self.scene.camera_height - WALL_CENTRE_Z) / copy
+        self._u_per_metre = self._ray_z / ahead / copy  # (64,)
+        self._v_per_metre = (self._ray_y / copy / ahead[:, None]).astype(np.float32)  # (64, 64)
+
+    @staticmethod
+    def _depth_of(distance: float | np.ndarray, ray: np.ndarray) -> np.ndarray:
+        """Depth at which rays have gone a distance along an axis; infinite where they never do."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = distance / ray
+        return np.where(depth > NEAR, depth, np.inf)
+
+    def _draw_floor(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Draw floor and sky, which move with the robot.
+
+        :return: their image, ``(3, 64, 64)``, and the floor's depth, infinite where there is none: ``(64, 1)``, or
+            ``(64, 64)`` if one of its sides is in view
+        """
+        texture = shade(floor_texture(), (0.0, 0.0, 1.0))
+        depth = self._depth_of(-self.scene.camera_height, self._ray_z)[:, None]
+        depth[depth > FAR] = np.inf
+        reach = np.where(np.isfinite(depth), depth, 0.0)
+        x, y = np.broadcast_arrays(reach * self._ray_x[:, None], reach * self._ray_y)
+        u, v = (PLANE_COPIES * (side / PLANE_HALF + 1) / 2 for side in (x, y))
+        rows, columns = len(texture) - 1 - (v % 1 * len(texture)).astype(int), (u % 1 * texture.shape[1]).astype(int)
+        is_off = np.maximum(abs(x), abs(y)) > PLANE_HALF
+        if is_off.any():
+            depth = np.where(is_off, np.inf, depth)
+        image = np.where(np.isfinite(depth)[..., None], texture[rows, columns], SKY).astype(np.uint8)
+        return np.ascontiguousarray(image.transpose(2, 0, 1)), depth
+
+    def images(self, state: np.ndarray) -> np.ndarray:
+        """Return one image for each state: ``(N, 3, 64, 64)`` uint8 from ``(N, 5)``."""
+        images = np.empty((len(state), 3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
+        images[:] = self._behind
+        wall_depth = self._depth_of(WALL_X - state[:, :1], self._ray_x)  # (N, 64)
+        wall_depth[wall_depth > FAR] = np.inf
+        for start in range(0, len(state), CHUNK):
+            chunk = slice(start, start + CHUNK)
+            self._draw_walls(images[chunk], WALL_X - state[chunk, 0], wall_depth[chunk])
+        self._draw_balls(images, state, wall_depth)
+        return images
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    # -- wall ---------------------------------------------------------------------------------------------------------
+
+    def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
+        """Draw walls at some distance, ``(N,)``, whose depth is given by the row: ``(N, 64)``."""
+        first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)  # (64,); equal but at its sides
+        with_wall = np.flatnonzero((depth < last).any(axis=0))
+        if not len(with_wall):
+            return
+        rows = slice(with_wall[0], with_wall[-1] + 1)
+        colours, shifted = self._wall_colours(distance, rows)
+        depth, first, last, behind = depth[:, rows], first[rows], last[rows], self._behind_packed[rows]
+        image, row = np.nonzero(depth >= last)
+        colours[image, row] = behind[row]
+        image, row = np.nonzero((depth >= first) & (depth < last))
+        if len(image):
+            is_wall = depth[image, row, None] < self._floor_depth[rows][row]
+            colours[image, row] = np.where(is_wall, colours[image, row], behind[row])
+        for channel in range(3):
+            # The cast keeps the lowest byte. An assignment would do the same, six times slower.
+            np.right_shift(colours, np.uint32(8 * channel), out=shifted)
+            np.copyto(images[:, channel, rows], shifted, casting="unsafe")
+
+    def _wall_colours(self, distance: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Look up the packed colours of the wall, ``(N, rows, 64)``; the second array is room to work with."""
+        u = self._u_at_zero + np.multiply.outer(distance, self._u_per_metre[rows])  # (N, rows)
+        u -= np.floor(u)
+        line = (u * self._texels_u).astype(np.int32) * np.int32(self._texels_v)
+        shape = (*u.shape, IMAGE_SIZE)
+        v, whole, texel, colours = (buffer[: np.prod(shape)].reshape(shape) for buffer in self._scratch)
+        # Single precision is off by less than a thousandth of a texel.
+        np.multiply(distance.astype(np.float32)[:, None, None], self._v_per_metre[rows], out=v)
+        np.add(v, np.float32(PLANE_COPIES / 2), out=v)
+        np.floor(v, out=whole)
+        np.subtract(v, whole, out=v)
+        np.multiply(v, np.float32(self._texels_v), out=v)
+        np.copyto(texel, v, casting="unsafe")
+        np.add(texel, line[..., None], out=texel)
+        return self._wall_texels.take(texel, mode="clip", out=colours), texel.view(np.uint32)
+
+    # -- ball ---------------------------------------------------------------------------------------------------------
+
+    def _draw_balls(self, images: np.ndarray, state: np.ndarray, wall_depth: np.ndarray) -> None:
+        """Draw the balls, each in the smallest window that holds it; windows of a size are drawn at once."""
+        # As seen from the camera, straight ahead and upward: (N, 2). The ball stays in the camera's plane.
+        centre = np.stack([state[:, 1] - state[:, 0], state[:, 2] - self.scene.camera_height], axis=1)
+        first, last = self._bounding_box(centre)  # (N, 2): row and column
+        size = (last - first).max(axis=1)
+        is_seen = (last > first).all(axis=1)
+        smallest = 0
+        for window in WINDOWS:
+            of_this_size = np.flatnonzero(is_seen & (smallest < size) & (size <= window))
+            smallest = window
+            at_once = max(1, WINDOW_PIXELS // window**2)
+            for start in range(0, len(of_this_size), at_once):
+                chosen = of_this_size[start : start + at_once]
+                corner = np.minimum(first[chosen], IMAGE_SIZE - window)
+                self._draw_windows(images, chosen, corner, window, centre[chosen], wall_depth)
+
+    def _bounding_box(self, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First, and one past the last, row and column of the pixels that a ball may cover: ``(N, 2)`` each."""
+        radius = MESH_RADIUS * self.scene.ball_radius
+        depth = centre @ self._axis
+        across = np.stack([-(centre @ self._up), np.zeros(len(centre))], axis=1)  # (N, 2): downward, to the right
+        # A line through the eye with this slope touches the circle that the ball is from above or from the side.
+        room = np.maximum(depth**2 - radius**2, 1e-12)[:, None]
+        root = radius * np.sqrt(np.maximum(across**2 + depth[:, None] ** 2 - radius**2, 0))
+        slopes = np.stack([across * depth[:, None] - root, across * depth[:, None] + root]) / room
+        pixels = (slopes / self._slope + 1) * IMAGE_SIZE / 2
+        pixels[..., 0] -= 1  # the lowest row is 63, at ndc -1
+        first, last = np.clip(np.stack([np.floor(pixels[0]), np.ceil(pixels[1]) + 1]), 0, IMAGE_SIZE).astype(int)
+        is_around = abs(depth) <= radius + NEAR  # the ball is at the eye: no bounds
+        first[is_around], last[is_around] = 0, IMAGE_SIZE
+        is_out = (depth < -radius) | (depth > FAR + radius)
+        last[is_out] = first[is_out]
+        return first, last
+
+    def _draw_windows(
+        self,
+        images: np.ndarray,
+        chosen: np.ndarray,
+        corner: np.ndarray,
+        window: int,
+        centre: np.ndarray,
+        wall_depth: np.ndarray,
+    ) -> None:
+        """Draw the balls of the chosen images, each in a window of K x K pixels from its corner on."""
+        radius = MESH_RADIUS * self.scene.ball_radius
+        steps = np.arange(window)
+        rows, columns = corner[:, :1] + steps, corner[:, 1:] + steps  # (n, K)
+        x, z, y = self._ray_x[rows], self._ray_z[rows], self._ray_y[columns]
+        # |depth * ray - centre|^2 = radius^2, a quadratic equation for the depth; the centre has y = 0.
+        along = x * centre[:, :1] + z * centre[:, 1:]  # (n, K)
+        excess = (centre**2).sum(axis=1, keepdims=True) - radius**2  # (n, 1)
+        discriminant = (along**2 - (x**2 + z**2) * excess)[:, :, None] - (y**2 * excess)[:, None]  # (n, K, K)
+        behind = np.minimum(wall_depth[chosen[:, None], rows], self._nearest_floor[rows])
+
+        # From here one entry for each pixel of a ball. K is a power of two, and so are these divisors.
+        found = np.flatnonzero(discriminant > 0)
+        row = found // window  # of the n * K rows of all windows
+        ball = row // window
+        pixel = rows.take(row) * IMAGE_SIZE + columns.take(ball * window + found % window)
+        depth = (along.take(row) - np.sqrt(discriminant.take(found))) / self._ray_length_squared.take(pixel)
+        is_seen = (depth > NEAR) & (depth < np.minimum(behind, FAR).take(row))
+        if not is_seen.all():
+            row, ball, pixel, depth = row[is_seen], ball[is_seen], pixel[is_seen], depth[is_seen]
+        # The normal is (depth * ray - centre) / radius.
+        towards_light = (depth * self._ray_to_light.take(pixel) - (centre @ TO_LIGHT[::2]).take(ball)) / radius
+        upward = (depth * z.take(row) - centre[:, 1].take(ball)) / radius
+        level = 255 * brightness(towards_light, upward)
+        place = chosen.take(ball) * (3 * IMAGE_SIZE**2) + pixel
+        for channel, amount in enumerate(self.scene.ball_color):
+            images.reshape(-1)[place + channel * IMAGE_SIZE**2] = np.minimum(amount * level, 255).astype(np.uint8)

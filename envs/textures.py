@@ -1,0 +1,196 @@
+"""
+The walls of the ball-catching problem: procedural textures, as many as one likes, and image files.
+
+Dimension key: S texels a side of a procedural texture, H and W rows and columns of any. A texture is an array
+``(H, W, 3)`` uint8 as an image file has it. One copy covers 8 m x 8 m of the wall. PyBullet's plane turns it: on the
+wall the image's columns run upwards and its rows to the right, so that procedural textures, drawn upright, are turned
+the other way at the end.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import functools
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+SIZE = 128  # S: 6.25 cm a texel on the wall, about a fifth of a pixel of the camera at the far end
+
+Pattern = Callable[[np.random.Generator], np.ndarray]  # draws a tileable picture (S, S), values in [0, 1]
+
+
+def _grid() -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of each texel, as fractions of a side."""
+    fraction = (np.arange(SIZE) + 0.5) / SIZE
+    rows, columns = np.meshgrid(fraction, fraction, indexing="ij")
+    return rows, columns
+
+
+def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
+    """Tileable smooth noise with about ``waves`` blobs a side, spread over [0, 1]."""
+    frequency = np.fft.fftfreq(SIZE, 1 / SIZE)
+    envelope = np.exp(-((frequency[:, None] ** 2 + frequency**2) / (2 * waves**2)))
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((SIZE, SIZE))) * envelope).real
+    return np.argsort(np.argsort(field, axis=None)).reshape(SIZE, SIZE) / SIZE**2
+
+
+def bricks(rng: np.random.Generator) -> np.ndarray:
+    """Running bond: 8 courses of 4 bricks (1 m x 2 m each), every brick of its own shade, light mortar."""
+    courses, per_course, mortar = 8, 4, 2 * 8 / SIZE  # the joint as a fraction of a course
+    rows, columns = _grid()
+    course = (rows * courses).astype(int)
+    along = columns * per_course + 0.5 * (course % 2)
+    brick = along.astype(int) % per_course
+    shade = 0.55 * rng.random((courses, per_course))[course, brick]
+    joint = (rows * courses % 1 < mortar) | (along % 1 < mortar * per_course / courses)
+    return np.where(joint, 1.0, shade)
+
+
+def tiles(rng: np.random.Generator) -> np.ndarray:
+    """A chequerboard of squares with unequal shades."""
+    per_side = 2 * int(rng.integers(2, 5))
+    rows, columns = ((axis * per_side).astype(int) for axis in _grid())
+    return 0.3 * rng.random((per_side, per_side))[rows, columns] + 0.7 * ((rows + columns) % 2)
+
+
+def stripes(rng: np.random.Generator) -> np.ndarray:
+    """Straight stripes: upright, level or slanted."""
+    number, slant = int(rng.integers(3, 7)), int(rng.integers(-2, 3))
+    rows, columns = _grid()
+    if rng.random() < 0.5:
+        rows, columns = columns, rows
+    return 0.5 + 0.5 * np.sin(2 * np.pi * (number * columns + slant * rows))
+
+
+def dots(rng: np.random.Generator) -> np.ndarray:
+    """Round dots, each row shifted by half a distance."""
+    per_side = 2 * int(rng.integers(2, 4))
+    rows, columns = (axis * per_side for axis in _grid())
+    columns = columns + 0.5 * (rows.astype(int) % 2)
+    radius = 0.28 + 0.1 * rng.random()
+    return (np.hypot(rows % 1 - 0.5, columns % 1 - 0.5) < radius).astype(float)
+
+
+def planks(rng: np.random.Generator) -> np.ndarray:
+    """Upright boards of unequal shades with a grain and dark gaps."""
+    number = int(rng.integers(6, 11))
+    _, columns = _grid()
+    board = (columns * number).astype(int)
+    grain = np.roll(_noise(rng, 6.0), rng.integers(SIZE), axis=0)
+    shade = 0.35 + 0.45 * rng.random(number)[board] + 0.2 * grain
+    return np.where(columns * number % 1 < 0.12, 0.0, shade)
+
+
+def blobs(rng: np.random.Generator) -> np.ndarray:
+    """Patches like leaves or camouflage, in four shades."""
+    return np.floor(4 * _noise(rng, 4.0)) / 3
+
+
+def waves(rng: np.random.Generator) -> np.ndarray:
+    """Level bands that a smooth noise bends, as in marble."""
+    rows, _ = _grid()
+    return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * rows + 1.2 * _noise(rng, 2.0)))
+
+
+def speckles(rng: np.random.Generator) -> np.ndarray:
+    """Fine and coarse noise, as in rough plaster."""
+    return 0.5 * _noise(rng, 3.0) + 0.5 * _noise(rng, 24.0)
+
+
+PATTERNS: tuple[Pattern, ...] = (bricks, tiles, stripes, dots, planks, blobs, waves, speckles)
+
+# hue, saturation, value, each in [0, 1]
+Colour = tuple[float, float, float]
+
+
+def _paint(pattern: Pattern, seed: int, dark: Colour, light: Colour) -> np.ndarray:
+    """Draw a pattern between two colours with a little grain, upright on the wall."""
+    rng = np.random.default_rng(seed)
+    ends = np.array([colorsys.hsv_to_rgb(*dark), colorsys.hsv_to_rgb(*light)])
+    amount = pattern(rng)[..., None]  # (S, S, 1)
+    picture = (1 - amount) * ends[0] + amount * ends[1] + 0.02 * rng.standard_normal((SIZE, SIZE, 1))
+    upright = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+    return np.ascontiguousarray(np.rot90(upright, -1))
+
+
+# name: pattern, seed, colours of the pattern's 0 and 1
+_BUILT_IN: dict[str, tuple[Pattern, int, Colour, Colour]] = {
+    "brick": (bricks, 0, (0.02, 0.80, 0.50), (0.05, 0.18, 0.80)),
+    "blue_tiles": (tiles, 1, (0.61, 0.85, 0.45), (0.57, 0.35, 0.95)),
+    "green_leaves": (blobs, 2, (0.36, 0.90, 0.20), (0.24, 0.65, 0.75)),
+    "yellow_stripes": (stripes, 3, (0.12, 0.85, 0.55), (0.15, 0.55, 1.00)),
+    "grey_plaster": (speckles, 4, (0.60, 0.04, 0.30), (0.10, 0.06, 0.85)),
+    "violet_dots": (dots, 5, (0.76, 0.60, 0.40), (0.83, 0.25, 0.95)),
+    "turquoise_waves": (waves, 6, (0.52, 0.90, 0.40), (0.46, 0.35, 0.90)),
+    "red_planks": (planks, 7, (0.98, 0.75, 0.15), (0.03, 0.70, 0.75)),
+}
+
+TRAINING_TEXTURE = "brick"
+TEST_TEXTURES = tuple(name for name in _BUILT_IN if name != TRAINING_TEXTURE)
+"""The seven test backgrounds, in the order of Table II; the seventh has the hue of the training texture."""
+
+
+@functools.cache
+def built_in_texture(name: str) -> np.ndarray:
+    """Return the texture with this name, ``(S, S, 3)``; the array is shared and read-only."""
+    texture = _paint(*_BUILT_IN[name])
+    texture.flags.writeable = False
+    return texture
+
+
+def random_texture(seed: int) -> np.ndarray:
+    """Draw a texture ``(S, S, 3)`` of any pattern and hue; the same seed gives the same texture."""
+    rng = np.random.default_rng([seed, 8])  # not the streams of the built-in ones
+    pattern = PATTERNS[rng.integers(len(PATTERNS))]
+    hue, shift = rng.random(), 0.1 * rng.standard_normal()
+    dark = (hue, rng.uniform(0.3, 0.95), rng.uniform(0.2, 0.55))
+    light = ((hue + shift) % 1, rng.uniform(0.1, 0.8), rng.uniform(0.65, 1.0))
+    return _paint(pattern, int(rng.integers(2**31)), dark, light)
+
+
+def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
+    """
+    Turn a name, a path or an array into a texture.
+
+    :param texture: A built-in name (``"brick"`` or one of :data:`TEST_TEXTURES`), ``"random-<seed>"`` for
+        :func:`random_texture`, the path of an image file, or an array ``(H, W, 3)`` uint8.
+    :return: ``(H, W, 3)`` uint8
+    :raises FileNotFoundError: if a path leads to no file.
+    :raises ValueError: if a name is unknown, or if a file or an array is not an image.
+    """
+    if isinstance(texture, np.ndarray):
+        if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
+            raise ValueError(
+                f"texture is an array of shape {texture.shape} and dtype {texture.dtype}; expected (height, width, 3) "
+                "of uint8 in 0..255"
+            )
+        return texture.copy()
+    if texture in _BUILT_IN:
+        return built_in_texture(str(texture))
+    if match := re.fullmatch(r"random-(\d+)", os.fspath(texture)):
+        return random_texture(int(match[1]))
+    return _load_image(texture)
+
+
+def _load_image(texture: str | os.PathLike[str]) -> np.ndarray:
+    path = Path(texture).expanduser()
+    if not path.is_file():
+        if path.suffix or path != Path(path.name):
+            raise FileNotFoundError(f"texture={str(texture)!r}: there is no such image file; mend the path")
+        raise ValueError(
+            f"texture={str(texture)!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', or the path of an "
+            "image file"
+        )
+    try:
+        with Image.open(path) as image:
+            return np.array(image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as error:  # what Pillow raises for a broken file differs by format
+        raise ValueError(
+            f"texture={str(texture)!r} cannot be read as an image ({error}): use an intact PNG, JPEG or other file "
+            "that Pillow opens"
+        ) from error

@@ -1,0 +1,135 @@
+"""Both renderers of the ball-catching camera draw one picture, and a policy fares the same with either."""
+
+import numpy as np
+import pytest
+
+from sb3_tdpg import BatchedVecEnv
+from sb3_tdpg.envs.ball_bullet import BulletRenderer
+from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.ball_fast import FastRenderer
+from sb3_tdpg.envs.ball_scene import BallScene
+from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
+
+
+def scene(**changes):
+    defaults = dict(
+        texture=load_texture(TRAINING_TEXTURE), ball_color=(0.0, 1.0, 0.0), ball_radius=0.235, camera_height=2.0,
+        camera_pitch=30.0, fov=90.0,
+    )  # fmt: skip
+    return BallScene(**{**defaults, **changes})
+
+
+def random_states(n, seed=0):
+    """States on the paper's flight, with the robot anywhere, and as many with the ball anywhere, too."""
+    rng = np.random.default_rng(seed)
+    t = rng.uniform(0, 25 / 15, n)
+    on_its_way = np.stack([8 - 4.5 * t, 1 + 7.85 * t - 4.905 * t**2], axis=1)
+    anywhere = rng.uniform((0, 0), (8, 4.5), (n, 2))
+    states = np.zeros((n, 5))
+    states[:, 0] = rng.uniform(-2.5, 2.5, n)
+    states[:, 1:3] = np.where(np.arange(n)[:, None] % 2, on_its_way, anywhere)
+    return states
+
+
+def compare(scene, states):
+    """Share of pixels within 2 of 255 in all channels, and the mean difference."""
+    renderers = BulletRenderer(scene), FastRenderer(scene)
+    reference, fast = (renderer.images(states).astype(int) for renderer in renderers)
+    for renderer in renderers:
+        renderer.close()
+    difference = abs(reference - fast)
+    return (difference.max(axis=1) <= 2).mean(), difference.mean()
+
+
+@pytest.mark.parametrize("texture", [TRAINING_TEXTURE, *TEST_TEXTURES])
+def test_the_renderers_agree_in_500_states_with_each_texture(texture):
+    within_two, mean = compare(scene(texture=load_texture(texture)), random_states(500))
+    assert within_two > 0.995
+    assert mean < 0.2
+
+
+@pytest.mark.parametrize(("changes", "lowest"), [
+    (dict(ball_color=(1.0, 0.5, 0.2), ball_radius=0.5), 0.995),
+    (dict(camera_height=0.7), 0.995),
+    (dict(camera_pitch=-20.0), 0.99),
+    (dict(camera_pitch=70.0), 0.995),
+    (dict(fov=40.0), 0.995),
+    (dict(fov=120.0), 0.98),  # the sides of the floor are in view
+    (dict(texture=np.random.default_rng(0).integers(0, 256, (75, 200, 3), dtype=np.uint8)), 0.995),
+], ids=str)  # fmt: skip
+def test_the_renderers_agree_in_other_scenes_too(changes, lowest):
+    within_two, _ = compare(scene(**changes), random_states(100))
+    assert within_two > lowest
+
+
+@pytest.mark.parametrize(("robot", "ball", "lowest"), [
+    ((8, 14), (0, 16), 0.995),  # at the wall and beyond it
+    ((-12, -5), (-5, 8), 0.995),  # the wall too far to be seen, the sides of the floor in view
+    ((-2, 2), (9, 10.4), 0.995),  # the ball in the wall
+], ids=str)  # fmt: skip
+def test_the_renderers_agree_far_from_the_task(robot, ball, lowest):
+    rng = np.random.default_rng(0)
+    states = random_states(100)
+    states[:, 0], states[:, 1] = rng.uniform(*robot, 100), rng.uniform(*ball, 100)
+    states[:, 2] = rng.uniform(-0.3, 4, 100)
+    within_two, _ = compare(scene(), states)
+    assert within_two > lowest
+
+
+def test_a_ball_around_the_eye_does_no_harm():
+    rng = np.random.default_rng(0)
+    states = random_states(200)
+    states[:, 1] = states[:, 0] + rng.uniform(-0.6, 0.6, 200)
+    states[:, 2] = 2 + rng.uniform(-0.6, 0.6, 200)
+    within_two, _ = compare(scene(), states)
+    assert within_two > 0.97
+
+
+def test_an_image_does_not_depend_on_the_batch_that_it_is_drawn_in():
+    states = random_states(150)
+    renderer = FastRenderer(scene())
+    together = renderer.images(states)
+    np.testing.assert_array_equal(together, np.concatenate([renderer.images(state[None]) for state in states]))
+    np.testing.assert_array_equal(together[::-1], renderer.images(states[::-1]))
+    assert renderer.images(states[:0]).shape == (0, 3, 64, 64)
+
+
+def test_images_that_went_out_earlier_are_not_overwritten_later():
+    renderer = FastRenderer(scene())
+    states = random_states(20)
+    first = renderer.images(states)
+    kept = first.copy()
+    renderer.images(states + 0.3)
+    np.testing.assert_array_equal(first, kept)
+
+
+@pytest.fixture(scope="module")
+def read_position():
+    """Fit, by ridge regression on noiseless images, where the robot is in front of the wall."""
+    env = BatchedVecEnv(BallCatchEnv(renderer="fast", robot_range=(-3.0, 3.0), ball_radius=1e-3, horizon=1), 1500)
+    env.seed(0)
+    images = env.reset()
+    positions = np.array([info["state"][0] for info in env.reset_infos])
+
+    def features(images):
+        return np.concatenate([images.mean(axis=3).reshape(len(images), -1) / 255, np.ones((len(images), 1))], axis=1)
+
+    x = features(images)
+    weights = np.linalg.solve(x.T @ x + 0.1 * np.eye(x.shape[1]), x.T @ positions)
+    return lambda images: features(images) @ weights
+
+
+def test_a_policy_has_the_same_mean_cost_with_both_renderers(read_position):
+    def costs(renderer):
+        env = BatchedVecEnv(BallCatchEnv(renderer=renderer), 60)
+        env.seed(5)
+        images, total = env.reset(), np.zeros(60)
+        for _ in range(25):
+            images, rewards, _, _ = env.step(3 * (0.5 - read_position(images))[:, None])
+            total -= rewards
+        env.close()
+        return total
+
+    reference, fast = costs("pybullet"), costs("fast")
+    assert reference.mean() < 100  # it is a policy that looks: standing still costs about 100
+    assert abs(reference.mean() - fast.mean()) < reference.std(ddof=1) / np.sqrt(60)
