@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import cast
 
 import torch as th
 from torch import nn
@@ -80,12 +81,12 @@ class BatchedMLP(nn.Module):
         :return: the output ``(M, N, O)``, and the input of every layer
         """
         # Direct calls, which are a third of a small network's time less than those through nn.Module.
-        *hidden, last = ((layer.bias, layer.weight) for layer in self.layers)
+        *hidden, last = cast("list[BatchedLinear]", list(self.layers))
         inputs = [x]
-        for bias, weight in hidden:
-            x = elu(th.baddbmm(bias, x, weight))
+        for layer in hidden:
+            x = elu(th.baddbmm(layer.bias, x, layer.weight))
             inputs.append(x)
-        return th.baddbmm(last[0], x, last[1]), inputs
+        return th.baddbmm(last.bias, x, last.weight), inputs
 
     def set_gradients(self, inputs: list[th.Tensor], grad_output: th.Tensor) -> None:
         """
