@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -184,7 +185,8 @@ def reproduce_lava(
     write_run_config(
         out / "config.json", dict(runs=[run.config for runs in groups.values() for run in runs], provenance=how)
     )
-    summary = "\n\n".join(["# The lava problem (Table I)", *sections, _how_made(how)]) + "\n"
+    made_at = _how_made(how, _commits([folder for group in groups for folder in folders[group]]))
+    summary = "\n\n".join(["# The lava problem (Table I)", *sections, made_at]) + "\n"
     write_atomically(out / "summary.md", summary)
     if publish is not None:
         publish.mkdir(parents=True, exist_ok=True)
@@ -251,13 +253,20 @@ def _markdown(frame: pd.DataFrame) -> str:
     return "\n".join([*header, *(f"| {' | '.join(row)} |" for row in cells)])
 
 
-def _how_made(how: Mapping[str, Any]) -> str:
+def _commits(folders: Sequence[Path]) -> list[str]:
+    """Return the commits at which the runs were made: more than one if the reproduction was resumed after a change."""
+    gits = (json.loads((folder / "config.json").read_text())["provenance"]["git"] for folder in folders)
+    return sorted({git["commit"][:7] for git in gits if git is not None})
+
+
+def _how_made(how: Mapping[str, Any], commits: Sequence[str]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
     git = how["git"]
     commit = (
         "outside a checkout" if git is None else git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
     )
-    return f"Made by `make reproduce-lava` at commit {commit}, {how['utc_time']}, {versions}. {how['platform']}."
+    runs = f"runs at {', '.join(commits)}; " if commits else ""
+    return f"Made by `make reproduce-lava` at commit {commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
 
 
 def _method_order(column: pd.Series) -> pd.Series:
