@@ -97,7 +97,7 @@ def lava_trajectories(
             for path in d.T:
                 axes.plot(path, color=colors.to_rgba(path[0]), linewidth=0.8, alpha=0.8)
             in_lava = (d[-1] >= LAVA).mean()
-            title = f"{label}, {_noise(variance)}: mean cost {costs.mean():.0f}, {in_lava:.0%} in the lava"
+            title = f"{label}, {_noise(variance)}\nmean cost {costs.mean():.0f}, {in_lava:.0%} in the lava"
             axes.set_title(title, fontsize=9)
     for axes in panels[-1]:
         axes.set_xlabel("time step $t$", fontsize=9)
