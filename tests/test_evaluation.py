@@ -393,7 +393,7 @@ def test_the_trajectories_have_a_panel_for_each_model_and_noise_level(tdpg, ppo,
     pytest.importorskip("matplotlib")
     figure = lava_trajectories({"PG": ppo, "TDPG": tdpg}, n_episodes=4)
     panels = figure.axes[:4]
-    assert [axes.get_title().split(":")[0] for axes in panels] == [
+    assert [axes.get_title().splitlines()[0] for axes in panels] == [
         r"PG, $\sigma^2 = 10^{-4}$", r"TDPG, $\sigma^2 = 10^{-4}$", r"PG, $\sigma^2 = 1$", r"TDPG, $\sigma^2 = 1$"
     ]  # fmt: skip
     paths = [[line.get_ydata() for line in axes.lines if len(line.get_ydata()) == 6] for axes in panels]
