@@ -49,7 +49,6 @@ class BatchedMLP(nn.Module):
     :param n_maps: Number of networks M.
     :param sizes: Width of every layer, from the input to the output.
     :param activation_fn: Nonlinearity after each layer but the last.
-    :param activate_output: Whether it follows the last layer, too.
     """
 
     def __init__(
@@ -57,20 +56,18 @@ class BatchedMLP(nn.Module):
         n_maps: int,
         sizes: Sequence[int],
         activation_fn: type[nn.Module] = nn.ELU,
-        activate_output: bool = False,
     ) -> None:
         super().__init__()
         self.n_maps = n_maps
         self.layers = nn.ModuleList(BatchedLinear(n_maps, i, o) for i, o in pairwise(sizes))
         self.activation = activation_fn()
-        self.activate_output = activate_output
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """``(M, N, I) -> (M, N, O)``."""
         last = len(self.layers) - 1
         for i, layer in enumerate(self.layers):
             x = layer(x)
-            if i < last or self.activate_output:
+            if i < last:
                 x = self.activation(x)
         return x
 
@@ -112,7 +109,7 @@ class BatchedMLP(nn.Module):
         for i, layer in enumerate(self.layers):
             assert isinstance(layer, BatchedLinear)
             x = layer.at(x, index)
-            if i < last or self.activate_output:
+            if i < last:
                 x = self.activation(x)
         return x
 
@@ -125,7 +122,6 @@ class TimeMLP(nn.Module):
     :param sizes: Width of every layer, from the input to the output.
     :param activation_fn: Nonlinearity after each layer but the last.
     :param time_varying: One set of weights per step, or one for all.
-    :param activate_output: Whether the nonlinearity follows the last layer, too.
     """
 
     def __init__(
@@ -135,11 +131,10 @@ class TimeMLP(nn.Module):
         activation_fn: type[nn.Module] = nn.ELU,
         *,
         time_varying: bool = True,
-        activate_output: bool = False,
     ) -> None:
         super().__init__()
         self.time_varying = time_varying
-        self.mlp = BatchedMLP(horizon if time_varying else 1, sizes, activation_fn, activate_output)
+        self.mlp = BatchedMLP(horizon if time_varying else 1, sizes, activation_fn)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """All steps of all episodes: ``(T, N, I) -> (T, N, O)``."""

@@ -17,15 +17,14 @@ def plain_mlp(network, index):
         linear.weight.data = layer.weight[index].T.clone()
         linear.bias.data = layer.bias[index, 0].clone()
         layers.append(linear)
-        if i < len(network.layers) - 1 or network.activate_output:
+        if i < len(network.layers) - 1:
             layers.append(network.activation)
     return nn.Sequential(*layers)
 
 
-@pytest.mark.parametrize("activate_output", [False, True])
 @pytest.mark.parametrize("activation_fn", [nn.ELU, nn.Tanh])
-def test_a_batched_mlp_is_a_list_of_ordinary_ones(activation_fn, activate_output):
-    network = BatchedMLP(T, [4, 6, 6, 2], activation_fn, activate_output)
+def test_a_batched_mlp_is_a_list_of_ordinary_ones(activation_fn):
+    network = BatchedMLP(T, [4, 6, 6, 2], activation_fn)
     x = th.randn(T, N, 4)
     expected = th.stack([plain_mlp(network, t)(x[t]) for t in range(T)])
     th.testing.assert_close(network(x), expected)
