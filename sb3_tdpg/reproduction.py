@@ -41,8 +41,11 @@ GOALS: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = {
     "text": {"PG": (12.0, None, None), "TDPG": (20.0, 10.0, 1.10), "TDPG (log-det)": (20.0, 10.0, 1.10)},
 }
 
-# Seeds below 200 were seen while the blocks were tuned.
-FIRST_SEED = 200
+# Seeds below 300 were seen while the blocks were tuned.
+FIRST_SEED = 300
+
+# Trainings of a policy with a penalty, at most: the next one only if the last one did not meet the block's limits.
+MAX_ATTEMPTS = 3
 
 PAPER_INVERSE_BETAS = (25, 50, 75, 100)
 
@@ -56,7 +59,8 @@ def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
     """
-    return Run(method, "Lava-v0", METHODS[method] + ("-table" if reading == "table" else ""), seed, overrides)
+    block = METHODS[method] + ("-table" if reading == "table" else "")
+    return Run(method, "Lava-v0", block, seed, overrides, max_attempts=1 if method == "PG" else MAX_ATTEMPTS)
 
 
 def env_kwargs_of(reading: str) -> dict[str, Any]:
@@ -164,7 +168,17 @@ def reproduce_lava(
     for group in groups:
         records = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders[group]], ignore_index=True)
         records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
-        columns = ["model", "train_seed", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
+        columns = [
+            "model",
+            "train_seed",
+            "attempts",
+            "selected",
+            "scenario",
+            "episode",
+            "cost",
+            "seed",
+            "deterministic",
+        ]
         write_frame_atomically(records[columns].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
@@ -205,8 +219,8 @@ def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
     keys = ["model", "train_seed"]
     training = summary[summary["scenario"] == LAVA[0].name].set_index(keys)[["mean", "std"]]
     noisiest = summary[summary["scenario"] == LAVA[-1].name].set_index(keys)[["ratio"]]
-    selected = records.groupby(keys)["selected"].first()
-    return training.join(noisiest).join(selected).reset_index()
+    training_outcome = records.groupby(keys)[["attempts", "selected"]].first()
+    return training.join(noisiest).join(training_outcome).reset_index()
 
 
 def _section(group: str, records: pd.DataFrame, seeds: pd.DataFrame) -> str:
@@ -223,8 +237,7 @@ def _section(group: str, records: pd.DataFrame, seeds: pd.DataFrame) -> str:
     parts.append("\n".join(lines))
     parts.append(
         "Every seed (cost in training; std over episodes; ratio of the mean at sigma^2 = 1 to that in training; "
-        "selected: "
-        "an epoch met the limits):"
+        "attempts: trainings until one met the limits; selected: whether one did):"
     )
     parts.append(_markdown(seeds))
     return "\n\n".join(parts)

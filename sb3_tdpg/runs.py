@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing as mp
 import os
+import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -27,6 +28,8 @@ from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
 
 CHECKPOINT_EPOCHS = 50
+# Attempts must not share their seeds with other runs.
+SEEDS_BETWEEN_ATTEMPTS = 1000
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Run:
     :param block: Block of ``hyperparams/tdpg.yml``.
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
+    :param max_attempts: Trainings from scratch, each with a seed of its own, until one meets the limits of the block's
+        selection. The paper likewise chooses its policy from several trainings.
     """
 
     method: str
@@ -46,6 +51,7 @@ class Run:
     block: str
     seed: int
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    max_attempts: int = 1
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -61,7 +67,14 @@ class Run:
     @property
     def config(self) -> dict[str, Any]:
         """What makes this run."""
-        return dict(method=self.method, env_id=self.env_id, block=self.block, seed=self.seed, settings=self.settings)
+        return dict(
+            method=self.method,
+            env_id=self.env_id,
+            block=self.block,
+            seed=self.seed,
+            max_attempts=self.max_attempts,
+            settings=self.settings,
+        )
 
 
 def complete_run(
@@ -75,9 +88,11 @@ def complete_run(
     """
     Train and evaluate, or go on where an earlier call was interrupted, or do nothing if it was finished.
 
-    ``folder`` then holds ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information),
-    ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings, seeds, versions, commit) and,
-    written last, ``episodes.csv`` (a row for each evaluation episode).
+    ``folder`` then holds ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information;
+    missing if no epoch met the limits), ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings,
+    seeds, versions, commit) and,
+    written last, ``episodes.csv`` (a row for each evaluation episode). Attempts after the first have folders of their
+    own in it.
 
     :param run: What to train.
     :param folder: Where to.
@@ -95,19 +110,22 @@ def complete_run(
     if not (folder / "config.json").exists():
         write_run_config(folder / "config.json", config)
 
-    model, selected = _train(run, folder, progress_bar)
-    model.save(folder / "model.zip")
+    for attempt in range(run.max_attempts):
+        attempt_folder = folder / f"attempt{attempt}"
+        model, selected = _train(run, attempt, attempt_folder, progress_bar)
+        if selected:
+            break
     records = evaluate_scenarios(
         {run.method: model},
         scenarios,
         n_eval_episodes,
         env_kwargs=run.settings.get("env_kwargs"),
-        labels=dict(train_seed=run.seed, selected=selected),
+        labels=dict(train_seed=run.seed, attempts=attempt + 1, selected=selected),
         progress_bar=progress_bar,
     )
+    shutil.copytree(attempt_folder, folder, dirs_exist_ok=True)
     write_frame_atomically(records, folder / "episodes.csv")
-    (folder / "checkpoint.zip").unlink(missing_ok=True)
-    (folder / "selected.zip").unlink(missing_ok=True)
+    shutil.rmtree(attempt_folder)
     return folder
 
 
@@ -124,10 +142,16 @@ def _check_same_run(path: Path, config: Mapping[str, Any]) -> None:
         )
 
 
-def _train(run: Run, folder: Path, progress_bar: bool) -> tuple[TDPG, bool]:
-    """Return the selected policy, and whether any epoch met the limits (otherwise it is the last epoch's)."""
-    training = make_training(run.env_id, run.settings, seed=run.seed, device="cpu")
-    checkpoint = folder / "checkpoint.zip"
+def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TDPG, bool]:
+    """
+    Return the policy of one attempt, and whether any epoch met the limits (otherwise it is the last epoch's).
+
+    ``folder`` keeps what a later call goes on from, and in the end ``model.zip``, ``selected.json`` and the log.
+    """
+    selected_path, checkpoint, result = (folder / name for name in ("selected.zip", "checkpoint.zip", "model.zip"))
+    if result.exists():
+        return TDPG.load(result, device="cpu"), selected_path.with_suffix(".json").exists()
+    training = make_training(run.env_id, run.settings, seed=run.seed + SEEDS_BETWEEN_ATTEMPTS * attempt, device="cpu")
     n_timesteps, model = training.n_timesteps, training.model
     if checkpoint.exists():
         model = TDPG.load(checkpoint, env=model.env, device="cpu")
@@ -137,12 +161,16 @@ def _train(run: Run, folder: Path, progress_bar: bool) -> tuple[TDPG, bool]:
     callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, CHECKPOINT_EPOCHS)]
     selection = training.selection
     if selection is not None:
-        selection.save_path = folder / "selected.zip"
+        selection.save_path = selected_path
     model.learn(n_timesteps, callbacks, reset_num_timesteps=not checkpoint.exists(), progress_bar=progress_bar)
-    if selection is None or selection.best is None:
-        return model, False
-    selection.restore(model)
-    return model, True
+    model.logger.close()
+    selected = selection is not None and selection.best is not None
+    if selection is not None and selected:
+        selection.restore(model)
+    model.save(result)
+    checkpoint.unlink(missing_ok=True)
+    selected_path.unlink(missing_ok=True)
+    return model, selected
 
 
 def read_progress(folder: Path) -> pd.DataFrame:

