@@ -213,8 +213,9 @@ def complete_runs(
                 progress.set_postfix_str(futures[future].name, refresh=False)
                 progress.update()
         except BaseException:
+            workers = list(getattr(pool, "_processes", {}).values())  # shutdown() forgets them
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in list(getattr(pool, "_processes", {}).values()):
+            for process in workers:
                 process.terminate()
             progress.write("stopped; finished runs and checkpoints are kept, and the same command goes on from them")
             raise

@@ -147,7 +147,7 @@ class TDPG(OnPolicyAlgorithm):
             # What follows belongs to algorithms with a value network and is not used.
             ent_coef=0.0,
             vf_coef=0.0,
-            max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
             use_sde=False,
             sde_sample_freq=-1,
             stats_window_size=stats_window_size,
@@ -180,6 +180,7 @@ class TDPG(OnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         # Again: load() sets attributes without the constructor.
+        self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         check_arguments(
             self.policy_class,
             self.beta,

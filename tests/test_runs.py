@@ -1,7 +1,12 @@
 """From the command line to results in a folder, with tiny settings: train, evaluate, interrupt, go on."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -15,6 +20,7 @@ from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.reproduction import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
 from sb3_tdpg.runs import Run, complete_run, read_progress
 
+REPOSITORY = Path(__file__).resolve().parents[1]
 TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
 CHEAP = dict(n_timesteps=800, n_episodes=20, mi_kwargs=dict(gradient_steps=2, warmup_gradient_steps=2))
 
@@ -183,6 +189,20 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
     )
     found = seeds.query("group == 'text' and model == 'PG' and train_seed == 301")["mean"].item()
     assert found == pytest.approx(recomputed, abs=1e-4)
+
+
+def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
+    command = [sys.executable, "-m", "sb3_tdpg", "reproduce", "lava", "--out", str(tmp_path), "--jobs", "2"]
+    with subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)  # a training takes longer
+    assert process.returncode == 130
+    assert "the same command goes on" in error
+    assert "Traceback" not in error
+    assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
 
 
 @pytest.mark.slow

@@ -246,6 +246,14 @@ def test_tdpg_fits_its_critics_without_being_asked():
     assert model.information.shape == (5,)
 
 
+def test_clipping_can_be_turned_off_when_a_model_is_loaded(tmp_path):
+    model = tiny_tdpg(max_grad_norm=0.5)
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=lava_env(), max_grad_norm=None, device="cpu")
+    train_epochs(loaded, 1)
+    assert loaded.max_grad_norm == math.inf
+
+
 def test_a_policy_gradient_model_warm_starts_tdpg(tmp_path):
     model = tiny_tdpg(beta=math.inf, mi_estimator="mine")
     train_epochs(model, 1)
