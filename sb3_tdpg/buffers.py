@@ -33,6 +33,10 @@ class EpisodeBatch(NamedTuple):
         """x~_{t-1}, which is zero at t = 0: ``(T, N, Z)``."""
         return th.cat([th.zeros_like(self.trvs[:1]), self.trvs[:-1]])
 
+    def select(self, episodes: th.Tensor | slice) -> EpisodeBatch:
+        """Only some episodes, by their columns."""
+        return EpisodeBatch(*(x[:, episodes] for x in self))
+
     def information_batch(self) -> InformationBatch:
         """What the mutual-information estimators see, detached."""
         alive = None if bool(self.alive.all()) else self.alive.bool()

@@ -40,7 +40,7 @@ class MINECallback(_TDPGCallback):
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
-        if model.mi_coef == 0.0:
+        if model.mi_coef == 0.0 and model.auto_weight is None:
             model.information = None
             return
         batch = model.rollout_buffer.episode_batch().information_batch()

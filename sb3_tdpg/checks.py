@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_tdpg.baselines import get_baseline
+from sb3_tdpg.information import get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
 
 POLICY_NAMES = ("TRVPolicy",)
@@ -16,21 +18,60 @@ ENCODER_GRADIENTS = ("score", "pathwise")
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
-def check_arguments(
-    policy: Any,
-    beta: float | Schedule,
-    learning_rate: float | Schedule,
-    n_episodes: int,
-    encoder_gradient: str,
-    gamma: float,
-    gae_lambda: float,
-    max_grad_norm: float | None,
-) -> None:
+def check_arguments(settings: Mapping[str, Any]) -> None:
     """
     Check what can be checked without an environment.
 
-    :raises ValueError: for the first argument of :class:`~sb3_tdpg.tdpg.TDPG` that is out of its range.
+    :param settings: Arguments of :class:`~sb3_tdpg.tdpg.TDPG` by their names; others are left alone.
+    :raises ValueError: for the first that is out of its range.
     """
+    check_policy(settings["policy"])
+    check_beta_argument(settings["beta"], settings["cost_limit"])
+    for rate in _values(settings["learning_rate"]):
+        check_learning_rate(rate)
+    get_estimator_class(settings["mi_estimator"])
+    get_baseline(settings["baseline"])
+    n_episodes, batch_size = settings["n_episodes"], settings["batch_size"]
+    for name in ("n_episodes", "n_epochs", "batch_size"):
+        check_count(name, settings[name])
+    if n_episodes < 2:
+        raise ValueError(f"n_episodes={n_episodes} must be at least 2: baseline and information are taken over a batch")
+    if not 2 <= batch_size <= n_episodes:
+        raise ValueError(
+            f"batch_size={batch_size} must be between 2 and n_episodes={n_episodes}: it is a number of episodes, since "
+            "the memory of an episode cannot be cut"
+        )
+    for clip_range in _values(settings["clip_range"]):
+        if not (isinstance(clip_range, (int, float, np.number)) and clip_range > 0):
+            raise ValueError(
+                f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
+                "returns one; float('inf') turns the clipping off"
+            )
+    if settings["n_epochs"] > 1 and not callable(settings["clip_range"]) and math.isinf(settings["clip_range"]):
+        raise ValueError(
+            f"n_epochs={settings['n_epochs']} passes over the same rollouts need a limit to how far the policy may go: "
+            "give clip_range=0.2, as PPO has, or n_epochs=1"
+        )
+    encoder_gradient = settings["encoder_gradient"]
+    if encoder_gradient not in ENCODER_GRADIENTS:
+        raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
+    if not 0.0 < settings["gamma"] <= 1.0:
+        raise ValueError(f"gamma={settings['gamma']} must be in (0, 1]; the paper's problems have gamma=1")
+    if not 0.0 <= settings["gae_lambda"] <= 1.0:
+        raise ValueError(f"gae_lambda={settings['gae_lambda']} must be in [0, 1]; 1 leaves the gradient unbiased")
+    if not settings["max_grad_norm"] > 0:
+        raise ValueError(f"max_grad_norm={settings['max_grad_norm']} must be positive, or None for no clipping")
+
+
+def _values(number_or_schedule: Any) -> list[Any]:
+    """Return a number, or what a schedule gives at the beginning and at the end."""
+    if callable(number_or_schedule):
+        return [number_or_schedule(1.0), number_or_schedule(0.0)]
+    return [number_or_schedule]
+
+
+def check_policy(policy: Any) -> None:
+    """Raise a ``ValueError`` unless the policy is TDPG's."""
     if isinstance(policy, str) and policy not in POLICY_NAMES:
         raise ValueError(f"policy={policy!r} is unknown: use one of {list(POLICY_NAMES)}")
     if not isinstance(policy, str) and not (isinstance(policy, type) and issubclass(policy, TRVPolicy)):
@@ -38,20 +79,25 @@ def check_arguments(
             f"policy={policy!r} is neither 'TRVPolicy' nor a subclass of TRVPolicy; if it comes from a file, that was "
             "saved by another algorithm: load it with the class that saved it"
         )
-    for progress in (1.0, 0.0):
-        check_beta(beta(progress) if callable(beta) else beta)
-        check_learning_rate(learning_rate(progress) if callable(learning_rate) else learning_rate)
-    check_count("n_episodes", n_episodes)
-    if n_episodes < 2:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 2: baseline and information are taken over a batch")
-    if encoder_gradient not in ENCODER_GRADIENTS:
-        raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
-    if not 0.0 < gamma <= 1.0:
-        raise ValueError(f"gamma={gamma} must be in (0, 1]; the paper's problems have gamma=1")
-    if not 0.0 <= gae_lambda <= 1.0:
-        raise ValueError(f"gae_lambda={gae_lambda} must be in [0, 1]; 1 leaves the gradient unbiased")
-    if max_grad_norm is not None and not max_grad_norm > 0:
-        raise ValueError(f"max_grad_norm={max_grad_norm} must be positive, or None for no clipping")
+
+
+def check_beta_argument(beta: Any, cost_limit: Any) -> None:
+    """Raise a ``ValueError`` unless beta is a positive number, a schedule of such, or "auto" with a fitting limit."""
+    if beta != "auto":
+        for value in _values(beta):
+            check_beta(value)
+        if cost_limit is not None:
+            raise ValueError(
+                f"cost_limit={cost_limit} is for beta='auto', which finds the weight that keeps it, but beta={beta!r} "
+                "is given: leave one of them out (to select an epoch under a limit, use SelectionCallback)"
+            )
+        return
+    if cost_limit is not None and not (
+        isinstance(cost_limit, (int, float, np.number)) and math.isfinite(cost_limit) and cost_limit != 0
+    ):
+        raise ValueError(
+            f"cost_limit={cost_limit!r} must be a finite number other than 0 (the weight moves in its parts)"
+        )
 
 
 def check_count(name: str, value: Any) -> None:
@@ -65,7 +111,8 @@ def check_beta(beta: float) -> float:
     if not (isinstance(beta, (int, float, np.number)) and beta > 0):  # NaN compares false
         raise ValueError(
             f"beta={beta!r} must be a positive number (or a function of the remaining progress that returns one): the "
-            "weight of the cost against the information. float('inf') gives plain policy gradient"
+            "weight of the cost against the information. float('inf') gives plain policy gradient, 'auto' the weight "
+            "at which the expected cost is cost_limit"
         )
     return float(beta)
 

@@ -26,12 +26,13 @@ class TRVCnn(BaseFeaturesExtractor):
         layers: list[nn.Module] = []
         channels = observation_space.shape[0]
         for kernel_size in kernel_sizes:
-            layers += [nn.Conv2d(channels, n_channels, kernel_size, stride=2), nn.ELU()]
+            layers += [nn.Conv2d(channels, n_channels, kernel_size, stride=2), nn.ELU(inplace=True)]
             channels = n_channels
-        self.cnn = nn.Sequential(*layers, nn.Flatten())
+        # With so few channels the convolutions are faster with the channels innermost in memory.
+        self.cnn = nn.Sequential(*layers, nn.Flatten()).to(memory_format=th.channels_last)  # type: ignore[call-overload]
         with th.no_grad():
             self._features_dim = self.cnn(th.zeros(1, *observation_space.shape)).shape[1]
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """``(N, C, H, W) -> (N, features_dim)``."""
-        return self.cnn(observations)
+        return self.cnn(observations.contiguous(memory_format=th.channels_last))

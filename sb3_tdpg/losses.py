@@ -26,6 +26,46 @@ def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.T
     return (alive * advantages.detach() * log_prob).sum(dim=0).mean()
 
 
+def clipped_policy_loss(
+    log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor, clip_range: float
+) -> th.Tensor:
+    """
+    PPO's surrogate (Schulman et al., 2017) for costs: the larger of the plain and of the clipped one.
+
+    At ``log_prob == old_log_prob`` its gradient is that of :func:`policy_gradient_loss`. It may be descended several
+    times on the same rollouts: a sample whose ratio has left ``[1 - clip_range, 1 + clip_range]`` in the direction of
+    its advantage has no gradient any more.
+
+    :param log_prob: of the policy that is being trained, ``(T, N)``
+    :param old_log_prob: of the policy that made the rollouts, ``(T, N)``
+    :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
+    :param alive: ``(T, N)``
+    :param clip_range: How far the ratio of the probabilities may go from 1.
+    :return: scalar
+    """
+    shapes = {log_prob.shape, old_log_prob.shape, advantages.shape, alive.shape}
+    assert len(shapes) == 1, shapes
+    ratio = th.exp(log_prob - old_log_prob.detach())
+    clipped = ratio.clamp(1.0 - clip_range, 1.0 + clip_range)
+    cost = advantages.detach()
+    return (alive * th.maximum(cost * ratio, cost * clipped)).sum(dim=0).mean()
+
+
+def normalized(advantages: th.Tensor, alive: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Bring advantages to mean 0 and variance 1 over all steps of living episodes.
+
+    :param advantages: ``(T, N)``
+    :param alive: ``(T, N)``
+    :return: the advantages ``(T, N)``, and the standard deviation that they were divided by: what is added to their
+        loss must be divided by it, too, if its weight is to stay the same
+    """
+    n = alive.sum()
+    mean = (alive * advantages).sum() / n
+    std = ((alive * (advantages - mean) ** 2).sum() / n).sqrt() + 1e-8
+    return (advantages - mean) / std, std
+
+
 def information_loss(information: th.Tensor) -> th.Tensor:
     """
     The penalty of eq:robust pomdp: the sum over time of I[x_t; x~_t], none below zero.

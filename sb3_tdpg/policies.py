@@ -66,13 +66,14 @@ class TRVPolicy(BasePolicy):
     :param trv_dim: Number of TRVs Z; default 2 for vectors and 8 for images, as in the paper.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default ``[64, 64]`` each for vectors,
         ``[32]`` and none for images.
-    :param activation_fn: Nonlinearity of the hidden layers.
+    :param activation_fn: Nonlinearity of the hidden layers; default: ELU for vectors, tanh for images, as in the paper.
     :param time_varying: One set of weights for each time step, or one for all; default: time-varying up to a horizon of
         50. A convolutional feature extractor is always shared.
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images:
         then no observation, however unlike those in training, drives the TRVs to where the action head has never been.
-    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it.
-    :param action_log_var_init: The same for the action head (Box actions).
+    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it; default:
+        0 for vectors, -3 for images.
+    :param action_log_var_init: The same for the action head (Box actions); default: 0 for vectors, -1 for images.
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded.
     :param action_var_floor: Smallest variance of an action, likewise.
     :param features_extractor_class: What stands in front of the encoder; default: nothing (flatten) for vectors, the
@@ -94,11 +95,11 @@ class TRVPolicy(BasePolicy):
         horizon: int,
         trv_dim: int | None = None,
         net_arch: dict[str, Sequence[int]] | None = None,
-        activation_fn: type[nn.Module] = nn.ELU,
+        activation_fn: type[nn.Module] | None = None,
         time_varying: bool | None = None,
         squash_trv_mean: bool = True,
-        encoder_log_var_init: float = 0.0,
-        action_log_var_init: float = 0.0,
+        encoder_log_var_init: float | None = None,
+        action_log_var_init: float | None = None,
         encoder_var_floor: float = 1e-3,
         action_var_floor: float = 1e-5,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
@@ -124,9 +125,10 @@ class TRVPolicy(BasePolicy):
         self.trv_dim = (8 if is_image else 2) if trv_dim is None else trv_dim
         self.time_varying = horizon <= MAX_TIME_VARYING_HORIZON if time_varying is None else time_varying
         self.squash_trv_mean = squash_trv_mean
-        self.activation_fn = activation_fn
-        self.encoder_log_var_init = encoder_log_var_init
-        self.action_log_var_init = action_log_var_init
+        self.activation_fn = (nn.Tanh if is_image else nn.ELU) if activation_fn is None else activation_fn
+        # What an image shows gets lost in the noise of wide TRVs: with them training takes twice as long.
+        self.encoder_log_var_init = _default(encoder_log_var_init, -3.0 if is_image else 0.0)
+        self.action_log_var_init = _default(action_log_var_init, -1.0 if is_image else 0.0)
         self.encoder_var_floor = encoder_var_floor
         self.action_var_floor = action_var_floor
         default_arch = dict(encoder=[32], action_head=[]) if is_image else dict(encoder=[64, 64], action_head=[64, 64])
@@ -144,13 +146,13 @@ class TRVPolicy(BasePolicy):
         self.encoder = TimeMLP(
             horizon,
             [self.trv_dim + self.features_dim, *self.net_arch["encoder"], 2 * self.trv_dim],
-            activation_fn,
+            self.activation_fn,
             time_varying=self.time_varying,
         )
         self.action_head = TimeMLP(
             horizon,
             [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()],
-            activation_fn,
+            self.activation_fn,
             time_varying=self.time_varying,
         )
         self.optimizer = self.optimizer_class(
@@ -242,7 +244,10 @@ class TRVPolicy(BasePolicy):
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Features of every observation: ``(T, N, F)``."""
-        features = self.extract_features(batch.observations.flatten(0, 1), self.features_extractor)
+        observations = batch.observations.flatten(0, 1)
+        if observations.dim() == 4:  # the layout that the CNN computes in, while the pixels are still bytes
+            observations = observations.contiguous(memory_format=th.channels_last)
+        features = self.extract_features(observations, self.features_extractor)
         return features.unflatten(0, batch.observations.shape[:2])
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
@@ -278,8 +283,9 @@ class TRVPolicy(BasePolicy):
         """
         trv = th.zeros_like(noise[0])
         trvs, means, stds = [], [], []
-        for t in range(self.horizon):
-            mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features[t]], dim=-1), t))
+        # Not features[t]: the gradient of each would be as large as all features.
+        for t, features_t in enumerate(features.unbind()):
+            mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features_t], dim=-1), t))
             trv = mean + std * noise[t]
             trvs.append(trv)
             means.append(mean)
@@ -345,6 +351,10 @@ class TRVPolicy(BasePolicy):
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
         return (actions if is_vectorized else actions[0]), (step.trvs.cpu().numpy(), t + 1)
+
+
+def _default(value: float | None, default: float) -> float:
+    return default if value is None else value
 
 
 def _variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:

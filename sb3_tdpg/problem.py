@@ -89,6 +89,12 @@ def read_problem(env: VecEnv) -> Problem:
     return Problem(int(horizon), max(1, int(np.prod(observation_shape))), state_is_observation=True)
 
 
+def reward_threshold(env: VecEnv) -> float | None:
+    """Return the return at which the environment counts as solved, if it was registered with one."""
+    spec = _attribute(env, "spec")
+    return None if spec is None else spec.reward_threshold
+
+
 def _attribute(env: VecEnv, name: str) -> Any:
     """Return an attribute of the first environment, or None."""
     return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None

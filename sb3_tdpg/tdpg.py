@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -20,25 +20,23 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.baselines import get_baseline
-from sb3_tdpg.buffers import EpisodeBuffer
+from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.checks import check_action_space, check_arguments, check_beta, check_count, nearest_multiples
+from sb3_tdpg.defaults import defaults_for, fill_in
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
-from sb3_tdpg.losses import information_loss, policy_gradient_loss
-from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import Problem, read_problem
+from sb3_tdpg.losses import clipped_policy_loss, information_loss, normalized, policy_gradient_loss
+from sb3_tdpg.policies import RebuiltTRVs, TRVPolicy
+from sb3_tdpg.problem import Problem, read_problem, reward_threshold
 from sb3_tdpg.random_state import RandomState
 from sb3_tdpg.vec_env import make_episodes_env
 
 SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
-
-
-# One update an epoch and a noisy gradient: what the last epochs gain, they gain from a falling rate.
-DEFAULT_LEARNING_RATE = LinearSchedule(2e-3, 2e-5, 1.0)
 
 
 class TrainingDivergedError(ValueError):
@@ -55,8 +53,8 @@ class TDPG(OnPolicyAlgorithm):
     .. math:: E[c(\tau)] + \frac1\beta \sum_t I[x_t; \tilde x_t]
 
     One policy epoch rolls out ``n_episodes`` episodes, fits the mutual-information critics to them
-    (:class:`~sb3_tdpg.callbacks.MINECallback`), and makes one update of the policy. ``beta=inf`` is plain policy
-    gradient with the same policy.
+    (:class:`~sb3_tdpg.callbacks.MINECallback`), and updates the policy: once, as in the paper, or with several clipped
+    passes, as PPO does. ``beta=inf`` is plain policy gradient with the same policy.
 
     The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). The true
     state comes from ``info["state"]`` of ``reset`` and ``step`` together with an attribute ``state_space``; an
@@ -64,21 +62,34 @@ class TDPG(OnPolicyAlgorithm):
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.policies.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
+    Where "default" names two values, the first is for vector observations and the second for images
+    (:mod:`sb3_tdpg.defaults`).
+
     :param beta: Weight of the cost against the information, a positive number or a function of the remaining progress
-        (1 to 0). ``inf``: no penalty.
-    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress; default: from
-        2e-3 linearly to 2e-5. The critics have their own (``mi_kwargs``).
-    :param n_episodes: Episodes N of a policy epoch.
+        (1 to 0). ``inf``: no penalty. ``"auto"``: the information is minimised as far as the expected cost stays below
+        ``cost_limit`` (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: 1/75 and ``"auto"``; ``"auto"`` wherever a
+        ``cost_limit`` is given.
+    :param cost_limit: The limit for ``beta="auto"``; default: minus the ``reward_threshold`` with which the environment
+        is registered.
+    :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress; default:
+        linearly from 2e-3 to 2e-5, and from 1e-3 to 5e-5. The critics have their own (``mi_kwargs``).
+    :param n_episodes: Episodes N of a policy epoch; default: 500 and 160.
     :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this
         plugin, otherwise the largest divisor of N up to 50.
     :param mi_estimator: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, ``"logdet"``, ``"loo"`` or a subclass of
-        :class:`~sb3_tdpg.information.InformationEstimator`.
+        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"`` and ``"logdet"``.
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step;
         ``"mean"``: cost of the whole episode minus the mean over the batch, as in the paper.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (eq:grad phi), as in the paper;
         ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the
-        second varies less.
+        second varies less. Default: ``"score"`` and ``"pathwise"``.
+    :param n_epochs: Passes over the rollouts of a policy epoch, as in SB3's PPO; default: 1 and 4.
+    :param batch_size: Minibatch size, in *episodes*: the memory of an episode cannot be cut. Default: all and 80.
+    :param clip_range: PPO's limit to the ratio of probabilities, a number or a function of the remaining progress;
+        ``inf``: none. Default: ``inf`` and 0.2.
+    :param normalize_advantage: Whether to bring the advantages to mean 0 and variance 1; the penalty is divided by the
+        same number, so that ``beta`` keeps its meaning. Default: no and yes.
     :param gamma: Discount factor; the paper has none.
     :param gae_lambda: Bias against variance of the advantages with ``baseline="value"``: 1 uses the costs as they
         were, 0 the regression at the next state in their place, which is less noisy and blind to the policy's memory.
@@ -104,14 +115,19 @@ class TDPG(OnPolicyAlgorithm):
         policy: str | type[TRVPolicy] = "TRVPolicy",
         env: GymEnv | str | None = None,
         *,
-        beta: float | Schedule = 1 / 75,
-        learning_rate: float | Schedule = DEFAULT_LEARNING_RATE,
-        n_episodes: int = 500,
+        beta: float | Schedule | str | None = None,
+        cost_limit: float | None = None,
+        learning_rate: float | Schedule | None = None,
+        n_episodes: int | None = None,
         n_envs: int | None = None,
-        mi_estimator: str | type[InformationEstimator] = "mine",
+        mi_estimator: str | type[InformationEstimator] | None = None,
         mi_kwargs: dict[str, Any] | None = None,
         baseline: str = "value",
-        encoder_gradient: str = "score",
+        encoder_gradient: str | None = None,
+        n_epochs: int | None = None,
+        batch_size: int | None = None,
+        clip_range: float | Schedule | None = None,
+        normalize_advantage: bool | None = None,
         gamma: float = 1.0,
         gae_lambda: float = 0.95,
         max_grad_norm: float | None = None,
@@ -123,11 +139,9 @@ class TDPG(OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        check_arguments(policy, beta, learning_rate, n_episodes, encoder_gradient, gamma, gae_lambda, max_grad_norm)
-        get_estimator_class(mi_estimator)
-        get_baseline(baseline)
-        if n_envs is not None:
-            check_count("n_envs", n_envs)
+        for name, count in (("n_episodes", n_episodes), ("n_envs", n_envs)):
+            if count is not None:
+                check_count(name, count)
         if isinstance(env, str):
             env = make_episodes_env(env, n_envs, n_episodes=n_episodes)
         elif n_envs is not None and getattr(env, "num_envs", 1) != n_envs:
@@ -137,17 +151,38 @@ class TDPG(OnPolicyAlgorithm):
             )
         if env is not None:
             check_action_space(env.action_space)
+        given = dict(
+            beta="auto" if beta is None and cost_limit is not None else beta,
+            learning_rate=learning_rate,
+            n_episodes=n_episodes,
+            mi_estimator=mi_estimator,
+            encoder_gradient=encoder_gradient,
+            n_epochs=n_epochs,
+            batch_size=batch_size,
+            clip_range=clip_range,
+            normalize_advantage=normalize_advantage,
+        )
+        settings = fill_in(given, None if env is None else env.observation_space)
+        settings.update(
+            policy=policy,
+            cost_limit=cost_limit,
+            baseline=baseline,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
+        )
+        check_arguments(settings)
         super().__init__(
             policy=policy,  # type: ignore[arg-type]
             env=env,  # type: ignore[arg-type]
-            learning_rate=learning_rate,
+            learning_rate=settings["learning_rate"],
             n_steps=0,  # known once the horizon is
             gamma=gamma,
             gae_lambda=gae_lambda,
             # What follows belongs to algorithms with a value network and is not used.
             ent_coef=0.0,
             vf_coef=0.0,
-            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            max_grad_norm=settings["max_grad_norm"],
             use_sde=False,
             sde_sample_freq=-1,
             stats_window_size=stats_window_size,
@@ -158,12 +193,20 @@ class TDPG(OnPolicyAlgorithm):
             device=device,
             _init_setup_model=False,
         )
-        self.beta = beta
-        self.n_episodes = n_episodes
-        self.mi_estimator = mi_estimator
+        self.beta: float | Schedule | str = settings["beta"]
+        self.cost_limit = cost_limit
+        self.n_episodes: int = settings["n_episodes"]
+        self.mi_estimator: str | type[InformationEstimator] = settings["mi_estimator"]
         self.mi_kwargs = {} if mi_kwargs is None else mi_kwargs
         self.baseline = baseline
-        self.encoder_gradient = encoder_gradient
+        self.encoder_gradient: str = settings["encoder_gradient"]
+        self.n_epochs: int = settings["n_epochs"]
+        self.batch_size: int = settings["batch_size"]
+        self.clip_range: float | Schedule = settings["clip_range"]
+        self.normalize_advantage: bool = settings["normalize_advantage"]
+        self.mi_perturbation = None
+        self.auto_weight: AutoWeight | None = None
+        """The weight of the information with ``beta="auto"``."""
         # Plain numbers, so that a model loaded without an environment can rebuild its networks.
         self.horizon = 0
         self.state_dim = 0
@@ -181,23 +224,17 @@ class TDPG(OnPolicyAlgorithm):
     def _setup_model(self) -> None:
         # Again: load() sets attributes without the constructor.
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
-        check_arguments(
-            self.policy_class,
-            self.beta,
-            self.learning_rate,
-            self.n_episodes,
-            self.encoder_gradient,
-            self.gamma,
-            self.gae_lambda,
-            self.max_grad_norm,
-        )
+        if self.beta != "auto":
+            self.cost_limit = None  # that of the file, if beta was given to load()
+        check_arguments({**vars(self), "policy": self.policy_class})
         self._setup_lr_schedule()
-        self.beta_schedule = FloatSchedule(self.beta)
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._set_problem(self._read_problem(self.env), self.env)
         elif self.horizon == 0:
             raise ValueError("TDPG needs an environment to learn the horizon and the spaces from: pass env=...")
+        self._setup_beta()
+        self.clip_range_schedule = FloatSchedule(self.clip_range)
         try:
             policy = self.policy_class(
                 self.observation_space, self.action_space, self.lr_schedule, horizon=self.horizon, **self.policy_kwargs
@@ -226,6 +263,24 @@ class TDPG(OnPolicyAlgorithm):
             state_dim=self.state_dim,
             trv_dim=self.policy.trv_dim,
         )
+
+    def _setup_beta(self) -> None:
+        """Make the schedule of beta, or the weight that follows the cost limit."""
+        if self.beta != "auto":
+            self.auto_weight = None
+            self.beta_schedule = FloatSchedule(cast("float | Schedule", self.beta))
+            return
+        if self.cost_limit is None:
+            threshold = None if self.env is None else reward_threshold(self.env)
+            if threshold is None:
+                raise ValueError(
+                    "beta='auto' minimises the information under a limit on the expected cost, and the environment has "
+                    "none (a reward_threshold in its registration): give cost_limit=..., or beta=1/75, say, or "
+                    "beta=float('inf') for plain policy gradient"
+                )
+            self.cost_limit = -threshold
+        if self.auto_weight is None or self.auto_weight.cost_limit != self.cost_limit:
+            self.auto_weight = AutoWeight(self.cost_limit)
 
     def _read_problem(self, env: VecEnv) -> Problem:
         """Learn horizon and state from the environment, or say why it cannot be used."""
@@ -262,6 +317,8 @@ class TDPG(OnPolicyAlgorithm):
     @property
     def mi_coef(self) -> float:
         """1 / beta at the present progress: the weight of the information, in units of cost per nat."""
+        if self.auto_weight is not None:
+            return self.auto_weight.value
         return 1.0 / check_beta(self.beta_schedule(self._current_progress_remaining))
 
     # -- one policy epoch -------------------------------------------------------------------------------------
@@ -353,41 +410,84 @@ class TDPG(OnPolicyAlgorithm):
         super().dump_logs(iteration)
 
     def train(self) -> None:
-        """Update encoder and action head once (line 6 of alg:trv-policy)."""
+        """Update encoder and action head (line 6 of alg:trv-policy)."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
+        if self.auto_weight is not None:
+            assert self.information is not None
+            self.auto_weight.update(float(self.rollout_buffer.episode_costs.mean()), float(self.information.sum()))
         mi_coef = self.mi_coef
         batch = self.rollout_buffer.episode_batch()
         advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
+        cost_scale = th.ones(())
+        if self.normalize_advantage:
+            advantages, cost_scale = normalized(advantages, batch.alive)
 
-        features = self.policy.episode_features(batch)
-        rebuilt = None
-        if mi_coef > 0.0 or self.encoder_gradient == "pathwise":
-            rebuilt = self.policy.rebuild_trvs(features, batch.noise)
-        if self.encoder_gradient == "pathwise":
-            assert rebuilt is not None
-            log_prob = self.policy.action_log_prob(rebuilt.trvs, batch)
-        else:
-            log_prob = self.policy.trv_log_prob(features, batch) + self.policy.action_log_prob(batch.trvs, batch)
-        policy_loss = policy_gradient_loss(log_prob, advantages, batch.alive)
-        loss = policy_loss
-        if mi_coef > 0.0:
-            information = self.estimator(batch.information_batch()._replace(**rebuilt._asdict()))  # type: ignore[union-attr]
-            penalty = mi_coef * information_loss(information)
-            loss = loss + penalty
-            self.logger.record("train/mi_loss", penalty.item())
-
-        self._step_optimizer(loss, {"costs": batch.costs, "policy loss": policy_loss, "loss": loss})
+        old_log_prob = None
+        clip_range = self.clip_range_schedule(self._current_progress_remaining)
+        if clip_range < math.inf:
+            with th.no_grad():
+                old_log_prob = self._log_prob(batch)[0]
+        for _ in range(self.n_epochs):
+            for episodes in self._minibatches():
+                part = batch.select(episodes)
+                log_prob, rebuilt = self._log_prob(part, rebuild=mi_coef > 0.0)
+                if old_log_prob is None:
+                    policy_loss = policy_gradient_loss(log_prob, advantages[:, episodes], part.alive)
+                else:
+                    policy_loss = clipped_policy_loss(
+                        log_prob, old_log_prob[:, episodes], advantages[:, episodes], part.alive, clip_range
+                    )
+                loss = policy_loss
+                if mi_coef > 0.0:
+                    if self.mi_perturbation is not None:
+                        perturbed = part._replace(observations=self.mi_perturbation(part.observations))
+                        rebuilt = self.policy.rebuild_trvs(self.policy.episode_features(perturbed), part.noise)
+                    assert rebuilt is not None
+                    information = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
+                    penalty = mi_coef * information_loss(information)
+                    loss = loss + penalty / cost_scale
+                    self.logger.record_mean("train/mi_loss", penalty.item())
+                self._step_optimizer(loss, {"costs": batch.costs, "policy loss": policy_loss, "loss": loss})
+                self.logger.record_mean("train/policy_loss", policy_loss.item())
+                self.logger.record_mean("train/loss", loss.item())
+                if old_log_prob is not None:
+                    self._record_distance(log_prob.detach() - old_log_prob[:, episodes], part.alive, clip_range)
         self.epoch += 1
-        self._n_updates += 1
+        self._n_updates += self.n_epochs
         mean_cost = batch.costs.sum(0).mean().item()
         total = 0.0 if self.information is None else float(self.information.sum())
         self.logger.record("train/objective", mean_cost + mi_coef * total)
-        self.logger.record("train/policy_loss", policy_loss.item())
-        self.logger.record("train/loss", loss.item())
         self.logger.record("train/mi_coef", mi_coef)
         self.logger.record("train/trv_std", batch.stds.mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _log_prob(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
+        """
+        Log-probability of what was sampled, ``(T, N)``, as the chosen gradient of the encoder takes it.
+
+        :param rebuild: Return the TRVs rebuilt from the noise also where the gradient does not need them.
+        """
+        features = self.policy.episode_features(batch)
+        if self.encoder_gradient == "pathwise":
+            rebuilt = self.policy.rebuild_trvs(features, batch.noise)
+            return self.policy.action_log_prob(rebuilt.trvs, batch), rebuilt
+        log_prob = self.policy.trv_log_prob(features, batch) + self.policy.action_log_prob(batch.trvs, batch)
+        return log_prob, self.policy.rebuild_trvs(features, batch.noise) if rebuild else None
+
+    def _minibatches(self) -> Sequence[th.Tensor | slice]:
+        """Columns of the episodes of each minibatch: a random partition, or one batch of all."""
+        if self.batch_size == self.n_episodes:
+            return [slice(None)]
+        return th.randperm(self.n_episodes, device=self.device).split(self.batch_size)
+
+    def _record_distance(self, log_ratio: th.Tensor, alive: th.Tensor, clip_range: float) -> None:
+        """Log how far the policy has moved from that of the rollouts, as SB3's PPO does."""
+        n = alive.sum()
+        kl = (alive * (th.exp(log_ratio) - 1.0 - log_ratio)).sum() / n  # http://joschu.net/blog/kl-approx.html
+        clipped = (alive * ((th.exp(log_ratio) - 1.0).abs() > clip_range)).sum() / n
+        self.logger.record_mean("train/approx_kl", kl.item())
+        self.logger.record_mean("train/clip_fraction", clipped.item())
 
     def _step_optimizer(self, loss: th.Tensor, checked: dict[str, th.Tensor]) -> None:
         """Make one step, unless something is not finite: then the parameters stay as they are."""
@@ -399,7 +499,7 @@ class TDPG(OnPolicyAlgorithm):
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not bool(th.isfinite(grad_norm)):
             raise self._diverged("gradient")
-        self.logger.record("train/grad_norm", grad_norm.item())
+        self.logger.record_mean("train/grad_norm", grad_norm.item())
         self.policy.optimizer.step()
 
     def _diverged(self, name: str) -> TrainingDivergedError:
@@ -415,7 +515,7 @@ class TDPG(OnPolicyAlgorithm):
 
     def learn(
         self: SelfTDPG,
-        total_timesteps: int = 1_000_000,
+        total_timesteps: int | None = None,
         callback: MaybeCallback = None,
         log_interval: int = 1,
         tb_log_name: str = "TDPG",
@@ -428,8 +528,12 @@ class TDPG(OnPolicyAlgorithm):
         Interrupted by Ctrl-C, the model keeps the parameters of the last whole epoch and can be used, saved or
         trained on.
 
+        :param total_timesteps: Environment steps; default: 400 policy epochs for vectors (a million steps of the lava
+            problem), 50 for images.
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
+        if total_timesteps is None:
+            total_timesteps = defaults_for(self.observation_space).total_epochs * self.n_episodes * self.horizon
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

@@ -6,6 +6,7 @@ Dimension key: N environments side by side, X state, U action.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -19,6 +20,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_tdpg.defaults import defaults_for
 from sb3_tdpg.envs.base import POMDPEnv
 
 
@@ -130,7 +132,7 @@ def make_episodes_env(
     env_id: str,
     n_envs: int | None = None,
     *,
-    n_episodes: int = 500,
+    n_episodes: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     seed: int | None = None,
 ) -> VecEnv:
@@ -140,7 +142,7 @@ def make_episodes_env(
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, otherwise its largest
         divisor up to 50.
-    :param n_episodes: Episodes that are to be run at a time.
+    :param n_episodes: Episodes that are to be run at a time; default: as many as TDPG runs in an epoch by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
     :return: a :class:`BatchedVecEnv` for an environment of this plugin, SB3's ``DummyVecEnv`` for any other
@@ -155,8 +157,13 @@ def make_episodes_env(
     if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
         env = cast(POMDPEnv, creator(**{**spec.kwargs, **env_kwargs}))
         env.spec = spec
-        vec_env: VecEnv = BatchedVecEnv(env, n_envs or n_episodes)
+        n_envs = n_envs or n_episodes or defaults_for(env.observation_space).n_episodes
+        vec_env: VecEnv = BatchedVecEnv(env, n_envs)
         vec_env.seed(seed)
         return vec_env
-    n_envs = n_envs or max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
+    if n_envs is None:
+        if n_episodes is None:
+            with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
+                n_episodes = defaults_for(probe.observation_space).n_episodes
+        n_envs = max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)

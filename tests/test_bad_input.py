@@ -34,7 +34,23 @@ ARGUMENTS = {
     "beta negative": (dict(beta=-1.0), "beta=-1.0", "positive number"),
     "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
     "beta a string": (dict(beta="0.1"), "beta='0.1'", "positive number"),
-    "beta None": (dict(beta=None), "beta=None", "positive number"),
+    "beta auto without a limit": (dict(beta="auto"), "beta='auto'", "cost_limit=", "reward_threshold", "inf"),
+    "image without beta or limit": (
+        dict(env=toy_vec_env(observation_space=IMAGE)), "beta='auto'", "cost_limit=", "reward_threshold"
+    ),
+    "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
+    "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
+    "cost_limit beside a number for beta": (
+        dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"
+    ),
+    "n_epochs zero": (dict(n_epochs=0), "n_epochs=0", "integer of at least 1"),
+    "batch_size above n_episodes": (dict(batch_size=21), "batch_size=21", "n_episodes=20", "episodes"),
+    "batch_size one": (dict(batch_size=1), "batch_size=1", "between 2 and"),
+    "batch_size in steps": (dict(batch_size=2000), "batch_size=2000", "number of episodes"),
+    "clip_range zero": (dict(clip_range=0.0), "clip_range=0.0", "positive", "inf"),
+    "clip_range NaN": (dict(clip_range=math.nan), "clip_range=nan", "positive"),
+    "clip_range a schedule that ends at zero": (dict(clip_range=lambda progress: progress), "clip_range=0.0"),
+    "passes without clipping": (dict(n_epochs=3), "n_epochs=3", "clip_range=0.2"),
     "beta a schedule that ends at zero": (dict(beta=lambda progress: progress), "beta=0.0", "positive number"),
     "beta a schedule that returns a string": (dict(beta=lambda progress: "1"), "beta='1'", "positive number"),
     "unknown estimator": (

@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_tdpg.losses import cost_to_go, information_loss, policy_gradient_loss
+from sb3_tdpg.losses import clipped_policy_loss, cost_to_go, information_loss, normalized, policy_gradient_loss
 
 
 def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes():
@@ -51,3 +51,40 @@ def test_the_cost_to_go_sums_from_each_step_to_the_end_with_the_discount():
     costs = th.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
     assert cost_to_go(costs).tolist() == [[7, 70], [6, 60], [4, 40]]
     assert cost_to_go(costs, 0.5).tolist() == [[3, 30], [4, 40], [4, 40]]
+
+
+def test_the_clipped_loss_begins_with_the_policy_gradient():
+    th.manual_seed(0)
+    old, advantages, alive = th.randn(3, 4), th.randn(3, 4), (th.rand(3, 4) < 0.7).float()
+    gradients = []
+    for loss in (policy_gradient_loss, lambda log_prob, *rest: clipped_policy_loss(log_prob, old, *rest, 0.2)):
+        log_prob = old.clone().requires_grad_()
+        loss(log_prob, advantages, alive).backward()
+        gradients.append(log_prob.grad)
+    th.testing.assert_close(gradients[0], gradients[1])
+
+
+@pytest.mark.parametrize(("ratio", "advantage", "moves"), [
+    (1.5, 1.0, True),  # too likely and too dear: makes it less likely
+    (0.5, 1.0, False),  # too dear, and already much less likely
+    (1.5, -1.0, False),  # cheap, and already much more likely
+    (0.5, -1.0, True),  # cheap, and too unlikely
+    (1.1, -1.0, True),  # within the range
+])  # fmt: skip
+def test_a_sample_that_has_moved_far_enough_has_no_gradient(ratio, advantage, moves):
+    log_prob = th.tensor([[ratio]]).log().requires_grad_()
+    loss = clipped_policy_loss(log_prob, th.zeros(1, 1), th.tensor([[advantage]]), th.ones(1, 1), 0.2)
+    loss.backward()
+    assert (log_prob.grad.abs().item() > 0) == moves
+    if moves:
+        assert loss.item() == pytest.approx(ratio * advantage)
+
+
+def test_normalised_advantages_count_living_steps_only():
+    advantages = th.tensor([[1.0, 2.0], [6.0, 100.0]])
+    alive = th.tensor([[1.0, 1.0], [1.0, 0.0]])
+    result, std = normalized(advantages, alive)
+    living = result[alive.bool()]
+    assert living.mean().item() == pytest.approx(0, abs=1e-6)
+    assert living.std(correction=0).item() == pytest.approx(1)
+    assert std.item() == pytest.approx(th.tensor([1.0, 2.0, 6.0]).std(correction=0).item())

@@ -1,0 +1,251 @@
+"""Passes over an epoch's rollouts, the weight that follows a cost limit, and the defaults of arguments left out."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from small_problems import parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+
+from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback
+from sb3_tdpg.auto_weight import AutoWeight
+from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.scenarios import BALL_CATCH
+from sb3_tdpg.evaluation import evaluate_scenarios
+
+IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
+PASSES = dict(n_epochs=3, batch_size=8, clip_range=0.2)
+
+
+def steps_of(model, monkeypatch):
+    """Count the optimiser's steps, and the episodes that each has seen."""
+    seen = []
+    original = model._log_prob
+
+    def counting(batch, **kwargs):
+        if th.is_grad_enabled():
+            seen.append(batch.costs.shape[1])
+        return original(batch, **kwargs)
+
+    monkeypatch.setattr(model, "_log_prob", counting)
+    return seen
+
+
+@pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
+def test_an_epoch_makes_so_many_passes_over_minibatches_of_whole_episodes(encoder_gradient, monkeypatch):
+    model = tiny_tdpg(**PASSES, encoder_gradient=encoder_gradient)
+    seen = steps_of(model, monkeypatch)
+    train_epochs(model, 1)
+    assert seen == [8, 8, 4] * 3
+    assert model.epoch == 1
+    assert model._n_updates == 3
+
+
+def test_every_episode_is_in_one_minibatch_of_a_pass():
+    model = tiny_tdpg(**PASSES)
+    columns = th.cat(list(model._minibatches()))
+    assert sorted(columns.tolist()) == list(range(20))
+    assert columns.tolist() != list(range(20))
+
+
+@pytest.mark.parametrize("beta", [math.inf, 1 / 75])
+def test_one_pass_without_clipping_and_one_with_it_are_the_same_step(beta):
+    trained = []
+    for clip_range in (math.inf, 0.2):
+        model = tiny_tdpg(beta=beta, clip_range=clip_range)
+        train_epochs(model, 1)
+        trained.append(parameters(model.policy))
+    for name, value in trained[0].items():
+        th.testing.assert_close(value, trained[1][name], msg=name)
+
+
+@pytest.mark.parametrize("beta", [math.inf, 1 / 75])
+def test_normalising_the_advantages_scales_the_gradient_of_the_whole_objective(beta):
+    """The penalty is divided by what the advantages are divided by: beta keeps its meaning."""
+    gradients = []
+    for normalize in (False, True):
+        model = tiny_tdpg(beta=beta, normalize_advantage=normalize)
+        train_epochs(model, 1)
+        gradients.append(th.cat([p.grad.flatten() for p in model.policy.parameters()]))
+    cosine = th.nn.functional.cosine_similarity(*gradients, dim=0)
+    # Not 1: subtracting the mean of the advantages changes the noise of the gradient.
+    assert cosine.item() > 0.98
+    assert gradients[0].norm() > 2 * gradients[1].norm()
+
+
+def test_passes_stop_where_the_clipping_says():
+    """Many passes over the same rollouts leave the policy near the one that made them; without clipping they do not."""
+    distances = []
+    for clip_range in (0.05, 1e9):
+        model = tiny_tdpg(beta=math.inf, n_epochs=60, clip_range=clip_range, learning_rate=1e-2)
+        _, callback = model._setup_learn(1)
+        model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+        batch = model.rollout_buffer.episode_batch()
+        with th.no_grad():
+            before = model._log_prob(batch)[0]
+        model.train()
+        with th.no_grad():
+            distances.append((model._log_prob(batch)[0] - before).abs().mean().item())
+    assert distances[0] < 0.3 * distances[1]
+
+
+def test_the_distance_from_the_rollouts_policy_is_logged():
+    model = tiny_tdpg(**PASSES)
+    train_epochs(model, 2)
+    logged = model.logger.name_to_value
+    assert 0 < logged["train/approx_kl"] < 1
+    assert 0 <= logged["train/clip_fraction"] < 1
+
+
+def test_the_clip_range_may_follow_the_progress():
+    asked = []
+    model = tiny_tdpg(clip_range=lambda progress: asked.append(progress) or 0.1 + 0.1 * progress)
+    asked.clear()
+    train_epochs(model, 4)
+    assert len(asked) == 4
+    assert 0 <= asked[-1] < asked[0] < 1
+    assert asked == sorted(asked, reverse=True)
+
+
+# -- the weight that follows a cost limit -----------------------------------------------------------------------------
+
+
+def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
+    weight = AutoWeight(cost_limit=10.0)
+    for _ in range(5):
+        weight.update(cost=30.0, information=4.0)
+        assert weight.value == 0.0
+    weight.update(cost=9.0, information=4.0)
+    start = weight.value
+    assert 0 < start * 4.0 < 10.0
+    weight.update(cost=5.0, information=4.0)
+    assert weight.value > start
+    larger = weight.value
+    weight.update(cost=12.0, information=4.0)
+    assert 0 < weight.value < larger
+    weight.update(cost=10.0, information=4.0)
+    at_the_limit = weight.value
+    weight.update(cost=1e9, information=4.0)
+    assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
+
+
+def test_the_weight_follows_a_limit_below_zero():
+    """Costs are negative returns, and many environments pay rewards."""
+    weight = AutoWeight(cost_limit=-400.0)
+    weight.update(cost=-100.0, information=1.0)
+    assert weight.value == 0.0
+    weight.update(cost=-450.0, information=1.0)
+    start = weight.value
+    assert start > 0
+    weight.update(cost=-490.0, information=1.0)
+    assert weight.value > start
+
+
+def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
+    arguments = dict(n_episodes=200, encoder_gradient="pathwise", n_epochs=4, clip_range=0.2, learning_rate=5e-3)
+    costs, information = [], []
+    for beta in ("auto", 1e6):
+        model = tiny_tdpg(beta=beta, cost_limit=40.0 if beta == "auto" else None, **arguments)
+        train_epochs(model, 150)
+        costs.append(model.rollout_buffer.episode_costs.mean())
+        information.append(model.information.sum())
+    assert costs[1] < 25 < costs[0] < 50
+    assert information[0] < 0.7 * information[1]
+
+
+def test_the_weight_is_saved_and_goes_on_where_it_was(tmp_path):
+    model = tiny_tdpg(beta="auto", cost_limit=1e4)
+    train_epochs(model, 3)
+    assert model.mi_coef > 0
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), device="cpu")
+    assert loaded.mi_coef == model.mi_coef
+    train_epochs(loaded, 1, reset_num_timesteps=False)
+    assert loaded.mi_coef > model.mi_coef
+    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), cost_limit=5.0, device="cpu").mi_coef == 0
+    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), beta=0.5, device="cpu").mi_coef == 2
+
+
+def test_a_policy_gradient_model_may_go_on_with_a_cost_limit(tmp_path):
+    model = tiny_tdpg(beta=math.inf)
+    train_epochs(model, 1)
+    model.save(tmp_path / "pg")
+    loaded = TDPG.load(tmp_path / "pg", env=BatchedVecEnv(LavaEnv(), 20), beta="auto", cost_limit=1e4, device="cpu")
+    train_epochs(loaded, 1)
+    assert loaded.mi_coef > 0
+
+
+def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():
+    """The selection compares epochs by it."""
+    trained = []
+    for arguments in (dict(beta="auto", cost_limit=1e-3), dict(beta=math.inf)):
+        model = tiny_tdpg(**arguments)
+        selection = SelectionCallback(cost_limit=1e6)
+        train_epochs(model, 2, callback=selection)
+        trained.append(parameters(model.policy))
+        assert (model.information is None) == (arguments["beta"] == math.inf)
+    assert same_parameters(*trained)
+
+
+# -- what is left out -------------------------------------------------------------------------------------------------
+
+
+def with_threshold(env, threshold):
+    env.envs[0].unwrapped.spec = EnvSpec("Toy-v0", reward_threshold=threshold)
+    return env
+
+
+def test_vectors_are_learnt_from_as_in_the_paper():
+    model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
+    assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, 500)
+    assert (model.clip_range, model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "mine")
+    assert not model.normalize_advantage
+    assert model.env.num_envs == 500
+
+
+def test_images_are_learnt_from_with_ppos_passes_under_the_environments_threshold():
+    model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
+    assert (model.beta, model.cost_limit) == ("auto", 8.0)
+    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range) == (160, 4, 80, 0.2)
+    assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
+    assert model.env.num_envs == 160
+
+
+def test_every_default_may_be_overruled():
+    env = toy_vec_env(observation_space=IMAGE)
+    model = TDPG(
+        "TRVPolicy", env, beta=0.5, n_episodes=8, n_epochs=1, clip_range=math.inf, normalize_advantage=False,
+        encoder_gradient="score", mi_estimator="loo", device="cpu",
+    )  # fmt: skip
+    assert (model.beta, model.n_epochs, model.batch_size, model.clip_range) == (0.5, 1, 8, math.inf)
+    assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("score", "loo", False)
+    train_epochs(model, 1)
+
+
+def test_a_cost_limit_alone_asks_for_the_weight_that_keeps_it():
+    assert tiny_tdpg(cost_limit=30.0).beta == "auto"
+
+
+def test_the_threshold_of_the_registration_is_the_default_limit():
+    model = TDPG("TRVPolicy", with_threshold(toy_vec_env(observation_space=IMAGE), 3.0), n_episodes=8, device="cpu")
+    assert model.cost_limit == -3.0
+
+
+def test_learning_without_a_number_of_steps_takes_the_default(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        "stable_baselines3.common.on_policy_algorithm.OnPolicyAlgorithm.learn", lambda _, n, *__: asked.append(n)
+    )
+    TDPG("TRVPolicy", "Lava-v0", device="cpu").learn()
+    TDPG("TRVPolicy", "BallCatch-v0", device="cpu").learn()
+    assert asked == [1_000_000, 200_000]
+
+
+def test_the_one_line_training_in_miniature():
+    """Two epochs on PyBullet's images, from the line that the documentation shows; two rows of the table."""
+    model = TDPG("TRVPolicy", "BallCatch-v0", n_episodes=8, device="cpu").learn(2 * 8 * 25)
+    assert model.epoch == 2
+    records = evaluate_scenarios(model, BALL_CATCH[:2], 4)
+    assert np.isfinite(records["cost"]).all()
