@@ -63,6 +63,8 @@ class BallCatchEnv(POMDPEnv):
         [0, 1]; 0: the image is left alone.
     :param noise_mode: What is done with values outside [0, 1] then. ``"minmax"``, as in the paper: of each image its
         minimum is subtracted, and it is divided by its maximum. ``"clip"``: they are cut off.
+    :param wall_stands_still: For diagnosis: the wall, the sky and the floor's edge look always as from d = 0, and only
+        the ball tells where the robot is.
     :param renderer: ``"pybullet"``, the reference (1 ms an image), or ``"fast"``, a batched ray caster that agrees
         with it in 99.8 % of the pixels.
     :param render_mode: ``None``, ``"rgb_array"`` (the scene from the side, beside the camera's image) or ``"human"``
@@ -90,6 +92,7 @@ class BallCatchEnv(POMDPEnv):
         texture: str | os.PathLike[str] | np.ndarray = TRAINING_TEXTURE,
         pixel_noise_std: float = 0.0,
         noise_mode: str = "minmax",
+        wall_stands_still: bool = False,
         renderer: str = "pybullet",
         render_mode: str | None = None,
     ) -> None:
@@ -112,6 +115,7 @@ class BallCatchEnv(POMDPEnv):
             raise ValueError(f"renderer={renderer!r} must be one of {list(RENDERERS)}")
         self.pixel_noise_std = float(pixel_noise_std)
         self.noise_mode = noise_mode
+        self.wall_stands_still = wall_stands_still
         self.scene = BallScene(
             texture=load_texture(texture),
             ball_color=_color(ball_color),
@@ -151,7 +155,15 @@ class BallCatchEnv(POMDPEnv):
         )
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
-        return self._with_noise(self._renderer.images(state), self.np_random)
+        return self._with_noise(self._renderer.images(self._seen_from(state)), self.np_random)
+
+    def _seen_from(self, state: np.ndarray) -> np.ndarray:
+        """Return the state whose image is shown."""
+        if not self.wall_stands_still:
+            return state
+        shown = state.copy()
+        shown[:, 0], shown[:, 1] = 0.0, state[:, 1] - state[:, 0]
+        return shown
 
     def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return 0.01 * np.abs(action[:, 0])
@@ -211,7 +223,8 @@ class BallCatchEnv(POMDPEnv):
         if self.render_mode == "human":
             time.sleep(self.dt)
             return None
-        (camera_image,) = self._with_noise(self._renderer.images(self._state), np.random.default_rng(0))
+        images = self._renderer.images(self._seen_from(self._state))
+        (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)
 
     def close(self) -> None:

@@ -113,6 +113,13 @@ BALL_CATCH: tuple[Scenario, ...] = (
     ),
 )
 
+# Which of the two that show where to go does a policy look at? Ours.
+BALL_CATCH_DIAGNOSIS: tuple[Scenario, ...] = (
+    Scenario("Ball and wall", "BallCatch-v0"),
+    Scenario("Ball hidden", "BallCatch-v0", dict(ball_radius=1e-3)),
+    Scenario("Wall stands still", "BallCatch-v0", dict(wall_stands_still=True)),
+)
+
 # The same rows where the launch varies: a comparison of our own, without numbers of the paper.
 BALL_CATCH_VARYING_LAUNCH: tuple[Scenario, ...] = tuple(
     Scenario(row.name, row.env_id, {**BALL_VARYING_LAUNCH, **row.env_kwargs}) for row in BALL_CATCH

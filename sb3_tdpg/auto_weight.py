@@ -9,21 +9,19 @@ class AutoWeight:
     """
     Dual ascent on the weight w of "minimise the information, subject to an expected cost of at most C".
 
-    The weight is 0 until the cost first meets the limit: before that there is nothing to trade. From then on it grows
-    while the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"`` does for the
-    entropy:
+    The weight is 0 until the cost first meets the limit: before that there is nothing to trade. It starts where the
+    penalty is as large as the limit. From then on it grows while the cost is below the limit and shrinks while it is
+    above, as SAC's ``ent_coef="auto"`` does for the entropy:
 
         log w += rate * clip((C - cost) / |C|, -2, 1)
 
     :param cost_limit: C
     :param rate: Change of log w for an epoch whose cost is 0.
-    :param initial_share: The weight starts where the penalty would be this share of the limit.
     """
 
-    def __init__(self, cost_limit: float, rate: float = 0.3, initial_share: float = 0.1) -> None:
+    def __init__(self, cost_limit: float, rate: float = 0.3) -> None:
         self.cost_limit = cost_limit
         self.rate = rate
-        self.initial_share = initial_share
         self.value = 0.0
         """w = 1 / beta, in units of cost per nat."""
 
@@ -38,4 +36,4 @@ class AutoWeight:
         if self.value > 0.0:
             self.value *= math.exp(self.rate * min(max((self.cost_limit - cost) / scale, -2.0), 1.0))
         elif cost <= self.cost_limit:
-            self.value = self.initial_share * scale / max(information, 1.0)
+            self.value = scale / max(information, 1.0)

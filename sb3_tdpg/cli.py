@@ -19,15 +19,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(parser.parse_args(arguments))
     command = options.pop("command")
     # Imported only now: torch takes seconds, and --help should not.
-    from sb3_tdpg import reproduction
+    from sb3_tdpg.reproduction import ball, lava
 
-    out = options.pop("out")
+    experiment = options.pop("experiment", None)
+    out = options.pop("out") or Path("results", f"{experiment.replace('-', '_')}_reproduction")
+    options = {name: value for name, value in options.items() if value is not None}
     try:
         if command == "demo":
-            text = reproduction.demo(out, **options)
+            text = lava.demo(out, **options)
+        elif experiment.startswith("ball"):
+            text = ball.reproduce_ball(out, launch="varying" if experiment.endswith("varying") else "fixed", **options)
         else:
-            options.pop("experiment")
-            text = reproduction.reproduce_lava(out, **options)
+            text = lava.reproduce_lava(out, **options)
     except KeyboardInterrupt:
         print(f"\ninterrupted; {out} keeps what is done, and the same command goes on from there", file=sys.stderr)
         return 130
@@ -49,12 +52,14 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_sizes(demo)
 
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
-    reproduce.add_argument("experiment", choices=("lava",))
-    reproduce.add_argument("--out", type=Path, default=Path("results/lava_reproduction"), help="folder for the results")
-    reproduce.add_argument("--publish", type=Path, default=None, help="copy all but the runs to this folder")
-    reproduce.add_argument("--n-seeds", type=_positive, default=10, help="training seeds of each method")
+    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying"))
     reproduce.add_argument(
-        "--n-paper-seeds", type=_positive, default=3, help="training seeds of the paper's own settings"
+        "--out", type=Path, default=None, help="folder for the results (default: results/<experiment>_reproduction)"
+    )
+    reproduce.add_argument("--publish", type=Path, default=None, help="copy all but the runs to this folder")
+    reproduce.add_argument("--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, ball 5)")
+    reproduce.add_argument(
+        "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
     )
     reproduce.add_argument("--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores)")
     _add_sizes(reproduce)

@@ -44,6 +44,7 @@ class Run:
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Trainings from scratch, each with a seed of its own, until one meets the limits of the block's
         selection. The paper likewise chooses its policy from several trainings.
+    :param start: Folder of a finished run whose policy the training starts from.
     """
 
     method: str
@@ -52,6 +53,7 @@ class Run:
     seed: int
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
+    start: Path | None = None
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -73,6 +75,7 @@ class Run:
             block=self.block,
             seed=self.seed,
             max_attempts=self.max_attempts,
+            start=None if self.start is None else self.start.name,
             settings=self.settings,
         )
 
@@ -156,6 +159,10 @@ def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TD
     if checkpoint.exists():
         model = TDPG.load(checkpoint, env=model.env, device="cpu")
         n_timesteps = model.remaining_timesteps
+    elif run.start is not None:
+        # Not the whole model: the optimiser's memory belongs to another objective.
+        start = TDPG.load(run.start / "model.zip", device="cpu")
+        model.policy.load_state_dict(start.policy.state_dict())
     log = make_output_format("csv", str(folder), log_suffix=f"_{model.num_timesteps:08d}")
     model.set_logger(Logger(str(folder), [log]))
     callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, CHECKPOINT_EPOCHS)]
@@ -184,8 +191,7 @@ def read_progress(folder: Path) -> pd.DataFrame:
 
 
 def complete_runs(
-    tasks: Sequence[tuple[Run, Path]],
-    scenarios: Sequence[Scenario],
+    tasks: Sequence[tuple[Run, Path, Sequence[Scenario]]],
     *,
     n_eval_episodes: int = 1000,
     jobs: int | None = None,
@@ -193,8 +199,7 @@ def complete_runs(
     """
     Complete runs in parallel processes, with a progress bar; Ctrl-C keeps what is finished.
 
-    :param tasks: Runs and their folders, see :func:`complete_run`.
-    :param scenarios: What to evaluate.
+    :param tasks: Runs, their folders and what to evaluate, see :func:`complete_run`.
     :param n_eval_episodes: Episodes of each scenario.
     :param jobs: Runs at a time; default: the number of cores.
     """
@@ -205,7 +210,7 @@ def complete_runs(
     ):
         futures = {
             pool.submit(complete_run, run, folder, scenarios, n_eval_episodes=n_eval_episodes): folder
-            for run, folder in tasks
+            for run, folder, scenarios in tasks
         }
         try:
             for future in _as_finished(futures):

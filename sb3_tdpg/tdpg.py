@@ -204,7 +204,6 @@ class TDPG(OnPolicyAlgorithm):
         self.batch_size: int = settings["batch_size"]
         self.clip_range: float | Schedule = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
-        self.mi_perturbation = None
         self.auto_weight: AutoWeight | None = None
         """The weight of the information with ``beta="auto"``."""
         # Plain numbers, so that a model loaded without an environment can rebuild its networks.
@@ -440,9 +439,6 @@ class TDPG(OnPolicyAlgorithm):
                     )
                 loss = policy_loss
                 if mi_coef > 0.0:
-                    if self.mi_perturbation is not None:
-                        perturbed = part._replace(observations=self.mi_perturbation(part.observations))
-                        rebuilt = self.policy.rebuild_trvs(self.policy.episode_features(perturbed), part.noise)
                     assert rebuilt is not None
                     information = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
                     penalty = mi_coef * information_loss(information)

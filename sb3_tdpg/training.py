@@ -31,8 +31,8 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     """
     Build model and callbacks from a block of settings, read as rl-zoo3 reads it.
 
-    ``n_timesteps``, ``env_kwargs`` and ``callback`` are the zoo's keys; ``lin_1e-3`` is a learning rate that falls
-    linearly to zero; every other key is an argument of :class:`~sb3_tdpg.tdpg.TDPG`.
+    ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper`` and ``callback`` are the zoo's keys; ``lin_1e-3`` is a learning
+    rate that falls linearly to zero; every other key is an argument of :class:`~sb3_tdpg.tdpg.TDPG`.
 
     :param env_id: A registered id.
     :param block: The settings, as :func:`sb3_tdpg.hyperparams.load_hyperparams` gives them.
@@ -40,24 +40,26 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     """
     settings = {**block, **overrides}
     n_timesteps = int(settings.pop("n_timesteps"))
-    callbacks = [_make_callback(entry) for entry in settings.pop("callback", [])]
+    callbacks: list[BaseCallback] = [_make(entry) for entry in settings.pop("callback", [])]
     env_kwargs = settings.pop("env_kwargs", {})
     env = make_episodes_env(
-        env_id, settings.pop("n_envs", None), n_episodes=settings.get("n_episodes", 500), env_kwargs=env_kwargs
+        env_id, settings.pop("n_envs", None), n_episodes=settings.get("n_episodes"), env_kwargs=env_kwargs
     )
+    for entry in settings.pop("vec_env_wrapper", []):
+        env = _make(entry, env)
     rate = settings.get("learning_rate")
     if isinstance(rate, str):
         settings["learning_rate"] = _make_schedule(rate)
     return Training(TDPG(settings.pop("policy"), env, **settings), callbacks, n_timesteps)
 
 
-def _make_callback(entry: str | Mapping[str, Mapping[str, Any]]) -> BaseCallback:
-    """``{"package.module.Class": {keywords}}`` or ``"package.module.Class"``."""
+def _make(entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:
+    """Make a callback or a wrapper: ``{"package.module.Class": {keywords}}`` or ``"package.module.Class"``."""
     (path, keywords), *more = [(entry, {})] if isinstance(entry, str) else entry.items()
     if more:
-        raise ValueError(f"a callback is one class with its keywords, not {entry}")
+        raise ValueError(f"a callback or a wrapper is one class with its keywords, not {entry}")
     module, _, name = path.rpartition(".")
-    return getattr(import_module(module), name)(**keywords)
+    return getattr(import_module(module), name)(*arguments, **keywords)
 
 
 def _make_schedule(text: str) -> LinearSchedule:

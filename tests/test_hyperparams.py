@@ -14,7 +14,7 @@ from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.training import make_training
 
 BLOCKS = sorted(yaml.safe_load(resources.files(hyperparams).joinpath("tdpg.yml").read_text()))
-ZOO_KEYS = {"n_timesteps", "env_kwargs", "callback"}
+ZOO_KEYS = {"n_timesteps", "env_kwargs", "vec_env_wrapper", "callback"}
 
 
 def env_id_of(block):
@@ -53,6 +53,8 @@ def test_every_block_trains_for_an_epoch(block):
     cheap = {"mi_kwargs": {**settings.get("mi_kwargs", {}), "gradient_steps": 2, "warmup_gradient_steps": 2}}
     if settings["mi_estimator"] != "mine":
         cheap = {}
+    if "batch_size" in settings:
+        cheap["batch_size"] = 20
     training = make_training(env_id_of(block), settings, n_timesteps=100, n_episodes=20, seed=0, **cheap)
     training.model.learn(training.n_timesteps, training.callbacks)
     assert training.model.epoch == 1

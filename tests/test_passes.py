@@ -119,7 +119,7 @@ def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
         assert weight.value == 0.0
     weight.update(cost=9.0, information=4.0)
     start = weight.value
-    assert 0 < start * 4.0 < 10.0
+    assert start * 4.0 == pytest.approx(10.0)
     weight.update(cost=5.0, information=4.0)
     assert weight.value > start
     larger = weight.value

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -17,7 +18,8 @@ from sb3_tdpg import TDPG
 from sb3_tdpg.callbacks import TDPGProgressBar
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
-from sb3_tdpg.reproduction import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
+from sb3_tdpg.evaluation import aggregate_seeds
+from sb3_tdpg.reproduction.lava import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
 from sb3_tdpg.runs import Run, complete_run, read_progress
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -161,11 +163,12 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
     pytest.importorskip("matplotlib")
     # In this process: the workers would not see the small epochs of this module.
     monkeypatch.setattr(
-        "sb3_tdpg.reproduction.complete_runs",
-        lambda tasks, scenarios, *, n_eval_episodes, jobs: [
-            complete_run(*task, scenarios, n_eval_episodes=n_eval_episodes) for task in tasks
+        "sb3_tdpg.reproduction.lava.complete_runs",
+        lambda tasks, *, n_eval_episodes, jobs: [
+            complete_run(*task, n_eval_episodes=n_eval_episodes) for task in tasks
         ],
     )
+    monkeypatch.setattr("sb3_tdpg.reproduction.lava.aggregate_seeds", partial(aggregate_seeds, n_bootstrap=10))
     tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
     summary = reproduce_lava(
         tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200, publish=published

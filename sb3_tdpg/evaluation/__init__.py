@@ -1,9 +1,17 @@
 """Evaluation: scenario -> per-episode records -> table -> figure."""
 
-from sb3_tdpg.evaluation.figures import cost_histograms, lava_trajectories, save_figure, training_curves
+from sb3_tdpg.evaluation.figures import (
+    cost_histograms,
+    diagnosis_bars,
+    lava_trajectories,
+    robustness_curves,
+    save_figure,
+    training_curves,
+)
 from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.records import evaluate_scenarios
-from sb3_tdpg.evaluation.tables import add_ratio, aggregate_seeds, comparison_markdown, summary_table
+from sb3_tdpg.evaluation.statistics import aggregate_seeds, probability_of_improvement
+from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table
 from sb3_tdpg.evaluation.trajectories import Trajectories, rollout_states
 
 __all__ = [
@@ -12,9 +20,12 @@ __all__ = [
     "aggregate_seeds",
     "comparison_markdown",
     "cost_histograms",
+    "diagnosis_bars",
     "evaluate_scenarios",
     "lava_trajectories",
+    "probability_of_improvement",
     "provenance",
+    "robustness_curves",
     "rollout_states",
     "save_figure",
     "summary_table",

@@ -59,8 +59,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
         _log_axis(panels[0], "x", subs=(1, 3))
     panels[0].set_ylabel("share of episodes", fontsize=9)
     figure.supxlabel(f"episode cost{' (logarithmic axis)' if is_positive else ''}; dashed: mean", fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9)
+    _legend_above(figure, panels[0])
     return figure
 
 
@@ -129,6 +128,74 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
         _tidy(axes)
     cost.legend(frameon=False)
     return figure
+
+
+def robustness_curves(
+    records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str], reference: str = "Training"
+) -> Figure:
+    """
+    Draw each method's mean cost over the rows of a table: a line for the median seed, a dot for each seed.
+
+    :param records: With a column ``train_seed``.
+    :param noise_rows: Scenarios that are ordered; they follow the reference in the left panel.
+    :param other_rows: Scenarios without an order, for the right panel.
+    :param reference: The scenario of the training.
+    """
+    figure = _new_figure(WIDTH, 3.6)
+    panels = figure.subplots(1, 2, sharey=True, width_ratios=(len(noise_rows) + 1, len(other_rows)))
+    means = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean()
+    models = list(records["model"].unique())
+    for axes, rows in zip(panels, ([reference, *noise_rows], list(other_rows)), strict=True):
+        for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
+            seeds = means[model].unstack("scenario")[rows]  # (seeds, rows)
+            at = np.arange(len(rows)) + 0.1 * (i - (len(models) - 1) / 2)
+            axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4, alpha=0.7)
+            style = "-" if axes is panels[0] else ""
+            axes.plot(at, seeds.median().to_numpy(), style + "_", color=color, linewidth=1.2, markersize=9, label=model)
+        axes.set_xticks(range(len(rows)), [_short(row) for row in rows])
+        _tidy(axes)
+    _log_axis(panels[0], "y", subs=(1, 2, 5))
+    panels[0].set_ylabel("mean episode cost", fontsize=9)
+    panels[0].set_xlabel("standard deviation of the pixel noise", fontsize=9)
+    panels[1].set_xlabel("test background", fontsize=9)
+    _legend_above(figure, panels[0])
+    return figure
+
+
+def diagnosis_bars(records: pd.DataFrame) -> Figure:
+    """
+    Draw the final distance of each method in each scenario of a diagnosis: a bar for the median seed, a dot for each.
+
+    :param records: With the columns ``train_seed`` and ``distance`` (m).
+    """
+    figure = _new_figure(WIDTH, 3.2)
+    axes = figure.add_subplot()
+    distances = records.groupby(["model", "train_seed", "scenario"], sort=False)["distance"].mean()
+    models, rows = list(records["model"].unique()), list(records["scenario"].unique())
+    width = 0.8 / len(models)
+    for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
+        seeds = distances[model].unstack("scenario")[rows]
+        at = np.arange(len(rows)) + width * (i - (len(models) - 1) / 2)
+        axes.bar(at, seeds.median(), width=0.9 * width, color=color, alpha=0.45, label=model)
+        axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4)
+    axes.set_xticks(range(len(rows)), rows)
+    _tidy(axes)
+    _log_axis(axes, "y", subs=(1, 2, 5))
+    axes.set_ylabel("final distance from the ball (m)", fontsize=9)
+    _legend_above(figure, axes)
+    return figure
+
+
+def _short(row: str) -> str:
+    """Return what tells a row of a table from its neighbours: "Sensor noise 0.10" -> "0.10"."""
+    last = row.rsplit(" ", 1)[-1]
+    return last if last[0].isdigit() else "0" if row == "Training" else row
+
+
+def _legend_above(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    columns = min(len(labels), 3)
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> None:

@@ -21,13 +21,13 @@ def summary_table(records: pd.DataFrame, by: Sequence[str] = ("model", "scenario
         mean), ``median``; ``failure_share`` if the records tell of failures; ``seed`` and ``deterministic``
     """
     keys = [*(["train_seed"] if "train_seed" in records.columns and "train_seed" not in by else []), *by]
-    _require(records, [*keys, "cost", "seed", "deterministic"])
+    require_columns(records, [*keys, "cost", "seed", "deterministic"])
     groups = records.groupby(keys, sort=False)
     cost = groups["cost"]
     columns = dict(n=cost.size(), mean=cost.mean(), std=cost.std(), sem=cost.sem(), median=cost.median())
     if "failure" in records.columns:
         columns["failure_share"] = groups["failure"].apply(lambda failure: failure.astype(float).mean())
-    columns.update(seed=groups["seed"].agg(_one_or_all), deterministic=groups["deterministic"].agg(_one_or_all))
+    columns.update(seed=groups["seed"].agg(one_or_all), deterministic=groups["deterministic"].agg(one_or_all))
     return pd.DataFrame(columns).reset_index()
 
 
@@ -48,61 +48,9 @@ def add_ratio(summary: pd.DataFrame, reference: str = "Training") -> pd.DataFram
     return summary.assign(ratio=summary["mean"].to_numpy() / means.to_numpy())
 
 
-def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the middle half along the last axis: of n sorted values, ``n // 4`` are cut off at each end."""
-    cut = values.shape[-1] // 4
-    return np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1)
-
-
-def aggregate_seeds(
-    records_by_seed: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
-) -> pd.DataFrame:
-    """
-    Summarise over training seeds: how good is the method, not one policy of it.
-
-    The number is the interquartile mean over the seeds' mean costs, with the percentile bootstrap interval from
-    resampling seeds, as Agarwal et al. (2021, "Deep reinforcement learning at the edge of the statistical precipice")
-    recommend for few runs.
-
-    :param records_by_seed: Records with a column ``train_seed``
-        (``evaluate_scenarios(..., labels=dict(train_seed=3))``).
-    :param level: Coverage of the interval.
-    :param n_bootstrap: Resamples.
-    :param seed: Seed of the resampling.
-    :return: one row for each model and scenario: ``n_seeds``, ``iqm``, ``low``, ``high``, ``min``, ``max``,
-        ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
-        seed), and how it was made: ``level``, ``seed``, ``deterministic``
-    """
-    _require(records_by_seed, ["train_seed"])
-    if not 0 < level < 1:
-        raise ValueError(f"level={level} must lie between 0 and 1")
-    rows = []
-    for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
-        means = group["mean"].to_numpy()
-        # The same resamples in every row that has as many seeds.
-        resampled = np.random.default_rng(seed).integers(len(means), size=(n_bootstrap, len(means)))
-        low, high = np.quantile(interquartile_mean(means[resampled]), [(1 - level) / 2, (1 + level) / 2])
-        rows.append(
-            dict(
-                model=model,
-                scenario=scenario,
-                n_seeds=len(means),
-                iqm=interquartile_mean(means),
-                low=low,
-                high=high,
-                min=means.min(),
-                max=means.max(),
-                episode_std=interquartile_mean(group["std"].to_numpy()),
-                level=level,
-                n=group["n"].iloc[0],
-                seed=_one_or_all(group["seed"]),
-                deterministic=_one_or_all(group["deterministic"]),
-            )
-        )
-    return pd.DataFrame(rows)
-
-
-def comparison_markdown(summary: pd.DataFrame, scenarios: Sequence[Scenario]) -> str:
+def comparison_markdown(
+    summary: pd.DataFrame, scenarios: Sequence[Scenario], *, quantity: str = "episode cost", digits: int = 2
+) -> str:
     """
     Write a Markdown table: a row for each scenario, and for each model its numbers beside the paper's.
 
@@ -110,10 +58,12 @@ def comparison_markdown(summary: pd.DataFrame, scenarios: Sequence[Scenario]) ->
         mean over seeds and its interval.
     :param scenarios: The rows, in this order. Where a label of a model is a key of ``scenario.paper``, the paper's
         numbers stand beside.
+    :param quantity: What the numbers are, for the line below the table.
+    :param digits: Digits behind the point.
     :return: the table, the lowest of ours and the lowest of the paper's in bold, and a line that says how it was made
     """
     over_seeds = "iqm" in summary.columns
-    _require(summary, ["model", "scenario", *(("iqm", "low", "high") if over_seeds else ("mean", "std"))])
+    require_columns(summary, ["model", "scenario", *(("iqm", "low", "high") if over_seeds else ("mean", "std"))])
     if summary.duplicated(["model", "scenario"]).any():
         raise ValueError(
             "the summary has several rows for a model in a scenario: use aggregate_seeds, or select one seed"
@@ -135,35 +85,35 @@ def comparison_markdown(summary: pd.DataFrame, scenarios: Sequence[Scenario]) ->
         of_paper = {model: scenario.paper[model].mean for model in in_paper if model in scenario.paper}
         row = [scenario.name]
         for model in models:
-            row.append(_bold_if(_our_cell(ours[model]), _is_lowest(model, value)) if model in ours else "")
+            row.append(_bold_if(_our_cell(ours[model], digits), _is_lowest(model, value)) if model in ours else "")
             if model in in_paper and (result := scenario.paper.get(model)):
-                row.append(_bold_if(_paper_cell(result), _is_lowest(model, of_paper)))
+                row.append(_bold_if(_paper_cell(result, digits), _is_lowest(model, of_paper)))
             elif model in in_paper:
                 row.append("")
         lines.append(_line(row))
     results = [scenario.paper[model] for scenario in scenarios for model in in_paper if model in scenario.paper]
-    return "\n".join([*lines, "", _footer(summary, results), ""])
+    return "\n".join([*lines, "", _footer(summary, results, quantity), ""])
 
 
-def _paper_cell(result: PaperResult) -> str:
-    return f"{result.mean:.2f}" if result.std is None else f"{result.mean:.2f} ({result.std:.2f})"
+def _paper_cell(result: PaperResult, digits: int) -> str:
+    return f"{result.mean:.{digits}f}" if result.std is None else f"{result.mean:.{digits}f} ({result.std:.{digits}f})"
 
 
-def _our_cell(cell: pd.Series) -> str:
+def _our_cell(cell: pd.Series, digits: int) -> str:
     if "iqm" in cell:
-        return f"{cell['iqm']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
-    return f"{cell['mean']:.2f} ({cell['std']:.2f})"
+        return f"{cell['iqm']:.{digits}f} [{cell['low']:.{digits}f}, {cell['high']:.{digits}f}]"
+    return f"{cell['mean']:.{digits}f} ({cell['std']:.{digits}f})"
 
 
-def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult]) -> str:
+def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult], quantity: str) -> str:
     """Say what the numbers are and how they were made."""
     if "iqm" in summary.columns:
         what = (
-            f"Interquartile mean of the episode cost over {_all(summary['n_seeds'])} training seeds "
+            f"Interquartile mean of the {quantity} over {_all(summary['n_seeds'])} training seeds "
             f"[{summary['level'].iloc[0]:.0%} bootstrap interval over seeds]"
         )
     else:
-        what = "Mean cost of an episode (standard deviation over episodes)"
+        what = f"Mean {quantity} (standard deviation over episodes)"
     if paper:
         what += "; the paper's columns: mean"
         what += " (standard deviation)" if any(result.std is not None for result in paper) else ""
@@ -182,7 +132,7 @@ def _all(values: pd.Series) -> str:
     return ", ".join(f"{value:,}" if isinstance(value, (int, np.integer)) else str(value) for value in values.unique())
 
 
-def _one_or_all(values: pd.Series) -> Any:
+def one_or_all(values: pd.Series) -> Any:
     """Return the value that all rows share, or else all that occur as text: ``"0, 1, 2"``."""
     unique = values.unique()
     return unique[0] if len(unique) == 1 else ", ".join(str(value) for value in unique)
@@ -201,6 +151,7 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
 
 
-def _require(frame: pd.DataFrame, columns: Sequence[str]) -> None:
+def require_columns(frame: pd.DataFrame, columns: Sequence[str]) -> None:
+    """Raise a ``ValueError`` if a column is missing."""
     if missing := [name for name in columns if name not in frame.columns]:
         raise ValueError(f"the frame has no column {missing}; it has {list(frame.columns)}")

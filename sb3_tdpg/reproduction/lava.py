@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ from sb3_tdpg.evaluation import (
     write_run_config,
 )
 from sb3_tdpg.files import write_atomically
+from sb3_tdpg.reproduction.common import commits_of, how_made, markdown_table, met, publish_files
 from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 
@@ -160,9 +159,9 @@ def reproduce_lava(
     }
     groups["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
     folders = {group: [out / "runs" / group / run.folder_name for run in runs] for group, runs in groups.items()}
-    tasks = [(run, folder) for group in groups for run, folder in zip(groups[group], folders[group], strict=True)]
+    tasks = [(run, folder, LAVA) for group in groups for run, folder in zip(groups[group], folders[group], strict=True)]
     tasks.sort(key=lambda task: task[0].method != "TDPG")
-    complete_runs(tasks, LAVA, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
     sections, seed_tables = [], []
     for group in groups:
@@ -199,14 +198,13 @@ def reproduce_lava(
     write_run_config(
         out / "config.json", dict(runs=[run.config for runs in groups.values() for run in runs], provenance=how)
     )
-    made_at = _how_made(how, _commits([folder for group in groups for folder in folders[group]]))
+    made_at = how_made(
+        "make reproduce-lava", how, commits_of([folder for group in groups for folder in folders[group]])
+    )
     summary = "\n\n".join(["# The lava problem (Table I)", *sections, made_at]) + "\n"
     write_atomically(out / "summary.md", summary)
     if publish is not None:
-        publish.mkdir(parents=True, exist_ok=True)
-        for path in out.iterdir():
-            if path.is_file():
-                shutil.copy2(path, publish / path.name)
+        publish_files(out, publish)
     return summary
 
 
@@ -239,7 +237,7 @@ def _section(group: str, records: pd.DataFrame, seeds: pd.DataFrame) -> str:
         "Every seed (cost in training; std over episodes; ratio of the mean at sigma^2 = 1 to that in training; "
         "attempts: trainings until one met the limits; selected: whether one did):"
     )
-    parts.append(_markdown(seeds))
+    parts.append(markdown_table(seeds))
     return "\n\n".join(parts)
 
 
@@ -248,38 +246,12 @@ def _verdict(rows: pd.DataFrame, goal: tuple[float, float | None, float | None] 
     if goal is None:
         return "none set"
     mean, std, ratio = goal
-    checks = [f"mean <= {mean:g}: {_met(rows['mean'].mean() <= mean)}"]
+    checks = [f"mean <= {mean:g}: {met(rows['mean'].mean() <= mean)}"]
     if std is not None:
-        checks.append(f"std <= {std:g}: {_met(rows['std'].mean() <= std)}")
+        checks.append(f"std <= {std:g}: {met(rows['std'].mean() <= std)}")
     if ratio is not None:
         checks.append(f"ratio <= {ratio:g}: {(rows['ratio'] <= ratio).sum()} of {len(rows)} seeds")
     return "; ".join(checks)
-
-
-def _met(condition: bool) -> str:
-    return "met" if condition else "MISSED"
-
-
-def _markdown(frame: pd.DataFrame) -> str:
-    header = [f"| {' | '.join(frame.columns)} |", "|" + "---|" * len(frame.columns)]
-    cells = ([f"{x:.3f}" if isinstance(x, float) else str(x) for x in row] for row in frame.itertuples(index=False))
-    return "\n".join([*header, *(f"| {' | '.join(row)} |" for row in cells)])
-
-
-def _commits(folders: Sequence[Path]) -> list[str]:
-    """Return the commits at which the runs were made: more than one if the reproduction was resumed after a change."""
-    gits = (json.loads((folder / "config.json").read_text())["provenance"]["git"] for folder in folders)
-    return sorted({git["commit"][:7] for git in gits if git is not None})
-
-
-def _how_made(how: Mapping[str, Any], commits: Sequence[str]) -> str:
-    versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
-    git = how["git"]
-    commit = (
-        "outside a checkout" if git is None else git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
-    )
-    runs = f"runs at {', '.join(commits)}; " if commits else ""
-    return f"Made by `make reproduce-lava` at commit {commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
 
 
 def _method_order(column: pd.Series) -> pd.Series:

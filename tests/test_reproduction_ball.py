@@ -1,0 +1,109 @@
+"""The reproduction of ball catching with tiny settings, from nothing to tables, figures and records."""
+
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sb3_tdpg.cli import main
+from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS
+from sb3_tdpg.reproduction import ball
+from sb3_tdpg.runs import Run, complete_run
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Small epochs and the fast renderer, in this process."""
+    block = Run.settings.fget
+    monkeypatch.setattr(
+        Run,
+        "settings",
+        property(
+            lambda run: {**block(run), "n_episodes": 4, "batch_size": 4, "mi_kwargs": {}, "mi_estimator": "logdet"}
+        ),
+    )
+    for name in ("METHODS", "VARYING_METHODS", "PAPER_METHODS"):
+        methods = tuple(ball.replace(method, renderer="fast") for method in getattr(ball, name))
+        monkeypatch.setattr(ball, name, methods)
+    for name in ("aggregate_seeds", "probability_of_improvement"):
+        monkeypatch.setattr(ball, name, partial(getattr(ball, name), n_bootstrap=10))
+    order = []
+
+    def complete_runs(tasks, *, n_eval_episodes, jobs):
+        order.append([run.method for run, *_ in tasks])
+        for task in tasks:
+            complete_run(*task, n_eval_episodes=n_eval_episodes)
+
+    monkeypatch.setattr(ball, "complete_runs", complete_runs)
+    return order
+
+
+def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
+    out, published = tmp_path / "out", tmp_path / "docs"
+    summary = ball.reproduce_ball(out, n_seeds=2, n_eval_episodes=2, n_timesteps=100, publish=published)
+
+    assert (out / "summary.md").read_text() == summary
+    assert {path.name for path in published.iterdir()} == {path.name for path in out.iterdir()} - {"runs"}
+    assert {"episodes.csv.gz", "seeds.csv", "config.json", "robustness.png", "diagnosis.png", "training.png"} <= {
+        path.name for path in out.iterdir()
+    }
+    assert "MISSED" in summary, "an epoch reaches no goal, and the summary must say so"
+    for method in (*ball.METHODS, *ball.PAPER_METHODS):
+        assert method.label in summary
+    records = pd.read_csv(out / "episodes.csv.gz")
+    n_policies = 2 * len(ball.METHODS) + len(ball.PAPER_METHODS)
+    assert len(records) == n_policies * (len(BALL_CATCH) + len(BALL_CATCH_DIAGNOSIS)) * 2
+    # A terminal cost of 100 for each metre, and a little for driving.
+    assert (records["cost"] >= 100 * records["distance"] - 0.1).all()
+    assert (records["cost"] <= 100 * records["distance"] + 25 * 0.2 + 0.1).all()
+    assert all("PG" in label and not label.startswith("TDPG") for label in tiny[0])
+    assert all(label not in tiny[0] for label in tiny[1] if label.startswith("TDPG"))
+
+
+def test_a_second_stage_starts_from_the_policy_of_the_first(tmp_path, tiny):
+    run = Run("PG", "BallCatch-v0", "BallCatch-v0-pg", 0, {"n_timesteps": 100})
+    complete_run(run, tmp_path / "first", BALL_CATCH[:1], n_eval_episodes=2)
+    # A rate of zero: what is found is what it started from.
+    second = Run(
+        "TDPG", "BallCatch-v0", "BallCatch-v0", 0, {"n_timesteps": 100, "learning_rate": 0.0}, start=tmp_path / "first"
+    )
+    complete_run(second, tmp_path / "second", BALL_CATCH[:1], n_eval_episodes=2)
+    costs = [pd.read_csv(tmp_path / name / "episodes.csv")["cost"].to_numpy() for name in ("first", "second")]
+    np.testing.assert_allclose(*costs)
+
+
+def test_the_varying_launch_has_a_reproduction_of_its_own(tmp_path, tiny, capsys):
+    arguments = ["--n-seeds", "1", "--n-eval-episodes", "2", "--n-timesteps", "100"]
+    assert main(["reproduce", "ball-varying", "--out", str(tmp_path), *arguments]) == 0
+    assert "a launch that varies" in capsys.readouterr().out
+    records = pd.read_csv(tmp_path / "runs" / "pg-seed100" / "episodes.csv")
+    landing = records.loc[records["scenario"] == "Training", "final_state_1"]
+    assert landing.nunique() > 1
+
+
+def test_a_group_is_the_mean_of_its_rows():
+    rows = [(m, s, r.name, float(10 * i + s)) for m in ("PG",) for s in (0, 1) for i, r in enumerate(BALL_CATCH)]
+    records = pd.DataFrame(rows, columns=["model", "train_seed", "scenario", "cost"])
+    grouped = ball.with_groups(records).groupby(["train_seed", "scenario"])["cost"].mean()
+    assert grouped[0, "Sensor noise, mean of 4"] == 25
+    assert grouped[1, "Test backgrounds, mean of 7"] == 81
+    noise, backgrounds = ball.group_rows(BALL_CATCH)
+    assert backgrounds.paper["PG"].mean == pytest.approx(132.88, abs=0.01)
+    assert backgrounds.paper["TDPG"].mean == pytest.approx(67.94, abs=0.01)
+    assert noise.paper["TDPG"].distance == pytest.approx(0.22)
+
+
+def test_every_goal_is_of_a_row_and_a_method_of_the_table():
+    names = {row.name for row in (*BALL_CATCH, *ball.group_rows(BALL_CATCH))}
+    for method, goals in ball.GOALS.items():
+        assert method in {m.label for m in ball.METHODS if m.renderer == "pybullet"}
+        assert set(goals) <= names
+
+
+def test_every_method_but_the_first_stages_starts_from_one():
+    for methods in (ball.METHODS, ball.VARYING_METHODS):
+        labels = [m.label for m in methods]
+        for method in methods:
+            assert method.start is None or labels.index(method.start) < labels.index(method.label)
+        assert {label for pair in ball.COMPARISONS for label in pair} <= set(labels)
