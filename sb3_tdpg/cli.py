@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -15,30 +16,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: What stands behind the program's name; default: ``sys.argv``.
     :return: exit code: 0 done, 2 bad input, 130 interrupted
     """
-    parser = _make_parser()
-    options = vars(parser.parse_args(arguments))
-    command = options.pop("command")
-    # Imported only now: torch takes seconds, and --help should not.
-    from sb3_tdpg.reproduction import ball, lava
-
-    experiment = options.pop("experiment", None)
-    out = options.pop("out") or Path("results", f"{experiment.replace('-', '_')}_reproduction")
-    options = {name: value for name, value in options.items() if value is not None}
+    options = vars(_make_parser().parse_args(arguments))
+    command = COMMANDS[options.pop("command")]
     try:
-        if command == "demo":
-            text = lava.demo(out, **options)
-        elif experiment.startswith("ball"):
-            text = ball.reproduce_ball(out, launch="varying" if experiment.endswith("varying") else "fixed", **options)
-        else:
-            text = lava.reproduce_lava(out, **options)
+        command(**options)
     except KeyboardInterrupt:
-        print(f"\ninterrupted; {out} keeps what is done, and the same command goes on from there", file=sys.stderr)
+        # A command that has a folder for its results can be resumed.
+        out = options.get("out")
+        advice = "" if out is None else f"; {out} keeps what is done, and the same command goes on from there"
+        print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
     except ValueError as e:
         print(f"error: {e}", file=sys.stderr)
         return 2
-    print(f"\n{text}\n\nresults are in {out}")
     return 0
+
+
+# The commands import what they need when they run: torch takes seconds, and --help should not.
+
+
+def _demo(out: Path, **options: Any) -> None:
+    from sb3_tdpg.reproduction.lava import demo
+
+    print(f"\n{demo(out, **options)}\n\nresults are in {out}")
+
+
+def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
+    from sb3_tdpg.reproduction.ball import reproduce_ball
+    from sb3_tdpg.reproduction.lava import reproduce_lava
+
+    given = {name: value for name, value in options.items() if value is not None}
+    if experiment == "lava":
+        out = out or Path("results/lava_reproduction")
+        text = reproduce_lava(out, **given)
+    else:
+        out = out or Path("results", experiment.replace("-", "_").replace("ball", "ball_catch"))
+        text = reproduce_ball(out, launch="varying" if experiment == "ball-varying" else "fixed", **given)
+    print(f"\n{text}\n\nresults are in {out}")
+
+
+def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
+    from sb3_tdpg.enjoy import enjoy, parse_keywords
+
+    enjoy(model, env, parse_keywords(env_kwargs), **options)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"demo": _demo, "reproduce": _reproduce, "enjoy": _enjoy}
 
 
 def _make_parser() -> argparse.ArgumentParser:
@@ -54,7 +77,7 @@ def _make_parser() -> argparse.ArgumentParser:
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
     reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying"))
     reproduce.add_argument(
-        "--out", type=Path, default=None, help="folder for the results (default: results/<experiment>_reproduction)"
+        "--out", type=Path, default=None, help="folder for the results (default: one in results/ for each experiment)"
     )
     reproduce.add_argument("--publish", type=Path, default=None, help="copy all but the runs to this folder")
     reproduce.add_argument("--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, ball 5)")
@@ -63,6 +86,18 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     reproduce.add_argument("--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores)")
     _add_sizes(reproduce)
+
+    enjoy = commands.add_parser("enjoy", help="run a saved model, print what its episodes cost, record them as a film")
+    enjoy.add_argument("model", type=Path, help="the .zip file that model.save() wrote")
+    enjoy.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
+    enjoy.add_argument(
+        "--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        help="keywords of the environment, the values in YAML: texture=violet_dots robot_range=[-1,1]",
+    )  # fmt: skip
+    enjoy.add_argument("--seed", type=int, default=0)
+    enjoy.add_argument("--n-episodes", type=_positive, default=1)
+    enjoy.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
+    enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4 (needs ffmpeg)")
     return parser
 
 

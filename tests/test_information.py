@@ -413,6 +413,92 @@ def test_a_component_of_the_state_that_is_constant_does_no_harm_when_standardise
     assert th.isfinite(estimator(batch)).all()
 
 
+# -- episodes that are held out -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_on_held_out_episodes_learning_by_heart_shows(name):
+    batch = gaussian_batch(80, [[0.0, 0.0]] * 3)
+    settings = dict(hidden_sizes=(64, 64), batch_size=20, learning_rate=1e-2, warmup_gradient_steps=600)
+    unguarded = dict(refit_below=-math.inf, refit_above=math.inf)
+    report = build(name, 3, 2, 2, **settings, **unguarded, held_out=0.5).fit(batch)
+    assert report["trained_on"] > 0.1
+    assert report["held_out"] < 0.05
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_on_held_out_episodes_the_information_of_correlated_gaussians_is_found(name):
+    batch_size = 16 if name == "infonce" else 64
+    settings = dict(batch_size=batch_size, warmup_gradient_steps=1000, learning_rate=2e-3)
+    report = build(name, len(GAINS), 2, 2, **settings, held_out=0.4).fit(gaussian_batch(10_000, GAINS))
+    truth = gaussian_information(GAINS).sum()
+    assert report["held_out"] == pytest.approx(truth, abs=0.2)
+    assert report["trained_on"] == pytest.approx(report["held_out"], abs=0.2)
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_the_critics_never_see_an_episode_that_is_held_out(name, monkeypatch):
+    estimator = build(name, 2, 1, 1, **TINY_CRITIC, held_out=0.3, refit_above=-math.inf)  # and all are fitted again
+    numbers = th.arange(20.0).expand(2, 20)[..., None]  # states and TRVs carry the episode's number
+    batch = InformationBatch(numbers, numbers, numbers, th.ones_like(numbers))
+    seen, ascend = [], estimator._ascend
+
+    def spy(critic, optimizer, states, trvs, *args):
+        assert th.equal(states, trvs)
+        seen.append(frozenset(states.unique().tolist()))
+        ascend(critic, optimizer, states, trvs, *args)
+
+    estimated, estimate = [], estimator._estimate
+    monkeypatch.setattr(estimator, "_ascend", spy)
+    monkeypatch.setattr(estimator, "_estimate", lambda batch, t: (estimated.append(batch), estimate(batch, t))[1])
+    for _ in range(3):
+        estimator.fit(batch)
+        first, again = seen[-2:]
+        assert first == again
+        assert len(first) == 14
+        held_out = frozenset(estimated[-1].states.unique().tolist())
+        assert held_out == set(range(20)) - first
+    assert len(set(seen)) > 1, "the same episodes each time"
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_holding_out_nothing_reports_nothing_and_draws_no_number(name):
+    results = []
+    for settings in ({}, dict(held_out=0.0)):
+        th.manual_seed(0)
+        estimator = build(name, 4, 2, 2, **TINY_CRITIC, **settings)
+        assert set(estimator.fit(random_batch())) == {"critic_refits"}
+        results.append((parameters(estimator), th.rand(3)))
+    assert_same_parameters(results[0][0], results[1][0])
+    assert th.equal(results[0][1], results[1][1])
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_dead_episodes_count_neither_as_held_out_nor_as_trained_on(name):
+    batch = random_batch(alive=half_dead())
+    reports = []
+    for garbage in (0.5, 1e4):
+        th.manual_seed(0)
+        reports.append(build(name, 4, 2, 2, **TINY_CRITIC, held_out=0.4).fit(with_garbage(batch, garbage)))
+    assert reports[0] == pytest.approx(reports[1])
+    assert np.isfinite(list(reports[0].values())).all()
+
+
+@pytest.mark.parametrize("alive", [0, 1])
+def test_with_hardly_an_episode_alive_there_is_no_information_to_report(alive):
+    mask = th.zeros(4, 60, dtype=th.bool)
+    mask[:, :alive] = True
+    report = Mine(4, 2, 2, **TINY_CRITIC, held_out=0.4).fit(random_batch(alive=mask))
+    assert report == dict(critic_refits=0.0, trained_on=0.0, held_out=0.0)
+
+
+@pytest.mark.parametrize(("held_out", "n"), [(0.01, 60), (0.02, 60), (0.99, 60), (0.5, 3)])
+def test_a_share_that_leaves_too_few_episodes_on_either_side_is_refused(held_out, n):
+    message = rf"mi_kwargs: held_out={held_out} of {n} episodes .* at least 2; change the share, or use more episodes"
+    with pytest.raises(ValueError, match=message):
+        Mine(4, 2, 2, **TINY_CRITIC, held_out=held_out).fit(random_batch(n=n))
+
+
 # -- episodes that have ended ---------------------------------------------------------------------------------
 
 
@@ -430,7 +516,9 @@ def half_dead():
     return alive
 
 
-@pytest.mark.parametrize("settings", [{}, dict(standardize=True)], ids=["plain", "standardized"])
+@pytest.mark.parametrize(
+    "settings", [{}, dict(standardize=True), dict(held_out=0.2)], ids=["plain", "standardized", "held_out"]
+)
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))
 def test_what_stands_where_an_episode_has_ended_makes_no_difference(name, settings):
     batch = random_batch(alive=half_dead())
@@ -540,6 +628,9 @@ def test_anything_else_is_refused_with_the_list(estimator):
     ("nwj", dict(learning_rate=math.nan)),
     ("nwj", dict(batch_size=0)),
     ("nwj", dict(gradient_steps=0)),
+    ("nwj", dict(held_out=1.0)),
+    ("nwj", dict(held_out=-0.1)),
+    ("nwj", dict(held_out=math.nan)),
 ], ids=str)  # fmt: skip
 def test_a_keyword_out_of_its_range_is_refused(name, kwargs):
     with pytest.raises(ValueError, match=f"mi_kwargs: {next(iter(kwargs))}="):

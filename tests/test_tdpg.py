@@ -510,6 +510,14 @@ def test_the_log_has_what_the_paper_plots_and_the_single_steps_go_to_tensorboard
     assert not per_step & set(header)
 
 
+def test_what_the_critics_make_of_held_out_episodes_is_in_the_log():
+    model = tiny_tdpg(mi_estimator="mine", mi_kwargs={**TINY_CRITIC, "held_out": 0.2})
+    logged = []
+    train_epochs(model, 2, callback=AtEveryEpoch(lambda m: logged.append(dict(m.logger.name_to_value))))
+    for values in logged:
+        assert np.isfinite([values["mi/held_out"], values["mi/trained_on"]]).all()
+
+
 def test_tensorboard_logging_is_asked_for_as_in_sb3(tmp_path):
     pytest.importorskip("tensorboard")
     train_epochs(tiny_tdpg(tensorboard_log=str(tmp_path)), 1)

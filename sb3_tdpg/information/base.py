@@ -27,6 +27,11 @@ class InformationBatch(NamedTuple):
         keep = slice(None) if self.alive is None else self.alive[t]
         return InformationBatch(*(x[t, keep][None] for x in self[:4]))
 
+    def select(self, episodes: th.Tensor) -> InformationBatch:
+        """Only some episodes, given by their columns: ``(T, n, ...)``."""
+        alive = None if self.alive is None else self.alive[:, episodes]
+        return InformationBatch(*(x[:, episodes] for x in self[:4]))._replace(alive=alive)
+
 
 class InformationEstimator(nn.Module):
     """

@@ -17,6 +17,8 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.flat_adam import FlatAdam
 from sb3_tdpg.networks import BatchedMLP
 
+MIN_EPISODES = 2  # for an estimate: a state is paired with the TRVs of another episode
+
 
 class Scores(NamedTuple):
     """The critic's values at samples of p(x, x~) and of p(x) q(x~)."""
@@ -49,6 +51,9 @@ class CriticEstimator(InformationEstimator):
     :param refit_gradient_steps: See ``refit_below``.
     :param reset_moments: Whether Adam's moments start from zero at each epoch: the data have moved.
     :param standardize: Whether each component of the state is brought to mean 0 and variance 1 at each time step.
+    :param held_out: Share of the episodes, drawn anew at each fit, that the critics are not trained on. :meth:`fit`
+        then also reports the estimate on these, summed over the time steps, as ``"held_out"``, and that on the others
+        as ``"trained_on"``. Where the second is far above the first, the critics have learnt their samples by heart.
     """
 
     def __init__(
@@ -68,12 +73,18 @@ class CriticEstimator(InformationEstimator):
         refit_gradient_steps: int = 500,
         reset_moments: bool = True,
         standardize: bool = False,
+        held_out: float = 0.0,
     ) -> None:
         super().__init__(horizon, state_dim, trv_dim)
         for name, value in (("learning_rate", learning_rate), ("batch_size", batch_size),
                             ("gradient_steps", gradient_steps)):  # fmt: skip
             if not value > 0:
                 raise ValueError(f"mi_kwargs: {name}={value} must be positive")
+        if not 0 <= held_out < 1:
+            raise ValueError(
+                f"mi_kwargs: held_out={held_out} must be in [0, 1): it is the share of the episodes that the critics "
+                "are not trained on"
+            )
         self.sizes = (state_dim + trv_dim, *hidden_sizes, 1)
         self.activation_fn = activation_fn
         self.learning_rate = learning_rate
@@ -85,6 +96,7 @@ class CriticEstimator(InformationEstimator):
         self.refit_gradient_steps = refit_gradient_steps
         self.reset_moments = reset_moments
         self.standardize = standardize
+        self.held_out = held_out
         self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
         self.optimizer = FlatAdam(learning_rate)
         self.is_warm = False
@@ -125,26 +137,58 @@ class CriticEstimator(InformationEstimator):
 
     def fit(self, batch: InformationBatch) -> dict[str, float]:
         """Train the critics on the epoch's samples (alg:mine); see :class:`InformationEstimator`."""
-        states, trvs = batch.states.detach(), batch.trvs.detach()
+        train, held_out = self._hold_out(batch)
+        states, trvs = train.states.detach(), train.trvs.detach()
         if self.standardize:
-            self._update_scaling(batch)
+            self._update_scaling(train)
         states = self._scale(states)
         steps = th.arange(self.horizon, device=trvs.device)
-        if batch.alive is not None:
-            steps = steps[batch.alive.sum(1) >= self.min_episodes(batch.alive.shape[1])]
+        if train.alive is not None:
+            steps = steps[train.alive.sum(1) >= self.min_episodes(train.alive.shape[1])]
         if len(steps) == 0:
-            return {"critic_refits": 0.0}
+            return self._report(0, train, held_out, steps)
 
         if self.reset_moments:
             self.optimizer.forget()
         n_steps = self.gradient_steps if self.is_warm else max(self.warmup_gradient_steps, self.gradient_steps)
-        self._ascend(self.critic, self.optimizer, states, trvs, batch.alive, steps, n_steps)
+        self._ascend(self.critic, self.optimizer, states, trvs, train.alive, steps, n_steps)
         self.is_warm = True
 
+        # On all episodes, as the policy's loss is.
         broken = steps[self._is_broken(batch)[steps]]
         if len(broken) > 0:
-            self._refit(states, trvs, batch.alive, broken)
-        return {"critic_refits": float(len(broken))}
+            self._refit(states, trvs, train.alive, broken)
+        return self._report(len(broken), train, held_out, steps)
+
+    def _hold_out(self, batch: InformationBatch) -> tuple[InformationBatch, InformationBatch | None]:
+        """Divide the episodes at random into those that are trained on and those that are not, if there are any."""
+        if self.held_out == 0:
+            return batch, None
+        n = batch.trvs.shape[1]
+        n_held_out = round(self.held_out * n)
+        if min(n_held_out, n - n_held_out) < MIN_EPISODES:
+            raise ValueError(
+                f"mi_kwargs: held_out={self.held_out} of {n} episodes keeps {n_held_out} from the critics and leaves "
+                f"them {n - n_held_out}: each needs at least {MIN_EPISODES}; change the share, or use more episodes"
+            )
+        order = th.randperm(n, device=batch.trvs.device)
+        return batch.select(order[n_held_out:]), batch.select(order[:n_held_out])
+
+    @th.no_grad()
+    def _report(
+        self, n_refits: int, train: InformationBatch, held_out: InformationBatch | None, steps: th.Tensor
+    ) -> dict[str, float]:
+        """What :meth:`fit` returns; ``steps`` are those whose critics were trained."""
+        report = {"critic_refits": float(n_refits)}
+        if held_out is not None:
+            report["trained_on"] = self._total(train, steps)
+            report["held_out"] = self._total(held_out, steps)
+        return report
+
+    def _total(self, batch: InformationBatch, steps: th.Tensor) -> float:
+        """Sum the estimates of some steps, each from the episodes that live there, if there are enough."""
+        living = ((t, batch.at(t)) for t in steps.tolist())
+        return float(sum(self._estimate(at, t).item() for t, at in living if at.trvs.shape[1] >= MIN_EPISODES))
 
     @th.no_grad()
     def _ascend(

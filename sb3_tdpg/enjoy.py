@@ -1,0 +1,142 @@
+"""Watch a saved policy: run some episodes, print what they cost, record them as a film."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import yaml
+
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.animation import Episode, check_animation_path, save_animation
+from sb3_tdpg.evaluation.environments import check_models_fit
+from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.tdpg import TDPG
+
+
+def enjoy(
+    model_path: str | os.PathLike[str],
+    env_id: str,
+    env_kwargs: Mapping[str, Any] | None = None,
+    *,
+    seed: int = 0,
+    n_episodes: int = 1,
+    deterministic: bool = False,
+    record: str | os.PathLike[str] | None = None,
+) -> list[Episode]:
+    """
+    Run episodes of a saved model and print cost and final state of each.
+
+    :param model_path: What ``model.save`` wrote.
+    :param env_id: A registered id, also in the ``module:id`` form.
+    :param env_kwargs: Keywords of the environment's constructor.
+    :param seed: Seed of the environment and of the policy's sampling.
+    :param n_episodes: How many.
+    :param deterministic: Act without noise, which is another policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
+    :param record: Also write a film there, ``.gif`` or ``.mp4``: what the environment draws, and the TRVs over time.
+    :return: the episodes; without ``record`` they have no pictures
+    :raises ValueError: if there is no model, it does not fit the environment, or no film can be made.
+    """
+    if record is not None:
+        check_animation_path(record)
+    model = _load(model_path)
+    env_kwargs = dict(env_kwargs or {})
+    if record is not None:
+        env_kwargs.setdefault("render_mode", "rgb_array")
+    check_models_fit({str(model_path): model}, [Scenario("enjoy", env_id, env_kwargs)])
+    seeds = evaluation_seeds(seed)
+    with contextlib.closing(gym.make(env_id, **env_kwargs)) as env, isolated_randomness(seeds.policy, model):
+        if record is not None and env.render_mode != "rgb_array":
+            raise ValueError(
+                f"{env_id} with render_mode={env.render_mode!r} gives no pictures to record: it needs 'rgb_array'"
+            )
+        episodes = []
+        for i in range(n_episodes):
+            observation, _ = env.reset(seed=seeds.env if i == 0 else None)
+            episode, final_state = _run_episode(model, env, observation, deterministic, record is not None)
+            print(f"episode {i + 1}: cost {episode.costs.sum():.2f}{_described(final_state)}", flush=True)
+            episodes.append(episode)
+        if n_episodes > 1:
+            print(f"mean cost {np.mean([episode.costs.sum() for episode in episodes]):.2f}")
+        if record is not None:
+            save_animation(episodes, record, horizon=model.horizon, fps=env.metadata.get("render_fps", 10))
+            print(f"the film is {record}")
+    return episodes
+
+
+def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
+    """
+    Read keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
+
+    :param texts: Each ``key=value``, the value in YAML: a number, a text, true, false, null or a list of these.
+    :raises ValueError: if one is something else, or a key comes twice.
+    """
+    keywords: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (equals and key.isidentifier()):
+            raise ValueError(f"{text!r} is no keyword of an environment: write key=value, for instance horizon=10")
+        if key in keywords:
+            raise ValueError(f"{text!r}: {key} is given twice")
+        try:
+            keywords[key] = _plain(yaml.safe_load(value))
+        except (yaml.YAMLError, TypeError) as e:
+            raise ValueError(
+                f"{text!r}: the value must be a number, a text, true, false, null or a list of these, like [-1, 0.5]"
+            ) from e
+    return keywords
+
+
+def _plain(value: Any) -> Any:
+    """Refuse what is neither a scalar nor a list, and read 1e-3 as a number, which PyYAML takes for a text."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return float(value)
+    if not isinstance(value, (str, bool, int, float, type(None))):
+        raise TypeError(f"{value!r} is a {type(value).__name__}")
+    return value
+
+
+def _load(path: str | os.PathLike[str]) -> TDPG:
+    try:
+        return TDPG.load(Path(path))
+    except OSError as e:
+        raise ValueError(f"{path} cannot be read ({e.strerror}): give the .zip file that model.save() wrote") from e
+
+
+def _run_episode(
+    model: TDPG, env: gym.Env, observation: np.ndarray, deterministic: bool, with_pictures: bool
+) -> tuple[Episode, np.ndarray | None]:
+    """Run the episode that begins with an observation; return its final state, too, where the environment tells it."""
+    pictures = [_picture(env)] if with_pictures else []
+    memory, trvs, costs, is_over = None, [], [], False
+    while not is_over:
+        action, memory = model.predict(observation, memory, deterministic=deterministic)
+        assert memory is not None
+        observation, reward, terminated, truncated, info = env.step(action)
+        trvs.append(memory[0][0])
+        costs.append(-float(reward))
+        is_over = terminated or truncated
+        if with_pictures:
+            pictures.append(_picture(env))
+    return Episode(pictures, np.stack(trvs), np.array(costs)), info.get("state")
+
+
+def _picture(env: gym.Env) -> np.ndarray:
+    picture = env.render()
+    if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
+        raise ValueError(f"render() of {env} gave no picture: it must return an array (height, width, 3) of uint8")
+    return picture
+
+
+def _described(state: np.ndarray | None) -> str:
+    if state is None:
+        return ""
+    return f", final state {np.array2string(np.asarray(state), precision=3, suppress_small=True)}"

@@ -1,0 +1,170 @@
+"""
+Films of a policy: what the environment draws, and below it the task-relevant variables (TRVs) over time.
+
+Dimension key: T time steps of an episode, Z TRVs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from itertools import cycle, product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from sb3_tdpg.evaluation.figures import INK, PALETTE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 100
+MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, or else the writing would not fit below them
+PANEL_HEIGHT = 190  # pixels, of the TRVs
+LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # pixels around the axes; the legend is at the right
+HOLD = 1.0  # s for which the last frame of an episode stays
+LINE_STYLES = ("-", (0, (4, 1.5)), (0, (1, 1)))
+
+
+class Episode(NamedTuple):
+    """One episode that can be shown."""
+
+    pictures: Sequence[np.ndarray]  # T + 1 of (H, W, 3) uint8, of x_0 ... x_T
+    trvs: np.ndarray  # (T, Z)
+    costs: np.ndarray  # (T,), the last one with the terminal cost
+
+
+def check_animation_path(path: str | os.PathLike[str]) -> None:
+    """
+    Tell whether an animation can be written there, before any episode is run.
+
+    :raises ValueError: if the ending is unknown, or what writes such a file is not installed.
+    """
+    ending = Path(path).suffix
+    if ending not in (".gif", ".mp4"):
+        raise ValueError(f"{path}: the ending {ending!r} is no format of an animation: use .gif or .mp4")
+    try:
+        from matplotlib.animation import FFMpegWriter
+    except ImportError as e:
+        raise ValueError("an animation needs matplotlib: pip install sb3_tdpg[plots]") from e
+    if ending == ".mp4" and not FFMpegWriter.isAvailable():
+        raise ValueError(f"{path}: an .mp4 is written by ffmpeg, which is not on the PATH: install it, or use .gif")
+
+
+def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float) -> None:
+    """
+    Write episodes as a film, one after the other.
+
+    The axis of time always goes to the horizon, and all episodes share the limits of the TRVs, so that nothing but the
+    lines moves. The last frame of each episode stays for about a second.
+
+    :param episodes: What is shown; their pictures have one size.
+    :param path: ``.gif`` or ``.mp4``. Folders are made, and at no time a half-written file is there.
+    :param horizon: Controls in an episode T.
+    :param fps: Frames a second. A GIF counts in hundredths of a second.
+    :raises ValueError: see :func:`check_animation_path`.
+    """
+    check_animation_path(path)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.partial{path.suffix}")  # ffmpeg tells the format by the ending
+    film = _Film(episodes, horizon)
+    (_write_gif if path.suffix == ".gif" else _write_mp4)(film, partial, fps)
+    os.replace(partial, path)
+
+
+class _Film:
+    """A figure, and what changes in it from frame to frame."""
+
+    def __init__(self, episodes: Sequence[Episode], horizon: int) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self.episodes = episodes
+        height, width = episodes[0].pictures[0].shape[:2]
+        self._factor = -(-MIN_WIDTH // width)
+        height, width = self._factor * height, self._factor * width
+        self.figure: Figure = Figure(figsize=(width / DPI, (height + PANEL_HEIGHT) / DPI), dpi=DPI)
+        self.canvas = FigureCanvasAgg(self.figure)
+        # Pixel by pixel: the picture in axes would be resampled.
+        self._picture = self.figure.figimage(self._enlarged(episodes[0].pictures[0]), xo=0, yo=PANEL_HEIGHT)
+        self._axes = self.figure.add_axes((
+            LEFT / width,
+            BOTTOM / (height + PANEL_HEIGHT),
+            (width - LEFT - RIGHT) / width,
+            (PANEL_HEIGHT - TOP - BOTTOM) / (height + PANEL_HEIGHT),
+        ))  # fmt: skip
+        self._draw_axes(horizon)
+
+    def _draw_axes(self, horizon: int) -> None:
+        axes = self._axes
+        trvs = np.concatenate([episode.trvs for episode in self.episodes])
+        low, high = float(trvs.min()), float(trvs.max())
+        margin = 0.05 * (high - low) or 1.0
+        axes.set_xlim(0, horizon)
+        axes.set_ylim(low - margin, high + margin)
+        axes.locator_params(axis="x", integer=True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+        axes.grid(alpha=0.25)
+        axes.set_xlabel("time step $t$", fontsize=9)
+        axes.set_ylabel(r"TRVs $\tilde{x}_t$", fontsize=9)
+        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
+        styles = cycle(product(LINE_STYLES, PALETTE))
+        looks: dict[str, Any] = dict(linewidth=1.3, marker="o", markersize=2.5, clip_on=False)
+        self._lines = [
+            axes.plot([], [], label=str(i + 1), linestyle=style, color=color, **looks)[0]
+            for i, (style, color) in zip(range(trvs.shape[1]), styles, strict=False)
+        ]
+        axes.legend(
+            title="TRV", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7, title_fontsize=8,
+            ncols=-(-len(self._lines) // 8), handlelength=1.2, labelspacing=0.2, columnspacing=0.6,
+        )  # fmt: skip
+
+    def frames(self) -> Iterator[bool]:
+        """Set the figure to one frame after the other; tell whether it is the last one of its episode."""
+        for number, episode in enumerate(self.episodes, start=1):
+            cost_so_far = np.concatenate([[0.0], episode.costs.cumsum()])
+            for t, picture in enumerate(episode.pictures):
+                self._picture.set_data(self._enlarged(picture))
+                self._now.set_xdata([t, t])
+                for line, values in zip(self._lines, episode.trvs.T, strict=True):
+                    line.set_data(np.arange(len(values))[: t + 1], values[: t + 1])
+                self._axes.set_title(
+                    f"episode {number}, step {t}: cost so far {cost_so_far[t]:.2f}", loc="left", fontsize=9, color=INK
+                )
+                yield t == len(episode.pictures) - 1
+
+    def image(self) -> Image.Image:
+        """Draw the figure as it is set."""
+        self.canvas.draw()
+        return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3])
+
+    def _enlarged(self, picture: np.ndarray) -> np.ndarray:
+        return picture.repeat(self._factor, axis=0).repeat(self._factor, axis=1)
+
+
+def _write_gif(film: _Film, path: Path, fps: float) -> None:
+    images, durations = [], []
+    for is_last in film.frames():
+        images.append(film.image())
+        # In ms; players slow down what is faster than 20 ms a frame.
+        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))
+    # One palette for all, since a palette for each frame flickers. By the range of the colours and not by how often
+    # they occur: what is small keeps its colour. The step of k-means then brings what is large to its own.
+    sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
+    palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
+
+
+def _write_mp4(film: _Film, path: Path, fps: float) -> None:
+    from matplotlib.animation import FFMpegWriter
+
+    writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]  # ffmpeg takes fractions, too
+    with writer.saving(film.figure, str(path), DPI):
+        for is_last in film.frames():
+            for _ in range(max(1, round(HOLD * fps)) if is_last else 1):
+                writer.grab_frame()
