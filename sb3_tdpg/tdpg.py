@@ -60,11 +60,11 @@ class TDPG(OnPolicyAlgorithm):
     state comes from ``info["state"]`` of ``reset`` and ``step`` together with an attribute ``state_space``; an
     environment without it is taken as fully observed if its observation is a vector.
 
-    :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.policies.TRVPolicy`.
-    :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
-    Where "default" names two values, the first is for vector observations and the second for images
+    Where a default has two values below, the first is for vector observations and the second for images
     (:mod:`sb3_tdpg.defaults`).
 
+    :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.policies.TRVPolicy`.
+    :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
     :param beta: Weight of the cost against the information, a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty. ``"auto"``: the information is minimised as far as the expected cost stays below
         ``cost_limit`` (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: 1/75 and ``"auto"``; ``"auto"`` wherever a

@@ -472,3 +472,20 @@ def test_an_image_file_of_any_mode_becomes_the_wall(tmp_path, mode, renderer):
     Image.fromarray(np.full((30, 50, 3), 204, np.uint8)).convert(mode).save(path)
     image = BallCatchEnv(texture=path, renderer=renderer).reset(seed=0)[0]
     np.testing.assert_allclose(image[:, 20:40].reshape(3, -1).T, 204 * 0.751, atol=2)
+
+
+@pytest.mark.parametrize("renderer", ["pybullet", "fast"])
+def test_with_a_wall_at_rest_only_the_ball_tells_where_the_robot_is(renderer):
+    """Robot and ball moved together: the picture is the same; the ball moved alone: it is not. The state is true."""
+    env = BallCatchEnv(renderer=renderer, wall_stands_still=True)
+    state = np.array([[0.5, 4.0, 2.5, -4.5, 1.0]])
+    together = state + np.array([[1.0, 1.0, 0.0, 0.0, 0.0]])
+    alone = state + np.array([[0.0, 1.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(env._sensor(state), env._sensor(together))
+    assert (env._sensor(state) != env._sensor(alone)).any()
+    ordinary = BallCatchEnv(renderer=renderer)
+    assert (ordinary._sensor(state) != ordinary._sensor(together)).any()
+    _, info = env.reset(seed=0)
+    np.testing.assert_array_equal(info["state"], ordinary.reset(seed=0)[1]["state"])
+    env.close()
+    ordinary.close()

@@ -25,6 +25,7 @@ from sb3_tdpg.evaluation import (
     comparison_markdown,
     cost_histograms,
     evaluate_scenarios,
+    knowledge,
     lava_trajectories,
     probability_of_improvement,
     provenance,
@@ -502,3 +503,25 @@ def test_a_failing_write_leaves_the_old_file_whole(records, tmp_path, monkeypatc
 def test_a_frame_needs_a_name_that_tells_its_format(records, tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.csv or \.csv\.gz"):
         write_frame_atomically(records, tmp_path / "episodes.parquet")
+
+
+def test_the_regression_on_the_trvs_finds_what_is_in_them_and_nothing_else():
+    rng = np.random.default_rng(0)
+    trvs = rng.standard_normal((3, 400, 2))
+    told = trvs @ np.array([[1.0], [-2.0]]) + 4.0
+    noisy = told + np.sqrt(5.0) * rng.standard_normal(told.shape)  # as much noise as there is signal
+    assert knowledge._r2(trvs, told) == pytest.approx(1.0)
+    assert knowledge._r2(trvs, noisy) == pytest.approx(0.5, abs=0.05)
+    assert knowledge._r2(trvs, rng.standard_normal(told.shape)) < 0.05
+
+
+def test_the_knowledge_of_a_ball_catching_policy_is_measured_without_a_trace():
+    model = TDPG("TRVPolicy", "BallCatch-v0", n_episodes=4, seed=0, device="cpu")
+    th.manual_seed(3)
+    first = knowledge.trv_knowledge(model, n_walls=2, n_episodes=10)
+    after = th.rand(1)
+    assert set(first) == {"position", "brightness", "wall"}
+    assert all(0 <= value <= 1 for value in first.values())
+    assert knowledge.trv_knowledge(model, n_walls=2, n_episodes=10) == first
+    th.manual_seed(3)
+    assert th.rand(1) == after

@@ -8,6 +8,7 @@ from sb3_tdpg.evaluation.figures import (
     save_figure,
     training_curves,
 )
+from sb3_tdpg.evaluation.knowledge import trv_knowledge
 from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.records import evaluate_scenarios
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, probability_of_improvement
@@ -30,6 +31,7 @@ __all__ = [
     "save_figure",
     "summary_table",
     "training_curves",
+    "trv_knowledge",
     "write_frame_atomically",
     "write_run_config",
 ]

@@ -1,0 +1,90 @@
+"""
+What the TRVs of ball catching still know of things that do not matter: a regression of each on the TRVs.
+
+Dimension key: T horizon, N episodes, Z TRVs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.envs.textures import load_texture
+from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+
+# Walls that no policy was trained or tested on.
+FIRST_WALL = 1000
+DARKEST = 0.4
+
+
+def trv_knowledge(model: Any, *, n_walls: int = 16, n_episodes: int = 40, seed: int = 0) -> dict[str, float]:
+    """
+    Tell how much of the robot's position, of the brightness and of the wall's colour can be read from the TRVs.
+
+    Episodes run in front of random walls, every one with all its images darkened by a factor of its own. At each time
+    step each quantity is regressed linearly on the TRVs of half of the episodes, and R^2 taken on the other half.
+
+    :param model: A model of ``BallCatch-v0``.
+    :param n_walls: Random walls.
+    :param n_episodes: Episodes in front of each.
+    :param seed: Seed of the episodes and of the darkening.
+    :return: R^2, averaged over time and not below 0, of ``"position"`` (d_t), ``"brightness"`` (the factor) and
+        ``"wall"`` (its mean colour, averaged over red, green and blue)
+    """
+    seeds = evaluation_seeds(seed)
+    rng = np.random.default_rng(seeds.env)
+    trvs, positions, factors, colors = [], [], [], []
+    for wall in range(FIRST_WALL, FIRST_WALL + n_walls):
+        texture = load_texture(f"random-{wall}")
+        scenario = Scenario(str(wall), "BallCatch-v0", dict(renderer="fast", texture=texture))
+        env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
+        env.seed(int(rng.integers(2**31)))
+        factor = rng.uniform(DARKEST, 1.0, n_episodes)
+        with isolated_randomness(seeds.policy, model):
+            of_wall = _run(model, env, factor)
+        trvs.append(of_wall[0])
+        positions.append(of_wall[1])
+        factors.append(factor)
+        colors.append(np.broadcast_to(texture.mean(axis=(0, 1)), (n_episodes, 3)))
+        env.close()
+    known = np.concatenate(trvs, axis=1)  # (T, N, Z)
+    horizon = len(known)
+
+    def constant(values: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(values, (horizon, *values.shape))
+
+    position = np.concatenate(positions, axis=1)[..., None]
+    brightness = constant(np.concatenate(factors)[:, None])
+    color = constant(np.concatenate(colors))
+    return {name: _r2(known, y) for name, y in (("position", position), ("brightness", brightness), ("wall", color))}
+
+
+def _run(model: Any, env: Any, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Run an episode in each environment: its TRVs ``(T, N, Z)`` and the robot's positions ``(T, N)``."""
+    observations = env.reset()
+    states = np.stack([info["state"] for info in env.unwrapped.reset_infos])
+    memory, start = None, np.ones(len(factor), dtype=bool)
+    trvs, positions = [], []
+    for _ in range(model.horizon):
+        positions.append(states[:, 0])
+        darkened = np.rint(observations * factor[:, None, None, None]).astype(np.uint8)
+        actions, memory = model.predict(darkened, memory, start, deterministic=False)
+        observations, _, start, infos = env.step(actions)
+        states = np.stack([info["state"] for info in infos])
+        trvs.append(memory[0])
+    return np.stack(trvs), np.stack(positions)
+
+
+def _r2(trvs: np.ndarray, targets: np.ndarray) -> float:
+    """R^2 on the odd episodes of a linear regression on the even ones, averaged over time and components."""
+    x = np.concatenate([trvs, np.ones_like(trvs[..., :1])], axis=-1)
+    values = []
+    for x_t, y_t in zip(x, targets, strict=True):
+        coefficients, *_ = np.linalg.lstsq(x_t[::2], y_t[::2], rcond=None)
+        residual = y_t[1::2] - x_t[1::2] @ coefficients
+        total = y_t[1::2] - y_t[::2].mean(axis=0)
+        values.append(1 - (residual**2).sum(axis=0) / (total**2).sum(axis=0))
+    return float(np.clip(values, 0, None).mean())
