@@ -434,12 +434,11 @@ class TDPG(OnPolicyAlgorithm):
                 if old_log_prob is None:
                     policy_loss = policy_gradient_loss(log_prob, advantages[:, episodes], part.alive)
                 else:
-                    policy_loss = clipped_policy_loss(
-                        log_prob, old_log_prob[:, episodes], advantages[:, episodes], part.alive, clip_range
-                    )
+                    old = old_log_prob[:, episodes]
+                    policy_loss = clipped_policy_loss(log_prob, old, advantages[:, episodes], part.alive, clip_range)
+                    self._record_distance(log_prob.detach() - old, part.alive, clip_range)
                 loss = policy_loss
-                if mi_coef > 0.0:
-                    assert rebuilt is not None
+                if rebuilt is not None and mi_coef > 0.0:
                     information = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
                     penalty = mi_coef * information_loss(information)
                     loss = loss + penalty / cost_scale
@@ -447,8 +446,6 @@ class TDPG(OnPolicyAlgorithm):
                 self._step_optimizer(loss, {"costs": batch.costs, "policy loss": policy_loss, "loss": loss})
                 self.logger.record_mean("train/policy_loss", policy_loss.item())
                 self.logger.record_mean("train/loss", loss.item())
-                if old_log_prob is not None:
-                    self._record_distance(log_prob.detach() - old_log_prob[:, episodes], part.alive, clip_range)
         self.epoch += 1
         self._n_updates += self.n_epochs
         mean_cost = batch.costs.sum(0).mean().item()
