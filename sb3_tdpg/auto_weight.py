@@ -16,12 +16,16 @@ class AutoWeight:
         log w += rate * clip((C - cost) / |C|, -2, 1)
 
     :param cost_limit: C
-    :param rate: Change of log w for an epoch whose cost is 0.
+    :param rate: Change of log w for an epoch whose cost is |C| below the limit, the largest there is.
+    :param max_growth: The weight stops at this multiple of its start: where the limit can be kept without any
+        information, nothing else would hold it.
     """
 
-    def __init__(self, cost_limit: float, rate: float = 0.3) -> None:
+    def __init__(self, cost_limit: float, rate: float = 0.3, max_growth: float = 1000.0) -> None:
         self.cost_limit = cost_limit
         self.rate = rate
+        self.max_growth = max_growth
+        self._start = 0.0
         self.value = 0.0
         """w = 1 / beta, in units of cost per nat."""
 
@@ -35,5 +39,6 @@ class AutoWeight:
         scale = abs(self.cost_limit)
         if self.value > 0.0:
             self.value *= math.exp(self.rate * min(max((self.cost_limit - cost) / scale, -2.0), 1.0))
+            self.value = min(self.value, self.max_growth * self._start)
         elif cost <= self.cost_limit:
-            self.value = scale / max(information, 1.0)
+            self.value = self._start = scale / max(information, 1.0)

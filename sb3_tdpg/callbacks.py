@@ -113,7 +113,10 @@ class SelectionCallback(_TDPGCallback):
 
     def _init_callback(self) -> None:
         resumes = self.model.num_timesteps > 0
-        if resumes and self.best is None and self.save_path is not None and self.save_path.exists():
+        # The record is written last; without it, that very epoch is run again.
+        saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
+        if resumes and self.best is None and saved:
+            assert self.save_path is not None
             record = json.loads(_record_path(self.save_path).read_text())
             self.best = Candidate(record["epoch"], record["cost"], record["information"])
             # Not the whole model: loading that seeds all random number generators.

@@ -32,11 +32,13 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     get_estimator_class(settings["mi_estimator"])
     get_baseline(settings["baseline"])
     n_episodes, batch_size = settings["n_episodes"], settings["batch_size"]
-    for name in ("n_episodes", "n_epochs", "batch_size"):
+    for name in ("n_episodes", "n_epochs"):
         check_count(name, settings[name])
+    if batch_size is not None:
+        check_count("batch_size", batch_size)
     if n_episodes < 2:
         raise ValueError(f"n_episodes={n_episodes} must be at least 2: baseline and information are taken over a batch")
-    if not 2 <= batch_size <= n_episodes:
+    if batch_size is not None and not 2 <= batch_size <= n_episodes:
         raise ValueError(
             f"batch_size={batch_size} must be between 2 and n_episodes={n_episodes}: it is a number of episodes, since "
             "the memory of an episode cannot be cut"
@@ -47,10 +49,11 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
                 f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
                 "returns one; float('inf') turns the clipping off"
             )
-    if settings["n_epochs"] > 1 and not callable(settings["clip_range"]) and math.isinf(settings["clip_range"]):
+    n_updates = settings["n_epochs"] * (1 if batch_size is None else math.ceil(n_episodes / batch_size))
+    if n_updates > 1 and not callable(settings["clip_range"]) and math.isinf(settings["clip_range"]):
         raise ValueError(
-            f"n_epochs={settings['n_epochs']} passes over the same rollouts need a limit to how far the policy may go: "
-            "give clip_range=0.2, as PPO has, or n_epochs=1"
+            f"n_epochs={settings['n_epochs']} and batch_size={batch_size} make {n_updates} updates with the same "
+            "rollouts, which need a limit to how far the policy may go: give clip_range=0.2, as PPO has, or make one"
         )
     encoder_gradient = settings["encoder_gradient"]
     if encoder_gradient not in ENCODER_GRADIENTS:

@@ -56,7 +56,7 @@ IMAGE = Defaults(
 
 
 def defaults_for(observation_space: spaces.Space | None) -> Defaults:
-    """Return :data:`IMAGE` for an image space (channels first or last), :data:`VECTOR` for any other, or none."""
+    """Return :data:`IMAGE` for images of bytes (channels first or last), :data:`VECTOR` for all else, or none."""
     is_image = observation_space is not None and is_image_space(observation_space, check_channels=False)
     return IMAGE if is_image else VECTOR
 
@@ -70,8 +70,7 @@ def fill_in(given: Mapping[str, Any], observation_space: spaces.Space | None) ->
     """
     defaults = defaults_for(observation_space)
     settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
-    if given["batch_size"] is None:
-        n_episodes = settings["n_episodes"]
+    if given["batch_size"] is None and defaults.batch_size is not None:
         # Whatever number of episodes is asked for, the default must fit.
-        settings["batch_size"] = n_episodes if defaults.batch_size is None else min(defaults.batch_size, n_episodes)
+        settings["batch_size"] = min(defaults.batch_size, settings["n_episodes"])
     return settings

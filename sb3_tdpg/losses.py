@@ -51,18 +51,22 @@ def clipped_policy_loss(
     return (alive * th.maximum(cost * ratio, cost * clipped)).sum(dim=0).mean()
 
 
-def normalized(advantages: th.Tensor, alive: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def normalized(
+    advantages: th.Tensor, alive: th.Tensor, negligible: th.Tensor | float = 0.0
+) -> tuple[th.Tensor, th.Tensor]:
     """
     Bring advantages to mean 0 and variance 1 over all steps of living episodes.
 
     :param advantages: ``(T, N)``
     :param alive: ``(T, N)``
+    :param negligible: A standard deviation up to this is rounding: the advantages are not scaled up then.
     :return: the advantages ``(T, N)``, and the standard deviation that they were divided by: what is added to their
         loss must be divided by it, too, if its weight is to stay the same
     """
     n = alive.sum()
     mean = (alive * advantages).sum() / n
-    std = ((alive * (advantages - mean) ** 2).sum() / n).sqrt() + 1e-8
+    std = ((alive * (advantages - mean) ** 2).sum() / n).sqrt()
+    std = th.where(std > negligible, std, th.ones_like(std))
     return (advantages - mean) / std, std
 
 

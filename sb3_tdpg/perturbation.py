@@ -20,15 +20,15 @@ PATTERN_SIZES = (2, 4, 8, 16, 32, 64)
 
 class VecImagePerturbation(VecEnvWrapper):
     r"""
-    Perturb every image of a vectorised environment, each at random and on its own.
+    Perturb every image of a vectorised environment at random.
 
     In the order in which it is done, with y in [0, 1] and fresh random numbers for every image:
 
     1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, rows
-       brought to the sum 1;
-    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p of cells of a random size; a is
-       uniform up to ``pattern``, 0 for three images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of
-       the image's;
+       divided by their sums (or by 0.3, if that is more);
+    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p (the size of its cells, and
+       whether they have edges, are drawn once for all images of a step); a is uniform up to ``pattern``, 0 for three
+       images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's;
     3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
        [0, 1];
     4. noise: normal at every pixel, with a standard deviation uniform up to ``noise``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing as mp
 import os
@@ -27,7 +28,8 @@ from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
 
-CHECKPOINT_EPOCHS = 50
+# A checkpoint resets the environments, so that how often it is made belongs to the run.
+MAX_CHECKPOINT_EPOCHS = 50
 # Attempts must not share their seeds with other runs.
 SEEDS_BETWEEN_ATTEMPTS = 1000
 
@@ -76,6 +78,7 @@ class Run:
             seed=self.seed,
             max_attempts=self.max_attempts,
             start=None if self.start is None else self.start.name,
+            start_policy=None if self.start is None else _digest(self.start / "model.zip"),
             settings=self.settings,
         )
 
@@ -94,8 +97,7 @@ def complete_run(
     ``folder`` then holds ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information;
     missing if no epoch met the limits), ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings,
     seeds, versions, commit) and,
-    written last, ``episodes.csv`` (a row for each evaluation episode). Attempts after the first have folders of their
-    own in it.
+    written last, ``episodes.csv`` (a row for each evaluation episode). Attempts in vain stay as ``attempt<i>/``.
 
     :param run: What to train.
     :param folder: Where to.
@@ -105,7 +107,8 @@ def complete_run(
     :return: ``folder``
     :raises ValueError: if the folder holds a run with other settings; nothing of it is touched.
     """
-    config = {**run.config, "n_eval_episodes": n_eval_episodes}
+    rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
+    config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
     _check_same_run(folder / "config.json", config)
     if (folder / "episodes.csv").exists():
         return folder
@@ -132,14 +135,19 @@ def complete_run(
     return folder
 
 
+def _digest(path: Path) -> str:
+    """A name for the content of a file, if there is one."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.exists() else "not trained yet"
+
+
 def _check_same_run(path: Path, config: Mapping[str, Any]) -> None:
     if not path.exists():
         return
     found = json.loads(path.read_text())
     found.pop("provenance")
     wanted = jsonable(config)
-    if found != wanted:
-        changed = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+    changed = sorted(key for key in found if found[key] != wanted.get(key))
+    if changed:
         raise ValueError(
             f"{path.parent} holds a run with another {', '.join(changed)}: choose another folder or remove it"
         )
@@ -156,6 +164,8 @@ def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TD
         return TDPG.load(result, device="cpu"), selected_path.with_suffix(".json").exists()
     training = make_training(run.env_id, run.settings, seed=run.seed + SEEDS_BETWEEN_ATTEMPTS * attempt, device="cpu")
     n_timesteps, model = training.n_timesteps, training.model
+    epochs = n_timesteps // (model.n_episodes * model.horizon)
+    checkpoint_epochs = max(1, min(MAX_CHECKPOINT_EPOCHS, epochs // 4))
     if checkpoint.exists():
         model = TDPG.load(checkpoint, env=model.env, device="cpu")
         n_timesteps = model.remaining_timesteps
@@ -165,7 +175,7 @@ def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TD
         model.policy.load_state_dict(start.policy.state_dict())
     log = make_output_format("csv", str(folder), log_suffix=f"_{model.num_timesteps:08d}")
     model.set_logger(Logger(str(folder), [log]))
-    callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, CHECKPOINT_EPOCHS)]
+    callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, checkpoint_epochs)]
     selection = training.selection
     if selection is not None:
         selection.save_path = selected_path

@@ -201,7 +201,7 @@ class TDPG(OnPolicyAlgorithm):
         self.baseline = baseline
         self.encoder_gradient: str = settings["encoder_gradient"]
         self.n_epochs: int = settings["n_epochs"]
-        self.batch_size: int = settings["batch_size"]
+        self.batch_size: int | None = settings["batch_size"]
         self.clip_range: float | Schedule = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.auto_weight: AutoWeight | None = None
@@ -223,8 +223,6 @@ class TDPG(OnPolicyAlgorithm):
     def _setup_model(self) -> None:
         # Again: load() sets attributes without the constructor.
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
-        if self.beta != "auto":
-            self.cost_limit = None  # that of the file, if beta was given to load()
         check_arguments({**vars(self), "policy": self.policy_class})
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -412,21 +410,26 @@ class TDPG(OnPolicyAlgorithm):
         """Update encoder and action head (line 6 of alg:trv-policy)."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
+        batch = self.rollout_buffer.episode_batch()
+        self._check_finite({"costs": batch.costs})
         if self.auto_weight is not None:
             assert self.information is not None
-            self.auto_weight.update(float(self.rollout_buffer.episode_costs.mean()), float(self.information.sum()))
+            self._check_finite({"information": th.as_tensor(self.information)})
+            self.auto_weight.update(batch.costs.sum(0).mean().item(), float(self.information.sum()))
         mi_coef = self.mi_coef
-        batch = self.rollout_buffer.episode_batch()
         advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
         cost_scale = th.ones(())
         if self.normalize_advantage:
-            advantages, cost_scale = normalized(advantages, batch.alive)
+            negligible = 1e-5 * batch.costs.abs().max()
+            advantages, cost_scale = normalized(advantages, batch.alive, negligible)
 
         old_log_prob = None
         clip_range = self.clip_range_schedule(self._current_progress_remaining)
         if clip_range < math.inf:
             with th.no_grad():
-                old_log_prob = self._log_prob(batch)[0]
+                old_log_prob = th.empty_like(batch.costs)
+                for episodes in self._minibatches():
+                    old_log_prob[:, episodes] = self._log_prob(batch.select(episodes))[0]
         for _ in range(self.n_epochs):
             for episodes in self._minibatches():
                 part = batch.select(episodes)
@@ -443,7 +446,8 @@ class TDPG(OnPolicyAlgorithm):
                     penalty = mi_coef * information_loss(information)
                     loss = loss + penalty / cost_scale
                     self.logger.record_mean("train/mi_loss", penalty.item())
-                self._step_optimizer(loss, {"costs": batch.costs, "policy loss": policy_loss, "loss": loss})
+                self._check_finite({"policy loss": policy_loss, "loss": loss})
+                self._step_optimizer(loss)
                 self.logger.record_mean("train/policy_loss", policy_loss.item())
                 self.logger.record_mean("train/loss", loss.item())
         self.epoch += 1
@@ -469,10 +473,12 @@ class TDPG(OnPolicyAlgorithm):
         return log_prob, self.policy.rebuild_trvs(features, batch.noise) if rebuild else None
 
     def _minibatches(self) -> Sequence[th.Tensor | slice]:
-        """Columns of the episodes of each minibatch: a random partition, or one batch of all."""
-        if self.batch_size == self.n_episodes:
+        """Columns of the episodes of each minibatch: a random partition into nearly equal parts, or one of all."""
+        n_parts = 1 if self.batch_size is None else math.ceil(self.n_episodes / self.batch_size)
+        if n_parts == 1:
             return [slice(None)]
-        return th.randperm(self.n_episodes, device=self.device).split(self.batch_size)
+        # Nearly equal: nothing can be estimated from the one episode that might remain.
+        return th.randperm(self.n_episodes, device=self.device).tensor_split(n_parts)
 
     def _record_distance(self, log_ratio: th.Tensor, alive: th.Tensor, clip_range: float) -> None:
         """Log how far the policy has moved from that of the rollouts, as SB3's PPO does."""
@@ -482,11 +488,14 @@ class TDPG(OnPolicyAlgorithm):
         self.logger.record_mean("train/approx_kl", kl.item())
         self.logger.record_mean("train/clip_fraction", clipped.item())
 
-    def _step_optimizer(self, loss: th.Tensor, checked: dict[str, th.Tensor]) -> None:
-        """Make one step, unless something is not finite: then the parameters stay as they are."""
-        for name, value in checked.items():
+    def _check_finite(self, values: dict[str, th.Tensor]) -> None:
+        """Stop, while the parameters are still good, if something is NaN or infinite."""
+        for name, value in values.items():
             if not bool(th.isfinite(value).all()):
                 raise self._diverged(name)
+
+    def _step_optimizer(self, loss: th.Tensor) -> None:
+        """Make one step, unless the gradient is not finite: then the parameters stay as they are."""
         self.policy.optimizer.zero_grad()
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
@@ -518,7 +527,7 @@ class TDPG(OnPolicyAlgorithm):
         """
         Train; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
 
-        Interrupted by Ctrl-C, the model keeps the parameters of the last whole epoch and can be used, saved or
+        Interrupted by Ctrl-C, the model keeps the parameters of the last finished update and can be used, saved or
         trained on.
 
         :param total_timesteps: Environment steps; default: 400 policy epochs for vectors (a million steps of the lava
@@ -626,6 +635,11 @@ class TDPG(OnPolicyAlgorithm):
         :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to go on from a policy-gradient model.
         :raises ValueError: if the file is damaged or was not saved by TDPG.
         """
+        # As in the constructor: a limit alone asks for the weight that keeps it, and a number for beta needs none.
+        if kwargs.get("cost_limit") is not None:
+            kwargs.setdefault("beta", "auto")
+        elif kwargs.get("beta", "auto") != "auto":
+            kwargs.setdefault("cost_limit", None)
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except AssertionError as e:

@@ -51,6 +51,7 @@ ARGUMENTS = {
     "clip_range NaN": (dict(clip_range=math.nan), "clip_range=nan", "positive"),
     "clip_range a schedule that ends at zero": (dict(clip_range=lambda progress: progress), "clip_range=0.0"),
     "passes without clipping": (dict(n_epochs=3), "n_epochs=3", "clip_range=0.2"),
+    "minibatches without clipping": (dict(batch_size=10), "batch_size=10", "2 updates", "clip_range=0.2"),
     "beta a schedule that ends at zero": (dict(beta=lambda progress: progress), "beta=0.0", "positive number"),
     "beta a schedule that returns a string": (dict(beta=lambda progress: "1"), "beta='1'", "positive number"),
     "unknown estimator": (

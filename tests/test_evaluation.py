@@ -304,19 +304,35 @@ def test_the_bootstrap_interval_covers_the_truth_about_as_often_as_it_says():
 
 
 def test_the_probability_of_improvement_is_that_of_a_seed_of_one_against_a_seed_of_the_other():
-    """By hand: of the 9 pairs of seeds 8 are won in one scenario, and 1 in the other."""
-    costs = {"A": {"x": [1.0, 2.0, 5.0], "y": [9.0, 9.0, 1.0]}, "B": {"x": [4.0, 6.0, 7.0], "y": [2.0, 3.0, 0.5]}}
+    """By hand: of the 9 pairs of seeds, by their means over both scenarios, A wins 4."""
+    costs = {"A": {"x": [1.0, 2.0, 5.0], "y": [3.0, 4.0, 9.0]}, "B": {"x": [4.0, 6.0, 1.0], "y": [8.0, 4.0, 2.0]}}
+    # means: A 2, 3, 7; B 6, 5, 1.5
     records = pd.concat(
         some_records({m: {s: [c[i], c[i]] for s, c in rows.items()} for m, rows in costs.items()}, train_seed=i)
         for i in range(3)
     )
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     value, low, high = probability_of_improvement(records, "A", "B")
-    assert value == pytest.approx((8 / 9 + 2 / 9) / 2)
+    assert value == pytest.approx(4 / 9)
     assert 0 <= low < value < high <= 1
     assert probability_of_improvement(records, "A", "B") == (value, low, high)
     assert probability_of_improvement(records, "B", "A")[0] == pytest.approx(1 - value)
     assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+
+
+def test_scenarios_of_the_same_seeds_do_not_narrow_the_interval():
+    """Seven copies of a scenario tell no more than one."""
+    rng = np.random.default_rng(0)
+    costs = {m: rng.normal(size=5) for m in ("A", "B")}
+    widths = []
+    for n in (1, 7):
+        records = pd.concat(
+            some_records({m: {f"s{j}": [c[i], c[i]] for j in range(n)} for m, c in costs.items()}, train_seed=i)
+            for i in range(5)
+        )
+        _, low, high = probability_of_improvement(records, "A", "B")
+        widths.append(high - low)
+    assert widths[0] == pytest.approx(widths[1])
 
 
 def test_one_seed_alone_has_an_interval_of_no_width():
@@ -507,12 +523,40 @@ def test_a_frame_needs_a_name_that_tells_its_format(records, tmp_path):
 
 def test_the_regression_on_the_trvs_finds_what_is_in_them_and_nothing_else():
     rng = np.random.default_rng(0)
-    trvs = rng.standard_normal((3, 400, 2))
+    trvs = rng.standard_normal((3, 800, 2))
     told = trvs @ np.array([[1.0], [-2.0]]) + 4.0
     noisy = told + np.sqrt(5.0) * rng.standard_normal(told.shape)  # as much noise as there is signal
     assert knowledge._r2(trvs, told) == pytest.approx(1.0)
     assert knowledge._r2(trvs, noisy) == pytest.approx(0.5, abs=0.05)
     assert knowledge._r2(trvs, rng.standard_normal(told.shape)) < 0.05
+    few, many = rng.standard_normal((3, 40, 15)), rng.standard_normal((3, 40, 1))
+    assert knowledge._r2(few, many) < 0.1, "15 coefficients fit 20 episodes by chance, and must not count"
+
+
+class Photometer:
+    """A model whose first TRV is the mean brightness of the image, and whose others are a random code of the wall."""
+
+    horizon = 25
+    device = "cpu"
+
+    def __init__(self):
+        env = make_episodes_env("BallCatch-v0", 1, env_kwargs=dict(renderer="fast"))
+        self.action_space, self.observation_space = env.action_space, env.observation_space
+
+    def get_vec_normalize_env(self):
+        return None
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        brightness = observation.mean(axis=(1, 2, 3))[:, None]
+        hue = (observation[:, 0, 20:40].mean(axis=(1, 2)) / (1 + observation[:, 2, 20:40].mean(axis=(1, 2)))).round(1)
+        code = np.stack([np.random.default_rng(int(10 * h)).standard_normal(7) for h in hue])
+        return np.zeros((len(observation), 1), np.float32), (np.concatenate([brightness, code], axis=1),)
+
+
+def test_the_knowledge_is_what_a_model_shows_and_a_code_of_the_wall_is_no_colour():
+    known = knowledge.trv_knowledge(Photometer())
+    assert known["brightness"] > 0.5
+    assert known["position"] < 0.2
 
 
 def test_the_knowledge_of_a_ball_catching_policy_is_measured_without_a_trace():

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from small_problems import parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
 
-from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback
+from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingDivergedError
 from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import BALL_CATCH
@@ -38,9 +38,15 @@ def test_an_epoch_makes_so_many_passes_over_minibatches_of_whole_episodes(encode
     model = tiny_tdpg(**PASSES, encoder_gradient=encoder_gradient)
     seen = steps_of(model, monkeypatch)
     train_epochs(model, 1)
-    assert seen == [8, 8, 4] * 3
+    assert seen == [7, 7, 6] * 3
     assert model.epoch == 1
     assert model._n_updates == 3
+
+
+def test_no_minibatch_is_left_with_a_single_episode():
+    model = tiny_tdpg(n_episodes=17, batch_size=8, clip_range=0.2)
+    assert sorted(len(part) for part in model._minibatches()) == [5, 6, 6]
+    train_epochs(model, 1)
 
 
 def test_every_episode_is_in_one_minibatch_of_a_pass():
@@ -131,6 +137,29 @@ def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
     assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
 
 
+def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
+    weight = AutoWeight(cost_limit=10.0)
+    for _ in range(500):
+        weight.update(cost=0.0, information=0.0)
+    assert weight.value == pytest.approx(10.0 * 1000.0)
+
+
+def test_costs_that_are_not_finite_leave_the_weight_alone():
+    model = tiny_tdpg(toy_vec_env(n_envs=4, nan_cost_in_episode=3), n_episodes=4, beta="auto", cost_limit=1e3)
+    with pytest.raises(TrainingDivergedError, match="costs"):
+        train_epochs(model, 10)
+    assert math.isfinite(model.mi_coef)
+
+
+def test_equal_costs_do_not_blow_up_the_penalty():
+    model = tiny_tdpg(toy_vec_env(n_envs=4), n_episodes=4, beta=1.0, normalize_advantage=True)
+    _, callback = model._setup_learn(1)
+    model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+    model.rollout_buffer.costs[:] = 1.0
+    model.train()
+    assert model.logger.name_to_value["train/grad_norm"] < 100
+
+
 def test_the_weight_follows_a_limit_below_zero():
     """Costs are negative returns, and many environments pay rewards."""
     weight = AutoWeight(cost_limit=-400.0)
@@ -177,6 +206,23 @@ def test_a_policy_gradient_model_may_go_on_with_a_cost_limit(tmp_path):
     assert loaded.mi_coef > 0
 
 
+def test_a_cost_limit_given_to_load_asks_for_the_weight_too(tmp_path):
+    model = tiny_tdpg(beta=math.inf)
+    model.save(tmp_path / "pg")
+    loaded = TDPG.load(tmp_path / "pg", cost_limit=8.0, device="cpu")
+    assert (loaded.beta, loaded.cost_limit) == ("auto", 8.0)
+    with pytest.raises(ValueError, match=r"cost_limit=8.0.*beta=0.5"):
+        TDPG.load(tmp_path / "pg", beta=0.5, cost_limit=8.0, device="cpu")
+
+
+def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    for n in (10, 40):
+        model = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 10), n_episodes=n, device="cpu")
+        train_epochs(model, 1)
+        assert model._minibatches() == [slice(None)]
+
+
 def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():
     """The selection compares epochs by it."""
     trained = []
@@ -199,7 +245,7 @@ def with_threshold(env, threshold):
 
 def test_vectors_are_learnt_from_as_in_the_paper():
     model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
-    assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, 500)
+    assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, None)
     assert (model.clip_range, model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "mine")
     assert not model.normalize_advantage
     assert model.env.num_envs == 500

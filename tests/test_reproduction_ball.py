@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 
 from sb3_tdpg.cli import main
+from sb3_tdpg.envs.ball_catch import RENDERERS
 from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS
+from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.reproduction import ball
 from sb3_tdpg.runs import Run, complete_run
 
@@ -23,9 +25,7 @@ def tiny(monkeypatch):
             lambda run: {**block(run), "n_episodes": 4, "batch_size": 4, "mi_kwargs": {}, "mi_estimator": "logdet"}
         ),
     )
-    for name in ("METHODS", "VARYING_METHODS", "PAPER_METHODS"):
-        methods = tuple(ball.replace(method, renderer="fast") for method in getattr(ball, name))
-        monkeypatch.setattr(ball, name, methods)
+    monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
     for name in ("aggregate_seeds", "probability_of_improvement"):
         monkeypatch.setattr(ball, name, partial(getattr(ball, name), n_bootstrap=10))
     order = []
@@ -51,6 +51,8 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     assert "MISSED" in summary, "an epoch reaches no goal, and the summary must say so"
     for method in (*ball.METHODS, *ball.PAPER_METHODS):
         assert method.label in summary
+    for title in ("PyBullet's images", "Controls", "own settings", "Goals", "penalty is worth", "TRVs know"):
+        assert title in summary
     records = pd.read_csv(out / "episodes.csv.gz")
     n_policies = 2 * len(ball.METHODS) + len(ball.PAPER_METHODS)
     assert len(records) == n_policies * (len(BALL_CATCH) + len(BALL_CATCH_DIAGNOSIS)) * 2
@@ -107,3 +109,15 @@ def test_every_method_but_the_first_stages_starts_from_one():
         for method in methods:
             assert method.start is None or labels.index(method.start) < labels.index(method.label)
         assert {label for pair in ball.COMPARISONS for label in pair} <= set(labels)
+
+
+def test_a_control_differs_from_its_method_in_nothing_but_the_penalty():
+    for methods in (ball.METHODS, ball.VARYING_METHODS):
+        by_label = {method.label: method for method in methods}
+        for model, control in ball.COMPARISONS[:2]:
+            settings = [
+                {**load_hyperparams(by_label[label].block), **by_label[label].overrides} for label in (model, control)
+            ]
+            assert by_label[model].start == by_label[control].start
+            assert {key for key in settings[0] if settings[0][key] != settings[1].get(key)} == {"beta", "cost_limit"}
+            assert set(settings[0]) == set(settings[1])

@@ -43,6 +43,9 @@ SETTINGS = {
     "logdet and schedules": dict(
         beta=lambda progress: 0.1 + progress, learning_rate=lambda progress: 1e-2 * progress, max_grad_norm=1.0
     ),
+    "passes under a cost limit": dict(
+        beta="auto", cost_limit=1e4, n_epochs=2, batch_size=4, clip_range=0.2, encoder_gradient="pathwise"
+    ),
     "policy gradient without a seed": dict(beta=float("inf"), seed=None),
 }
 

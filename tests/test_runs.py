@@ -1,6 +1,7 @@
 """From the command line to results in a folder, with tiny settings: train, evaluate, interrupt, go on."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -92,7 +93,7 @@ def test_the_command_line_tells_bad_input_in_one_line_with_exit_code_2(tmp_path,
 
 
 def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_tdpg.runs.CHECKPOINT_EPOCHS", 2)
+    monkeypatch.setattr("sb3_tdpg.runs.MAX_CHECKPOINT_EPOCHS", 2)
     complete_run(tiny_run(), tmp_path / "whole", LAVA, n_eval_episodes=4)
 
     def interrupt(callback):
@@ -124,6 +125,19 @@ def test_a_run_keeps_the_selected_policy_and_says_whether_an_epoch_met_the_limit
     complete_run(tiny_run(callback=loose), tmp_path / "some", LAVA[:1], n_eval_episodes=4)
     assert pd.read_csv(tmp_path / "some" / "episodes.csv")["selected"].all()
     assert {"epoch", "cost", "information"} == set(json.loads((tmp_path / "some" / "selected.json").read_text()))
+
+
+def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
+    complete_run(tiny_run(), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
+    with pytest.raises(ValueError, match="another scenarios"):
+        complete_run(tiny_run(), tmp_path / "first", LAVA[:2], n_eval_episodes=4)
+    second = replace(tiny_run(), start=tmp_path / "first")
+    complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
+    complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
+    shutil.rmtree(tmp_path / "first")
+    complete_run(tiny_run(seed=5), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
+    with pytest.raises(ValueError, match="another start_policy"):
+        complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
 
 
 def test_attempts_go_on_until_one_meets_the_limits(tmp_path):

@@ -73,25 +73,23 @@ def probability_of_improvement(
     seed: int = 0,
 ) -> tuple[float, float, float]:
     """
-    How likely a seed of one method has a lower mean cost than a seed of another, averaged over the scenarios.
+    How likely a seed of one method has a lower mean cost, over all episodes given, than a seed of another.
 
-    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
+    A seed's scenarios are one number, not several: it is the same policy that meets them, and they must be resampled
+    together.
+
+    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to take the mean over.
     :param model: Label of the method.
     :param control: Label of the method that it is compared with.
     :param level: Coverage of the interval.
-    :param n_bootstrap: Resamples; seeds are resampled in each scenario (stratified).
+    :param n_bootstrap: Resamples of the seeds.
     :param seed: Seed of the resampling.
     :return: the probability, and the interval's ends; 0.5 is no difference
     """
     rliable, metrics = _import_rliable()
-    summary = summary_table(records_by_seed)
-    # rliable takes scores, of which more is better: (seeds, scenarios).
-    scores = {
-        label: -summary[summary["model"] == label]
-        .pivot(index="train_seed", columns="scenario", values="mean")
-        .to_numpy()
-        for label in (model, control)
-    }
+    means = records_by_seed.groupby(["model", "train_seed"])["cost"].mean()
+    # rliable takes scores, of which more is better: (seeds, 1).
+    scores = {label: -means[label].to_numpy()[:, None] for label in (model, control)}
     (value,), (low, high) = _interval(
         rliable,
         (scores[model], scores[control]),

@@ -80,4 +80,6 @@ class FlatAdam:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave."""
-        self._moments = state["moments"]
+        moments = state["moments"]
+        # Copies, as torch.optim makes them: the steps are made in place.
+        self._moments = None if moments is None else (moments[0].clone(), moments[1].clone(), moments[2].clone())
