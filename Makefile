@@ -8,11 +8,11 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-varying wheel clean
+.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
-	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{ printf "  %-16s %s\n", $$1, $$2 }'
+	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{ printf "  %-24s %s\n", $$1, $$2 }'
 	@echo "Variables: PYTHON=$(PYTHON) VENV=$(VENV) JOBS=$(JOBS) EXTRAS=$(EXTRAS)"
 
 venv: $(STAMP) ## make the virtual environment (also done on demand by every other target)
@@ -58,12 +58,15 @@ docs: $(STAMP) ## build the documentation into docs/_build/html
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py
 
-reproduce: reproduce-lava reproduce-ball reproduce-ball-varying ## reproduce every experiment
+reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying ## reproduce every experiment
 
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
 
-reproduce-ball: $(STAMP) ## reproduce Table II: policy gradient, TDPG and their controls on ball catching
+reproduce-ball: $(STAMP) ## reproduce Table II: policy gradient and TDPG on ball catching
+	$(PY) -m sb3_tdpg reproduce ball --no-controls --out results/ball_catch --publish docs/results/ball_catch
+
+reproduce-ball-controls: $(STAMP) ## add the controls without the penalty, and the paper's own settings
 	$(PY) -m sb3_tdpg reproduce ball --out results/ball_catch --publish docs/results/ball_catch
 
 reproduce-ball-varying: $(STAMP) ## the same where the launch varies, a scenario of our own

@@ -47,6 +47,8 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
 
     given = {name: value for name, value in options.items() if value is not None}
     if experiment == "lava":
+        if "controls" in given:
+            raise ValueError("--no-controls is for ball and ball-varying: lava has no controls")
         out = out or Path("results/lava_reproduction")
         text = reproduce_lava(out, **given)
     else:
@@ -84,6 +86,10 @@ def _make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument(
         "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
     )
+    reproduce.add_argument(
+        "--no-controls", action="store_false", dest="controls", default=None,
+        help="ball: only PG and TDPG; without it, a later call adds the controls",
+    )  # fmt: skip
     reproduce.add_argument("--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores)")
     _add_sizes(reproduce)
 

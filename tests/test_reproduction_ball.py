@@ -51,7 +51,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     assert "MISSED" in summary, "an epoch reaches no goal, and the summary must say so"
     for method in (*ball.METHODS, *ball.PAPER_METHODS):
         assert method.label in summary
-    for title in ("PyBullet's images", "Controls", "own settings", "Goals", "penalty is worth", "TRVs know"):
+    for title in ("PyBullet's images", "The others", "own settings", "Goals", "penalty is worth", "TRVs know"):
         assert title in summary
     records = pd.read_csv(out / "episodes.csv.gz")
     n_policies = 2 * len(ball.METHODS) + len(ball.PAPER_METHODS)
@@ -61,6 +61,16 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     assert (records["cost"] <= 100 * records["distance"] + 25 * 0.2 + 0.1).all()
     assert all("PG" in label and not label.startswith("TDPG") for label in tiny[0])
     assert all(label not in tiny[0] for label in tiny[1] if label.startswith("TDPG"))
+
+
+def test_the_controls_may_be_added_later(tmp_path, tiny):
+    arguments = dict(n_seeds=1, n_eval_episodes=2, n_timesteps=100)
+    summary = ball.reproduce_ball(tmp_path, controls=False, **arguments)
+    assert "its control" not in summary
+    assert [label for stage in tiny for label in stage] == ["PG", "PG, perturbed images", "TDPG"]
+    before = (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes()
+    assert "its control" in ball.reproduce_ball(tmp_path, **arguments)
+    assert (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes() == before
 
 
 def test_a_second_stage_starts_from_the_policy_of_the_first(tmp_path, tiny):
