@@ -13,10 +13,10 @@ class AutoWeight:
     penalty is as large as the limit. From then on it grows while the cost is below the limit and shrinks while it is
     above, as SAC's ``ent_coef="auto"`` does for the entropy:
 
-        log w += rate * clip((C - cost) / |C|, -2, 1)
+        log w += rate * clip((C - cost) / abs(C), -2, 1)
 
     :param cost_limit: C
-    :param rate: Change of log w for an epoch whose cost is |C| below the limit, the largest there is.
+    :param rate: Change of log w for an epoch whose cost is abs(C) below the limit, the largest there is.
     :param max_growth: The weight stops at this multiple of its start: where the limit can be kept without any
         information, nothing else would hold it.
     """

@@ -210,7 +210,14 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
 
 def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
     command = [sys.executable, "-m", "sb3_tdpg", "reproduce", "lava", "--out", str(tmp_path), "--jobs", "2"]
-    with subprocess.Popen(command, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True) as process:
+
+    def hear_ctrl_c():
+        # A job in the background ignores it, and hands that on.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    with subprocess.Popen(
+        command, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True, preexec_fn=hear_ctrl_c
+    ) as process:
         deadline = time.monotonic() + 120
         while not list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip")) and time.monotonic() < deadline:
             time.sleep(0.1)
