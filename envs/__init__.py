@@ -8,8 +8,8 @@ ENTRY_POINTS = {
     "BallCatch-v0": "sb3_tdpg.envs.ball_catch:BallCatchEnv",
 }
 
-# Returns at which a problem counts as solved: the limit on the cost for beta="auto". The ball is caught within 8 cm.
-REWARD_THRESHOLDS = {"BallCatch-v0": -8.0}
+# Returns at which a problem counts as solved: the limit on the cost for beta="auto". The ball is caught within 5 cm.
+REWARD_THRESHOLDS = {"BallCatch-v0": -5.0}
 
 for _env_id, _entry_point in ENTRY_POINTS.items():
     # No max_episode_steps: the horizon belongs to the problem and ends as `terminated`, not as a time limit.

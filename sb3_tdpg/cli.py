@@ -103,7 +103,7 @@ def _make_parser() -> argparse.ArgumentParser:
     enjoy.add_argument("--seed", type=int, default=0)
     enjoy.add_argument("--n-episodes", type=_positive, default=1)
     enjoy.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
-    enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4 (needs ffmpeg)")
+    enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4")
     return parser
 
 

@@ -6,8 +6,9 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_tdpg import TDPG
+from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.envs.lava import LavaEnv
 
 TINY_CRITIC = dict(hidden_sizes=(8,), batch_size=5, gradient_steps=2, warmup_gradient_steps=4, refit_gradient_steps=4)
 
@@ -188,3 +189,7 @@ class AtEveryEpoch(BaseCallback):
 
 def toy_vec_env(n_envs=4, **kwargs) -> VecEnv:
     return DummyVecEnv([lambda: ToyEnv(**kwargs) for _ in range(n_envs)])
+
+
+def lava_env(n=20):
+    return BatchedVecEnv(LavaEnv(), n)

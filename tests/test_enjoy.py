@@ -1,6 +1,7 @@
 """``python -m sb3_tdpg enjoy``: episodes of a saved model, printed and recorded as a film."""
 
 import re
+import sys
 from unittest.mock import Mock
 
 import gymnasium as gym
@@ -179,11 +180,8 @@ def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
     assert frames_of(tmp_path / "film.gif")[1] == [20, 20, 20, 1000]
 
 
-def test_an_mp4_is_written_by_ffmpeg(lava, tmp_path):
-    from matplotlib.animation import FFMpegWriter
-
-    if not FFMpegWriter.isAvailable():
-        pytest.skip("ffmpeg is not installed")
+def test_an_mp4_is_written_without_an_ffmpeg_on_the_path(lava, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", "")
     enjoy(lava, "Lava-v0", record=tmp_path / "film.mp4")
     assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
@@ -266,7 +264,8 @@ def test_what_is_no_model_is_reported_in_one_line_with_exit_code_2(make, tmp_pat
 
 
 def test_without_ffmpeg_an_mp4_is_refused_before_an_episode_is_run(lava, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("matplotlib.animation.FFMpegWriter.isAvailable", lambda: False)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["enjoy", str(lava), "--env", "Lava-v0", "--record", str(tmp_path / "film.mp4")]) == 2
     captured = capsys.readouterr()
     assert "ffmpeg" in captured.err

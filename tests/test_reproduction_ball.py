@@ -45,7 +45,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
 
     assert (out / "summary.md").read_text() == summary
     assert {path.name for path in published.iterdir()} == {path.name for path in out.iterdir()} - {"runs"}
-    assert {"episodes.csv.gz", "seeds.csv", "config.json", "robustness.png", "diagnosis.png", "training.png"} <= {
+    assert {"episodes.csv.xz", "seeds.csv", "config.json", "robustness.png", "diagnosis.png", "training.png"} <= {
         path.name for path in out.iterdir()
     }
     assert "MISSED" in summary, "an epoch reaches no goal, and the summary must say so"
@@ -53,7 +53,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
         assert method.label in summary
     for title in ("PyBullet's images", "The others", "own settings", "Goals", "penalty is worth", "TRVs know"):
         assert title in summary
-    records = pd.read_csv(out / "episodes.csv.gz")
+    records = pd.read_csv(out / "episodes.csv.xz")
     n_policies = 2 * len(ball.METHODS) + len(ball.PAPER_METHODS)
     assert len(records) == n_policies * (len(BALL_CATCH) + len(BALL_CATCH_DIAGNOSIS)) * 2
     # A terminal cost of 100 for each metre, and a little for driving.

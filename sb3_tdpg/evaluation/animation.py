@@ -7,6 +7,7 @@ Dimension key: T time steps of an episode, Z TRVs.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from itertools import cycle, product
 from pathlib import Path
@@ -46,11 +47,26 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
     if ending not in (".gif", ".mp4"):
         raise ValueError(f"{path}: the ending {ending!r} is no format of an animation: use .gif or .mp4")
     try:
-        from matplotlib.animation import FFMpegWriter
+        import matplotlib.animation  # noqa: F401
     except ImportError as e:
         raise ValueError("an animation needs matplotlib: pip install sb3_tdpg[plots]") from e
-    if ending == ".mp4" and not FFMpegWriter.isAvailable():
-        raise ValueError(f"{path}: an .mp4 is written by ffmpeg, which is not on the PATH: install it, or use .gif")
+    if ending == ".mp4" and _ffmpeg() is None:
+        raise ValueError(
+            f"{path}: an .mp4 is written by ffmpeg, and there is none: install it, or pip install imageio-ffmpeg, or "
+            "use .gif"
+        )
+
+
+def _ffmpeg() -> str | None:
+    """Return the ffmpeg on the PATH, or else the one that the package imageio-ffmpeg brings."""
+    if (on_path := shutil.which("ffmpeg")) is not None:
+        return on_path
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return str(get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        return None
 
 
 def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float) -> None:
@@ -161,10 +177,11 @@ def _write_gif(film: _Film, path: Path, fps: float) -> None:
 
 
 def _write_mp4(film: _Film, path: Path, fps: float) -> None:
+    import matplotlib as mpl
     from matplotlib.animation import FFMpegWriter
 
     writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]  # ffmpeg takes fractions, too
-    with writer.saving(film.figure, str(path), DPI):
+    with mpl.rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(film.figure, str(path), DPI):
         for is_last in film.frames():
             for _ in range(max(1, round(HOLD * fps)) if is_last else 1):
                 writer.grab_frame()

@@ -65,15 +65,16 @@ def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) ->
     Write a frame as CSV without its index, so that at no time a half-written file is there.
 
     :param frame: Records or a table.
-    :param path: ``.csv``, or ``.csv.gz`` to compress it; folders are made. The same frame gives the same bytes.
+    :param path: ``.csv``, or ``.csv.gz`` or ``.csv.xz`` (smaller) to compress it; folders are made. The same frame
+        gives the same bytes.
     """
     path = _with_folder(path)
-    if not path.name.endswith((".csv", ".csv.gz")):
-        raise ValueError(f"path={str(path)!r} must end in .csv or .csv.gz")
+    if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
+        raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
     # Without mtime the compressed file would differ from one second to the next.
-    compression: Any = {"method": "gzip", "mtime": 0} if path.name.endswith(".gz") else None
+    methods: dict[str, Any] = {".csv": None, ".gz": {"method": "gzip", "mtime": 0}, ".xz": "xz"}
     partial = path.with_name(path.name + ".partial")
-    frame.to_csv(partial, index=False, compression=compression)
+    frame.to_csv(partial, index=False, compression=methods[path.suffix])
     os.replace(partial, path)
 
 

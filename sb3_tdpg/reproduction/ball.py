@@ -130,7 +130,7 @@ def reproduce_ball(
 
     Finished runs are kept: the same call goes on where an interrupted one stopped.
 
-    :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.gz``, figures, ``config.json`` and ``runs/``.
+    :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
     :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own, without the paper's methods.
     :param controls: Also train and evaluate the controls, and the paper's own settings; a later call may add them.
     :param n_seeds: Training seeds of each method.
@@ -192,7 +192,7 @@ def reproduce_ball(
         "seed",
         "deterministic",
     ]
-    write_frame_atomically(records[columns].round({"cost": 3, "distance": 4}), out / "episodes.csv.gz")
+    write_frame_atomically(records[columns].round({"cost": 3, "distance": 4}), out / "episodes.csv.xz")
     table = with_groups(records[is_row])
     summary_rows = [*rows, *group_rows(rows)]
     of_methods = table["model"].isin([m.label for m in methods])

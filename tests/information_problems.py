@@ -1,0 +1,59 @@
+"""Samples whose information is known, and the registry of estimators sorted by kind."""
+
+import math
+
+import numpy as np
+import torch as th
+
+from sb3_tdpg.information import (
+    ESTIMATORS,
+    CriticEstimator,
+    InformationBatch,
+)
+
+CRITICS = sorted(name for name, cls in ESTIMATORS.items() if issubclass(cls, CriticEstimator))
+CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))
+UPPER = sorted(name for name, cls in ESTIMATORS.items() if cls.bound == "upper")
+LOWER = sorted(name for name, cls in ESTIMATORS.items() if cls.bound == "lower")
+
+# One time step for each: gains a of ``trv = a * state + noise`` in each of two dimensions.
+GAINS = ((0.0, 0.0), (0.8, 0.0), (1.0, 1.0))
+
+
+def gaussian_batch(n, gains, noise_std=1.0, generator=None):
+    """Samples whose information is ``sum log(1 + (a / noise_std)^2) / 2`` nats: one time step per row of gains."""
+    gains = th.as_tensor(gains)[:, None, :]  # (T, 1, Z)
+    states = th.randn(gains.shape[0], n, gains.shape[2], generator=generator)
+    means = gains * states
+    stds = th.full_like(means, noise_std)
+    return InformationBatch(states, means + stds * th.randn(means.shape, generator=generator), means, stds)
+
+
+def gaussian_information(gains, noise_std=1.0):
+    return 0.5 * np.log1p(np.square(np.asarray(gains) / noise_std)).sum(axis=1)
+
+
+def build(name, horizon, state_dim, trv_dim, **kwargs):
+    kwargs = kwargs if name in CRITICS else {}
+    return ESTIMATORS[name](horizon, state_dim, trv_dim, **kwargs)
+
+
+def random_batch(horizon=4, n=60, alive=None):
+    states, means = th.randn(horizon, n, 2), th.randn(horizon, n, 2)
+    stds = 0.5 + th.rand(horizon, n, 2)
+    return InformationBatch(states, means + stds * th.randn_like(means), means, stds, alive)
+
+
+def half_dead():
+    alive = th.ones(4, 60, dtype=th.bool)
+    alive[1:, 50:] = False
+    alive[2:, ::2] = False
+    alive[3:, 3:] = False  # too few are left at the last step
+    return alive
+
+
+def fresh_estimates(estimator, n_batches=20, n=1000):
+    """Estimates on samples that the critic has not seen: mean and standard error for each time step."""
+    with th.no_grad():
+        values = np.stack([estimator(gaussian_batch(n, GAINS)).numpy() for _ in range(n_batches)])
+    return values.mean(0), values.std(0, ddof=1) / math.sqrt(n_batches)

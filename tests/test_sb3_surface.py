@@ -1,0 +1,341 @@
+"""TDPG does what users of Stable-Baselines3 expect of any of its algorithms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from small_problems import (
+    TINY_CRITIC,
+    AtEveryEpoch,
+    AtEveryStep,
+    CountdownEnv,
+    assert_same_parameters,
+    lava_env,
+    parameters,
+    same_parameters,
+    tiny_tdpg,
+    toy_vec_env,
+    train_epochs,
+)
+from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
+from sb3_tdpg.envs.lava import LavaEnv
+
+
+def stochastic_predictions(model, observation=None, seed=1):
+    """Actions of one whole episode with the noise that follows from a seed."""
+    th.manual_seed(seed)
+    observation = np.tile(model.observation_space.sample()[None], (3, 1)) if observation is None else observation
+    actions, state = [], None
+    for _ in range(model.horizon):
+        action, state = model.predict(observation, state)
+        actions.append(action)
+    return np.stack(actions)
+
+
+def test_the_learning_rate_follows_its_schedule_and_leaves_the_critics_alone():
+    model = tiny_tdpg(learning_rate=LinearSchedule(1e-2, 1e-4, 1.0), mi_estimator="mine")
+    rates = []
+    train_epochs(model, 4, callback=AtEveryEpoch(lambda m: rates.append(m.policy.optimizer.param_groups[0]["lr"])))
+    assert rates[0] == pytest.approx(1e-2)
+    assert np.diff(rates[1:]).max() < 0
+    assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4)
+    assert model.estimator.optimizer.learning_rate == 1e-3
+
+
+def test_policy_kwargs_reach_the_policy():
+    model = tiny_tdpg(
+        policy_kwargs=dict(trv_dim=3, time_varying=False, optimizer_class=th.optim.SGD, encoder_var_floor=0.5)
+    )
+    assert model.policy.trv_dim == model.estimator.trv_dim == 3
+    assert not model.policy.time_varying
+    assert isinstance(model.policy.optimizer, th.optim.SGD)
+    assert model.policy.encoder_var_floor == 0.5
+    train_epochs(model, 1)
+    assert model.rollout_buffer.stds.min() > math.sqrt(0.5)
+
+
+def test_the_same_seed_gives_the_same_training_and_another_seed_another():
+    def train(seed):
+        return parameters(train_epochs(tiny_tdpg(seed=seed, mi_estimator="mine"), 2).policy)
+
+    assert_same_parameters(train(3), train(3))
+    assert not same_parameters(train(3), train(4))
+
+
+def test_learning_twice_starts_anew_or_goes_on_as_asked():
+    model = tiny_tdpg()
+    train_epochs(model, 2)
+    train_epochs(model, 2)
+    assert (model.epoch, model.num_timesteps) == (2, 200)
+    train_epochs(model, 3, reset_num_timesteps=False)
+    assert (model.epoch, model.num_timesteps) == (5, 500)
+
+
+def test_a_saved_model_predicts_the_same_with_and_without_an_environment(tmp_path):
+    model = train_epochs(tiny_tdpg(mi_estimator="mine"), 2)
+    model.save(tmp_path / "model")
+    observation = np.random.default_rng(0).normal(size=(3, 2)).astype(np.float32)
+    expected = stochastic_predictions(model, observation)
+    for env in (None, lava_env()):
+        loaded = TDPG.load(tmp_path / "model", env=env, device="cpu")
+        np.testing.assert_array_equal(stochastic_predictions(loaded, observation), expected)
+        assert_same_parameters(parameters(model.estimator), parameters(loaded.estimator))
+        assert (loaded.horizon, loaded.epoch, loaded.num_timesteps) == (5, 2, 200)
+        assert loaded.mi_coef == model.mi_coef
+    train_epochs(loaded, 1, reset_num_timesteps=False)
+    assert loaded.epoch == 3
+
+
+def test_a_model_is_saved_to_a_file_object_and_under_any_name(tmp_path):
+    import io
+
+    model = tiny_tdpg()
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    assert_same_parameters(parameters(TDPG.load(file, device="cpu").policy), parameters(model.policy))
+    model.save(tmp_path / "new" / "folder" / "beta_0.5.zip")
+    model.save(str(tmp_path / "name"))
+    assert (tmp_path / "new" / "folder" / "beta_0.5.zip").exists()
+    assert (tmp_path / "name.zip").exists()
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_a_name_with_a_dot_can_be_saved_and_loaded(tmp_path):
+    model = tiny_tdpg()
+    model.save(tmp_path / "beta_0.0133")
+    TDPG.load(tmp_path / "beta_0.0133", device="cpu")
+
+
+def test_a_loaded_model_can_be_given_an_environment_later(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    model = TDPG.load(tmp_path / "model", device="cpu")
+    model.set_env(lava_env())
+    train_epochs(model, 1)
+    assert model.epoch == 1
+
+
+def test_training_without_an_environment_asks_for_one(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    model = TDPG.load(tmp_path / "model", device="cpu")
+    with pytest.raises(Exception, match="set_env"):
+        model.learn(100)
+
+
+def test_another_environment_of_the_same_shape_can_be_set():
+    model = train_epochs(tiny_tdpg(), 1)
+    model.set_env(BatchedVecEnv(LavaEnv(sensor_noise_std=30.0), 20))
+    train_epochs(model, 1, reset_num_timesteps=False)
+    assert np.std(model.rollout_buffer.observations - model.rollout_buffer.states) > 20
+
+
+def test_parameters_are_taken_from_one_model_and_put_into_another():
+    first, second = tiny_tdpg(seed=0, mi_estimator="mine"), tiny_tdpg(seed=1, mi_estimator="mine")
+    train_epochs(first, 1)
+    assert set(first.get_parameters()) == {"policy", "policy.optimizer", "estimator"}
+    assert not same_parameters(parameters(first.policy), parameters(second.policy))
+    second.set_parameters(first.get_parameters())
+    assert_same_parameters(parameters(first.policy), parameters(second.policy))
+    assert_same_parameters(parameters(first.estimator), parameters(second.estimator))
+
+
+def test_evaluate_policy_clears_the_memory_between_episodes():
+    model = tiny_tdpg()
+    # More than one episode for each environment: an episode_start that is not heeded would overrun the horizon.
+    rewards, lengths = evaluate_policy(
+        model, lava_env(4), n_eval_episodes=12, deterministic=False, return_episode_rewards=True, warn=False
+    )
+    assert lengths == [5] * 12
+    assert np.mean(rewards) < 0
+
+
+def test_evaluation_in_mid_rollout_does_not_disturb_the_training(tmp_path):
+    def train(with_evaluation):
+        callbacks = []
+        if with_evaluation:
+            # Deterministic in policy and environment: nothing is drawn.
+            env = BatchedVecEnv(LavaEnv(), 4)
+            callbacks = [
+                EvalCallback(env, n_eval_episodes=8, eval_freq=3, verbose=0, best_model_save_path=str(tmp_path))
+            ]
+        model = train_epochs(tiny_tdpg(), 3, callback=callbacks)
+        return parameters(model.policy)
+
+    assert_same_parameters(train(False), train(True))
+    TDPG.load(tmp_path / "best_model", device="cpu")
+
+
+def test_checkpoints_can_be_loaded(tmp_path):
+    train_epochs(tiny_tdpg(), 2, callback=CheckpointCallback(5, str(tmp_path), verbose=0))
+    files = sorted(tmp_path.glob("*.zip"))
+    assert len(files) == 2
+    TDPG.load(files[0], device="cpu")
+
+
+def test_a_callback_can_stop_the_training_in_mid_rollout_and_the_model_learns_on():
+    model = tiny_tdpg()
+    calls = []
+    train_epochs(model, 5, callback=AtEveryStep(lambda c: calls.append(1) or c.n_calls < 8))
+    assert len(calls) == 8
+    assert model.epoch == 1
+    train_epochs(model, 2, reset_num_timesteps=False)
+    assert model.epoch == 3
+    assert (model.rollout_buffer.states[0, :, 1] == 0).all()  # from the start of an episode
+
+
+def test_callbacks_are_given_as_one_or_a_list_or_a_function():
+    counts = []
+    for callback in (
+        AtEveryStep(lambda c: None),
+        [AtEveryStep(lambda c: None), StopTrainingOnMaxEpisodes(10**6)],
+        CallbackList([AtEveryStep(lambda c: None)]),
+        lambda local_variables, global_variables: True,
+        None,
+    ):
+        counts.append(train_epochs(tiny_tdpg(), 1, callback=callback).epoch)
+    assert counts == [1] * 5
+
+
+def test_sb3s_callbacks_see_the_episodes():
+    model = tiny_tdpg()
+    train_epochs(model, 5, callback=StopTrainingOnMaxEpisodes(max_episodes=2))
+    assert model.num_timesteps <= 2 * 100
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_the_progress_bar_runs(capsys):
+    pytest.importorskip("rich")
+    train_epochs(tiny_tdpg(), 2, progress_bar=True)
+    assert "200/200" in (output := capsys.readouterr()).out + output.err
+
+
+def test_the_log_has_what_the_paper_plots_and_the_single_steps_go_to_tensorboard_only(tmp_path):
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    model = tiny_tdpg(mi_estimator="mine")
+    model.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
+    costs, information = [], []
+
+    def remember(m):
+        costs.append(m.rollout_buffer.episode_costs.mean())
+        information.append(m.information)
+
+    train_epochs(model, 3, callback=AtEveryEpoch(remember))
+    model.logger.close()
+    events = event_accumulator.EventAccumulator(str(tmp_path))
+    events.Reload()
+    scalars = {key: [event.value for event in events.Scalars(key)] for key in events.Tags()["scalars"]}
+    per_step = {f"mi/t{t:02d}" for t in range(5)}
+    expected = {"rollout/ep_cost_mean", "train/objective", "train/learning_rate", "mi/total", "mi/critic_refits"}
+    assert per_step | expected <= set(scalars)
+    np.testing.assert_allclose(scalars["rollout/ep_cost_mean"], costs, rtol=1e-5)
+    np.testing.assert_allclose(scalars["mi/total"], np.sum(information, axis=1), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(scalars["mi/t03"], np.array(information)[:, 3], rtol=1e-4, atol=1e-6)
+    # What train() records is written with the next epoch.
+    objective = costs[0] + 75 * information[0].sum()
+    assert scalars["train/objective"][0] == pytest.approx(objective, rel=1e-4)
+
+    header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
+    assert expected <= set(header)
+    assert not per_step & set(header)
+
+
+def test_what_the_critics_make_of_held_out_episodes_is_in_the_log():
+    model = tiny_tdpg(mi_estimator="mine", mi_kwargs={**TINY_CRITIC, "held_out": 0.2})
+    logged = []
+    train_epochs(model, 2, callback=AtEveryEpoch(lambda m: logged.append(dict(m.logger.name_to_value))))
+    for values in logged:
+        assert np.isfinite([values["mi/held_out"], values["mi/trained_on"]]).all()
+
+
+def test_tensorboard_logging_is_asked_for_as_in_sb3(tmp_path):
+    pytest.importorskip("tensorboard")
+    train_epochs(tiny_tdpg(tensorboard_log=str(tmp_path)), 1)
+    assert list(tmp_path.glob("TDPG_1/events*"))
+
+
+def test_observations_may_be_normalised():
+    env = VecNormalize(lava_env(), norm_reward=False)
+    model = tiny_tdpg(env)
+    train_epochs(model, 3)
+    observations = model.rollout_buffer.observations
+    assert abs(observations[..., 0].mean()) < 1
+    assert not np.allclose(observations, model.rollout_buffer.states, atol=0.1)
+    assert model.get_vec_normalize_env() is env
+
+
+def test_every_estimator_trains_from_its_name():
+    for name in ("mine", "nwj", "smile", "infonce", "logdet", "loo"):
+        model = train_epochs(tiny_tdpg(mi_estimator=name), 2)
+        assert np.isfinite(model.information).all()
+
+
+def test_an_estimator_of_ones_own_is_given_as_a_class_and_saved(tmp_path):
+    from sb3_tdpg.information import LogDet
+
+    model = train_epochs(tiny_tdpg(mi_estimator=LogDet, mi_kwargs={}), 1)
+    model.save(tmp_path / "model")
+    assert isinstance(TDPG.load(tmp_path / "model", device="cpu").estimator, LogDet)
+
+
+def test_mi_kwargs_reach_the_estimator():
+    model = tiny_tdpg(mi_estimator="mine", mi_kwargs={**TINY_CRITIC, "ema_decay": 0.5, "learning_rate": 0.02})
+    assert model.estimator.ema_decay == 0.5
+    assert model.estimator.optimizer.learning_rate == 0.02
+
+
+def test_a_foreign_environment_may_be_given_bare():
+    from small_problems import ToyEnv
+
+    model = tiny_tdpg(ToyEnv(), n_episodes=4)
+    train_epochs(model, 1)
+    assert model.env.num_envs == 1
+    assert model.rollout_buffer.alive.all()
+
+
+def test_the_discount_reaches_the_advantages():
+    gradients = []
+    for gamma in (1.0, 0.5):
+        model = tiny_tdpg(beta=math.inf, gamma=gamma, policy_kwargs=dict(optimizer_class=th.optim.SGD))
+        train_epochs(model, 1)
+        gradients.append(next(iter(model.policy.parameters())).grad.clone())
+    assert not th.allclose(*gradients)
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("mi_estimator", ["mine", "logdet"])
+def test_everything_runs_on_the_gpu(mi_estimator, tmp_path):
+    model = train_epochs(tiny_tdpg(mi_estimator=mi_estimator, device="cuda"), 2)
+    assert {p.device.type for p in [*model.policy.parameters(), *model.estimator.parameters()]} <= {"cuda"}
+    model.save(tmp_path / "model")
+    TDPG.load(tmp_path / "model", device="cpu").predict(np.zeros(2, np.float32))
+    train_epochs(TDPG.load(tmp_path / "model", env=lava_env(), device="cuda"), 1)
+
+
+def test_episodes_env_and_id_give_the_same_training():
+    first = train_epochs(tiny_tdpg("Lava-v0"), 1)
+    second = train_epochs(tiny_tdpg(make_episodes_env("Lava-v0", n_episodes=20)), 1)
+    assert_same_parameters(parameters(first.policy), parameters(second.policy))
+
+
+def test_an_episode_that_runs_beyond_the_declared_horizon_is_refused():
+    class Liar(CountdownEnv):
+        horizon = 2
+
+    model = tiny_tdpg(DummyVecEnv([lambda: Liar(0, [3])]), n_episodes=2)
+    with pytest.raises(ValueError, match=r"did not end after horizon=2 steps.*declare its true horizon"):
+        model.learn(10)
+
+
+def test_an_environment_that_leaves_out_its_state_is_refused_with_the_mend():
+    env = toy_vec_env()
+    for e in env.envs:
+        e._info = dict
+    with pytest.raises(ValueError, match=r'no info\["state"\]'):
+        train_epochs(tiny_tdpg(env), 1)
