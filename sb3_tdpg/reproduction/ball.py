@@ -86,14 +86,14 @@ METHODS: tuple[Method, ...] = (
 WITHOUT_CONTROLS = ("PG", "PG, perturbed images", "TDPG")
 COMPARISONS = (("TDPG", "its control"), ("TDPG, plain images", "control, plain images"), ("TDPG", "PG"))
 
-VARYING_SECOND_STAGE = dict(n_timesteps=120_000)
+# From scratch, perturbed images teach to see the ball too slowly: they come after plain ones.
 VARYING_METHODS: tuple[Method, ...] = (
     Method("PG", "BallCatch-v0-varying-pg"),
-    Method("PG, perturbed images", "BallCatch-v0-varying-perturbed-pg"),
-    Method("TDPG", "BallCatch-v0-varying", "PG, perturbed images", overrides=VARYING_SECOND_STAGE),
+    Method("PG, perturbed images", "BallCatch-v0-varying-perturbed-pg", "PG"),
+    Method("TDPG", "BallCatch-v0-varying", "PG, perturbed images"),
     Method("its control", "BallCatch-v0-varying-perturbed-pg", "PG, perturbed images"),
-    Method("TDPG, plain images", "BallCatch-v0-varying-plain", "PG", overrides=VARYING_SECOND_STAGE),
-    Method("control, plain images", "BallCatch-v0-varying-pg", "PG"),
+    Method("TDPG, plain images", "BallCatch-v0-varying-plain", "PG"),
+    Method("control, plain images", "BallCatch-v0-varying-pg", "PG", overrides=dict(n_timesteps=120_000)),
 )
 
 COMPARISON = (
@@ -160,8 +160,11 @@ def reproduce_ball(
         run = Run(method.label, "BallCatch-v0", method.block, seed, settings, start=start)
         runs[method.label, seed], folders[method.label, seed] = run, out / "runs" / run.folder_name
 
-    # A first stage must be there before its second one is begun.
-    for is_second_stage in (False, True):
+    # A stage must be there before the next one is begun.
+    stages: dict[str, int] = {}
+    for method, _ in everything:
+        stages[method.label] = 0 if method.start is None else 1 + stages[method.start]
+    for stage in sorted(set(stages.values())):
         tasks = [
             (
                 runs[m.label, seed],
@@ -170,7 +173,7 @@ def reproduce_ball(
                 + [d.with_kwargs(renderer="fast") for d in diagnosis],
             )
             for m, seed in everything
-            if (m.start is not None) == is_second_stage
+            if stages[m.label] == stage
         ]
         # The longest first, so that the cores finish together.
         tasks.sort(key=lambda task: (not task[0].method.startswith("paper"), "pybullet" not in str(task[2])))
