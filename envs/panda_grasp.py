@@ -104,20 +104,24 @@ class PandaGraspEnv(POMDPEnv):
         self.observation_space = spaces.Box(0.0, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
         self._last_details: list[dict[str, Any]] = []
+        self._is_closed = False
         self._film: list[Configuration] = []  # of the last grasp, where something is rendered
 
     # -- Bullet worlds, each made when it is needed, and so in the process that uses it ------------------------------
 
     @cached_property
     def _simulation(self) -> GraspSimulation:
+        self._check_open()
         return GraspSimulation(self.scene, MOTIONS[self.motion], self.solver_iterations)
 
     @cached_property
     def _camera(self) -> DepthCamera:
+        self._check_open()
         return DepthCamera(self.scene)
 
     @cached_property
     def _view(self) -> PandaView:
+        self._check_open()
         return PandaView(self.scene, gui=self.render_mode == "human")
 
     # -- the POMDP ----------------------------------------------------------------------------------------------------
@@ -182,7 +186,7 @@ class PandaGraspEnv(POMDPEnv):
                 time.sleep(1 / self.metadata["render_fps"])
             return None
         self._view.place(self._shown()[-1])
-        return self._view.picture(self._shown_depth())
+        return self._view.picture(self._depth_of(self._state[0]))
 
     def film(self) -> Iterator[np.ndarray]:
         """
@@ -196,10 +200,8 @@ class PandaGraspEnv(POMDPEnv):
             raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a film")
         if self._time == 0:
             raise ValueError("there is no grasp to show before step()")
-        first = self._film[0]
-        angles = self._view.client.getEulerFromQuaternion(first.mug_orientation)
-        before = np.array([[*first.mug_position, angles[2]]])
-        (depth,) = self._with_noise(self._camera.images(before), np.random.default_rng(0))
+        _, _, to_z, to_w = self._film[0].mug_orientation
+        depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w)])
         for configuration in self._film:
             self._view.place(configuration)
             yield self._view.picture(depth)
@@ -212,13 +214,18 @@ class PandaGraspEnv(POMDPEnv):
         x, y, z, yaw = self._state[0].tolist()
         return [PandaView.at_rest((x, y, z), yaw)]
 
-    def _shown_depth(self) -> np.ndarray:
-        assert self._state is not None
-        (depth,) = self._with_noise(self._camera.images(self._state), np.random.default_rng(0))
+    def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
+        (depth,) = self._with_noise(self._camera.images(np.array([state])), np.random.default_rng(0))
         return depth
 
     def close(self) -> None:
         """Close the Bullet worlds and the window; closing twice is fine."""
+        self._is_closed = True
         for name in ("_simulation", "_camera", "_view"):
             if name in self.__dict__:
                 getattr(self, name).close()
+
+    def _check_open(self) -> None:
+        # BulletClient says the same of a world that has been closed, but here there may have been none yet.
+        if self._is_closed:
+            raise RuntimeError("this environment has been closed: make a new one")

@@ -22,7 +22,7 @@ TABLE_FILE = os.path.join(ASSETS, "table", "table.urdf")
 MUG_FILE = os.path.join(ASSETS, "objects", "mug.obj")
 
 TABLE_POSITION = (0.4, 0.0, -0.625)  # puts the table's top at z = 0
-MUG_COLOR = (0.75, 0.16, 0.14, 1.0)
+MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
 UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
 
 # The mug of PyBullet, made wider and lower: 93 mm across and 81 mm high as the paper's. It is wider than the gripper

@@ -13,12 +13,12 @@ from .panda_camera import IMAGE_SIZE
 from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
 
 HEIGHT, WIDTH = 256, 384  # pixels of the view
-MIDDLE = (0.42, 0.0, 0.22)  # m, what it looks at
-DISTANCE, YAW, PITCH, FOV = 1.25, 38.0, -24.0, 42.0  # m and degrees
-LIGHT = (1.0, -0.8, 2.0)  # direction
+MIDDLE = (0.36, 0.0, 0.22)  # m, what it looks at
+DISTANCE, YAW, PITCH, FOV = 0.85, 145.0, -24.0, 46.0  # m and degrees: from where it sees robot, mug and handle
+LIGHT = (1.0, 1.2, 2.5)  # direction
 FLOOR_FILE = os.path.join(ASSETS, "plane.urdf")
 FLOOR_HEIGHT = -0.625  # m
-NEAREST, FURTHEST = 0.33, 0.61  # m, what is white and what is black in the picture of the depth
+NEAREST, FURTHEST = 0.30, 0.61  # m, what is white and what is black in the picture of the depth
 
 
 class PandaView:
