@@ -6,6 +6,7 @@ Dimension key: N episodes side by side, X state, U action; observations have sha
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ class BatchStep(NamedTuple):
     state: np.ndarray  # (N, X), x_{t+1}
     observation: np.ndarray  # (N, *obs), y_{t+1}
     cost: np.ndarray  # (N,), c_t, plus c_T on the last step
+    details: Sequence[Mapping[str, Any]] = ()  # N of them, or none: what else stands in the info of the step
 
 
 class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -34,7 +36,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     problem, so that nothing bootstraps there. The reward is the negative cost, negated here and nowhere else.
 
     ``info["state"]`` holds a copy of the true state (after ``reset`` x_0, after ``step`` x_{t+1}), ``info["cost"]``
-    the cost of the step.
+    the cost of the step. A subclass may add to the info of a step by :meth:`_details`.
 
     :param horizon: Number of controls T in an episode.
     :param render_mode: ``None`` or one of ``metadata["render_modes"]``.
@@ -43,6 +45,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
+    #: Whether a batch takes as long as its episodes one by one, so that several processes are worth their while.
+    wants_processes: bool = False
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
         if not (isinstance(horizon, (int, np.integer)) and horizon >= 1):
@@ -76,6 +80,10 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
         """c_T(x_T): ``(N,)``."""
 
+    def _details(self) -> Sequence[Mapping[str, Any]]:
+        """Tell more of what the last :meth:`_dynamics` did, for the info of each of its N episodes; or nothing."""
+        return ()
+
     def reset_batch(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Start N episodes; return x_0 ``(N, X)`` and y_0 ``(N, *obs)``."""
         state = self._initial_state(n)
@@ -103,7 +111,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         next_state = self._dynamics(state, action)
         if is_last:
             cost = cost + self._terminal_cost(next_state)
-        return BatchStep(next_state, self._sensor(next_state), cost)
+        return BatchStep(next_state, self._sensor(next_state), cost, self._details())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -123,6 +131,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         self._time += 1
         terminated = self._time == self.horizon
         batch = np.asarray(action, dtype=np.float64).reshape(1, -1)
-        self._state, observation, cost = self.step_batch(self._state, batch, is_last=terminated)
+        self._state, observation, cost, details = self.step_batch(self._state, batch, is_last=terminated)
         info = {"state": self._state[0].copy(), "cost": float(cost[0])}
+        for more in details:
+            info.update(more)
         return observation[0], -float(cost[0]), terminated, False, info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -123,4 +124,16 @@ BALL_CATCH_DIAGNOSIS: tuple[Scenario, ...] = (
 # The same rows where the launch varies: a comparison of our own, without numbers of the paper.
 BALL_CATCH_VARYING_LAUNCH: tuple[Scenario, ...] = tuple(
     Scenario(row.name, row.env_id, {**BALL_VARYING_LAUNCH, **row.env_kwargs}) for row in BALL_CATCH
+)
+
+
+def _panda(name: str, pg: float, tdpg: float, **env_kwargs: Any) -> Scenario:
+    return Scenario(name, "PandaGrasp-v0", env_kwargs, dict(PG=PaperResult(pg), TDPG=PaperResult(tdpg)))
+
+
+# Table III. The cost is 1 for a failure, so that its mean is the failure rate.
+PANDA_GRASP: tuple[Scenario, ...] = (
+    _panda("Training", 0.107, 0.094),
+    _panda("Rotation", 0.182, 0.132, yaw_range=(0.0, 2 * math.pi)),
+    _panda("Translation", 0.367, 0.358, xy_half_width=0.075),
 )

@@ -7,7 +7,10 @@ Dimension key: N environments side by side, X state, U action.
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import os
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any, cast
@@ -17,7 +20,7 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_tdpg.defaults import defaults_for
@@ -77,11 +80,13 @@ class BatchedVecEnv(VecEnv):
         """Apply the stored actions; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
         self._time += 1
         is_last = self._time == self.env.horizon
-        self._state, observation, cost = self.env.step_batch(self._state, self._actions, is_last=is_last)
+        self._state, observation, cost, details = self.env.step_batch(self._state, self._actions, is_last=is_last)
         self._returns -= cost
         infos: list[dict[str, Any]] = [
             {"state": state, "cost": c} for state, c in zip(self._state.copy(), cost.tolist(), strict=True)
         ]
+        for info, more in zip(infos, details, strict=False):
+            info.update(more)
         if is_last:
             elapsed = round(time.time() - self._start_time, 6)
             for info, terminal_observation, episode_return in zip(
@@ -128,6 +133,15 @@ class BatchedVecEnv(VecEnv):
         return images
 
 
+def usable_cores() -> int:
+    """Count the processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _largest_divisor(n: int, limit: int) -> int:
+    return max(divisor for divisor in range(1, min(n, limit) + 1) if n % divisor == 0)
+
+
 def make_episodes_env(
     env_id: str,
     n_envs: int | None = None,
@@ -139,13 +153,22 @@ def make_episodes_env(
     """
     Vectorise a registered id in the fastest way that this plugin knows.
 
+    ==================================================  ==========================  ===================================
+    environment                                         becomes                     number of environments by default
+    ==================================================  ==========================  ===================================
+    of this plugin                                      :class:`BatchedVecEnv`      ``n_episodes``
+    of this plugin, simulated one by one (PandaGrasp),  SB3's ``SubprocVecEnv``     the largest divisor of
+    on several cores                                                                ``n_episodes`` up to the cores
+    any other                                           SB3's ``DummyVecEnv``       the largest divisor of
+                                                                                    ``n_episodes`` up to 50
+    ==================================================  ==========================  ===================================
+
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, otherwise its largest
-        divisor up to 50.
+    :param n_envs: Number of environments. One that is simulated one by one has a process for each; with 1, there is
+        none beside this one.
     :param n_episodes: Episodes that are to be run at a time; default: as many as TDPG runs in an epoch by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :return: a :class:`BatchedVecEnv` for an environment of this plugin, SB3's ``DummyVecEnv`` for any other
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
@@ -156,14 +179,36 @@ def make_episodes_env(
     creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
     if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
         env = cast(POMDPEnv, creator(**{**spec.kwargs, **env_kwargs}))
+        n_episodes = n_episodes or defaults_for(env.observation_space).n_episodes
+        if env.wants_processes and (n_processes := n_envs or _largest_divisor(n_episodes, usable_cores())) > 1:
+            env.close()
+            # With its module, so that a process that does not know of the registration comes to know it.
+            return _in_processes(f"{creator.__module__}:{bare_id}", n_processes, env_kwargs, seed)
         env.spec = spec
-        n_envs = n_envs or n_episodes or defaults_for(env.observation_space).n_episodes
-        vec_env: VecEnv = BatchedVecEnv(env, n_envs)
+        vec_env: VecEnv = BatchedVecEnv(env, n_envs or n_episodes)
         vec_env.seed(seed)
         return vec_env
     if n_envs is None:
         if n_episodes is None:
             with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
                 n_episodes = defaults_for(probe.observation_space).n_episodes
-        n_envs = max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
+        n_envs = _largest_divisor(n_episodes, 50)
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
+
+
+def _in_processes(env_id: str, n_envs: int, env_kwargs: dict[str, Any], seed: int | None) -> VecEnv:
+    """Give each environment a process of its own."""
+    # A forked process goes on where this one is. Any other start method imports the user's script once more, which must
+    # then guard what it does by `if __name__ == "__main__"`.
+    start_method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
+    with warnings.catch_warnings():
+        # From Python 3.12 on a fork warns of the threads of PyTorch; the processes do not call PyTorch.
+        warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
+        return make_vec_env(
+            env_id,
+            n_envs=n_envs,
+            seed=seed,
+            env_kwargs=env_kwargs,
+            vec_env_cls=SubprocVecEnv,
+            vec_env_kwargs=dict(start_method=start_method),
+        )

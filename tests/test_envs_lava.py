@@ -121,6 +121,8 @@ def test_every_registered_environment_passes_the_checkers(env_id, check_env):
         warnings.filterwarnings("ignore", message=".*Box observation space m(in|ax)imum value is.*infinity.*")
         warnings.filterwarnings("ignore", message=".*symmetric and normalized.*space.*")
         warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes.*")
+        # A depth image is in metres, not in bytes.
+        warnings.filterwarnings("ignore", message="It seems that your observation.*is an image but")
         env = gym.make(env_id).unwrapped
         # A window needs a display.
         env.metadata = {**env.metadata, "render_modes": [m for m in env.metadata["render_modes"] if m != "human"]}
@@ -168,7 +170,7 @@ def test_the_state_in_info_is_a_copy_that_may_be_overwritten(env_id):
     _, _, _, _, expected = untouched.step(action)
     np.testing.assert_array_equal(info["state"], expected["state"])
     kept = info["state"].copy()
-    env.step(action)
+    env.step(action) if env.unwrapped.horizon > 1 else env.reset()
     np.testing.assert_array_equal(info["state"], kept)
 
 

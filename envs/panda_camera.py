@@ -1,0 +1,80 @@
+"""The depth camera of the grasping scene: PyBullet draws the mug alone, the table behind it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .bullet import BulletClient
+from .panda_scene import PandaScene, add_mug_picture
+
+IMAGE_SIZE = 128  # pixels a side
+
+TARGET, DISTANCE, YAW, PITCH = (0.5, 0.0, 0.02), 0.4, 225.0, -45.0  # m and degrees: where it looks, and from where
+NEAR, FAR = 0.01, 1000.0  # m
+# Edges of the image at the depth NEAR: left, right, bottom, top.
+EDGES = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
+
+
+class DepthCamera:
+    """
+    A Bullet world of its own with nothing in it but the mug's mesh.
+
+    Drawing table and mug takes 5 ms an image. The table's depth is the same in every image and follows from geometry,
+    so that the mug alone is drawn, in 1.4 ms, and of the two the nearer one is seen: the same to 3e-6 m.
+
+    :param scene: Size and frame of the mug.
+    """
+
+    def __init__(self, scene: PandaScene) -> None:
+        self.client = client = BulletClient()
+        self._mug = add_mug_picture(client, scene)
+        view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
+        projection = client.computeProjectionMatrix(*EDGES, NEAR, FAR)
+        self._camera = dict(
+            width=IMAGE_SIZE,
+            height=IMAGE_SIZE,
+            viewMatrix=view,
+            projectionMatrix=projection,
+            shadow=0,
+            renderer=client.ER_TINY_RENDERER,
+        )
+        # In single precision, which a projection matrix has, 1000 m are as much as 998.65 m.
+        matrix = np.array(projection, np.float32)
+        self._far = float(matrix[14] / (matrix[10] + np.float32(1)))
+        turn_and_shift = np.array(view).reshape(4, 4).T
+        self.rotation = turn_and_shift[:3, :3]  # from the world's axes to right, up and backward
+        self.eye = -self.rotation.T @ turn_and_shift[:3, 3]
+        self.table_depth = self._depth_of_plane(0.0)
+
+    def _depth_of_plane(self, z: float) -> np.ndarray:
+        """Depth of a level plane without end, ``(128, 128)``, along the axis of view as every depth here."""
+        left, right, bottom, top = EDGES
+        # TinyRenderer samples a pixel at its lower left corner. The first row is the uppermost.
+        corner = np.arange(IMAGE_SIZE) / IMAGE_SIZE
+        to_right = (left + (right - left) * corner) / NEAR
+        upward = (bottom + (top - bottom) * corner[::-1]) / NEAR
+        rays = np.stack(np.broadcast_arrays(to_right[None, :], upward[:, None], -1.0), axis=-1) @ self.rotation
+        return (z - self.eye[2]) / rays[..., 2]
+
+    def pixel(self, point: np.ndarray) -> tuple[float, float, float]:
+        """Return row, column and depth of a point, ``(3,)``, of the world."""
+        left, right, bottom, top = EDGES
+        to_right, upward, backward = self.rotation @ (np.asarray(point) - self.eye)
+        depth = -backward
+        column = (NEAR * to_right / depth - left) / (right - left) * IMAGE_SIZE
+        row = IMAGE_SIZE - 1 - (NEAR * upward / depth - bottom) / (top - bottom) * IMAGE_SIZE
+        return float(row), float(column), float(depth)
+
+    def images(self, state: np.ndarray) -> np.ndarray:
+        """Return one depth image for each state of the mug: ``(N, 1, 128, 128)`` float32 in m from ``(N, 4)``."""
+        images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
+        client = self.client
+        for image, (x, y, z, yaw) in zip(images, state.tolist(), strict=True):
+            client.resetBasePositionAndOrientation(self._mug, (x, y, z), client.getQuaternionFromEuler((0, 0, yaw)))
+            buffer = np.asarray(client.getCameraImage(**self._camera)[3], np.float64).reshape(IMAGE_SIZE, IMAGE_SIZE)
+            image[0] = np.minimum(self._far * NEAR / (self._far - (self._far - NEAR) * buffer), self.table_depth)
+        return images
+
+    def close(self) -> None:
+        """Close the Bullet world."""
+        self.client.close()

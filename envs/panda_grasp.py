@@ -1,0 +1,231 @@
+"""The grasping problem (Section IV-C of the paper): lift a mug by its rim, with one depth image as the only sensor."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from .base import POMDPEnv
+from .panda_bullet import MOTIONS, Configuration, GraspSimulation
+from .panda_camera import IMAGE_SIZE, DepthCamera
+from .panda_scene import PandaScene
+from .panda_view import PandaView
+
+NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
+ACTION_SCALE = 0.1
+# In units of the action. x and y: what the arm reaches and the table's mugs need. z, between 0.05 and 0.16 m: lower
+# down the palm would press on the rim, which lifts nothing. yaw: 1 rad to either side.
+LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
+HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
+MAX_DEPTH = 1.0  # m; the table is at most 0.61 m away
+LIFTED = 0.05  # m
+
+WORKSPACE = np.array([0.5, 0.0])  # m, its middle
+
+
+class PandaGraspEnv(POMDPEnv):
+    r"""
+    Grasp a mug that stands anywhere on a table, and lift it.
+
+    State ``x = (x, y, z, yaw)`` of the mug's frame, in m and rad. Observation ``y``: a depth image in m, float32
+    ``(1, 128, 128)``. Action ``u``: where the hand grasps, ``(0.5, 0, 0.06, pi/6) + 0.1 u`` for its position in m and
+    its yaw in rad. There is one control, ``T = 1``, and PyBullet simulates what comes of it:
+
+    .. math::
+        c_0 = 0, \qquad c_1 = \begin{cases} 0 & \text{if the mug's frame is more than 5 cm above the table},\\
+        1 & \text{otherwise.} \end{cases}
+
+    ``info`` has, after the step, ``success``, ``mug_height`` (m), ``grasp`` (the pose of the grasp, after clipping),
+    ``contacts`` (points in which the fingers touch the mug in the end), and ``is_success``, the name under which
+    Stable-Baselines3 looks for the success.
+
+    An outcome is a function of state and action alone: it does not depend on the trials before it, nor on the process.
+
+    :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
+    :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
+    :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
+    :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
+    :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
+    :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: 50 in the fast motion, 150 in the
+        reference.
+    :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
+    :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
+    :param render_mode: ``None``, ``"rgb_array"`` (the scene beside the depth image) or ``"human"`` (PyBullet's window).
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
+    wants_processes = True
+
+    def __init__(
+        self,
+        *,
+        xy_half_width: float = 0.05,
+        yaw_range: tuple[float, float] = (-np.pi / 4, np.pi / 4),
+        mug_scale: float = 1.0,
+        frame_offset: float = 0.012,
+        friction: float = 0.5,
+        solver_iterations: int | None = None,
+        motion: str = "fast",
+        depth_noise_std: float = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(horizon=1, render_mode=render_mode)
+        if not 0 <= xy_half_width <= 0.2:
+            raise ValueError(f"xy_half_width={xy_half_width} must be between 0 and 0.2 m: what the arm reaches")
+        low_high = np.asarray(yaw_range, dtype=np.float64)
+        if low_high.shape != (2,) or not np.isfinite(low_high).all() or low_high[0] > low_high[1]:
+            raise ValueError(f"yaw_range={yaw_range} must be (low, high) of finite numbers in rad, low <= high")
+        if not 0.5 <= mug_scale <= 1.5:
+            raise ValueError(f"mug_scale={mug_scale} must be between 0.5 and 1.5: it is a multiple of the paper's size")
+        if not -0.05 <= frame_offset <= 0.05:
+            raise ValueError(f"frame_offset={frame_offset} must be between -0.05 and 0.05 m")
+        if not (np.isfinite(friction) and friction >= 0):
+            raise ValueError(f"friction={friction} must be finite and not negative")
+        if solver_iterations is not None and not (
+            isinstance(solver_iterations, (int, np.integer)) and solver_iterations >= 1
+        ):
+            raise ValueError(f"solver_iterations={solver_iterations!r} must be None or an integer of at least 1")
+        if motion not in MOTIONS:
+            raise ValueError(f"motion={motion!r} must be one of {list(MOTIONS)}")
+        if not (np.isfinite(depth_noise_std) and depth_noise_std >= 0):
+            raise ValueError(f"depth_noise_std={depth_noise_std} must be finite and not negative (it is sigma, in m)")
+        self.xy_half_width = float(xy_half_width)
+        self.yaw_range = low_high
+        self.scene = PandaScene(float(mug_scale), float(frame_offset), float(friction))
+        self.solver_iterations = solver_iterations
+        self.motion = motion
+        self.depth_noise_std = float(depth_noise_std)
+        self.state_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
+        self.observation_space = spaces.Box(0.0, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
+        self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
+        self._last_details: list[dict[str, Any]] = []
+        self._is_closed = False
+        self._film: list[Configuration] = []  # of the last grasp, where something is rendered
+
+    # -- Bullet worlds, each made when it is needed, and so in the process that uses it ------------------------------
+
+    @cached_property
+    def _simulation(self) -> GraspSimulation:
+        self._check_open()
+        return GraspSimulation(self.scene, MOTIONS[self.motion], self.solver_iterations)
+
+    @cached_property
+    def _camera(self) -> DepthCamera:
+        self._check_open()
+        return DepthCamera(self.scene)
+
+    @cached_property
+    def _view(self) -> PandaView:
+        self._check_open()
+        return PandaView(self.scene, gui=self.render_mode == "human")
+
+    # -- the POMDP ----------------------------------------------------------------------------------------------------
+
+    def _initial_state(self, n: int) -> np.ndarray:
+        state = np.zeros((n, 4))
+        state[:, :2] = WORKSPACE + self.np_random.uniform(-self.xy_half_width, self.xy_half_width, (n, 2))
+        state[:, 3] = self.np_random.uniform(self.yaw_range[0], self.yaw_range[1], n)
+        return state
+
+    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        poses = NOMINAL_GRASP + ACTION_SCALE * action
+        next_state = np.empty_like(state)
+        self._last_details = []
+        for i, (mug, pose) in enumerate(zip(state, poses, strict=True)):
+            self._film = []
+            watch = None if self.render_mode is None else self._film.append
+            next_state[i], contacts = self._simulation.grasp(mug, pose, watch)
+            height = float(next_state[i, 2])
+            success = height > LIFTED
+            self._last_details.append(
+                dict(success=success, is_success=success, mug_height=height, grasp=pose, contacts=contacts)
+            )
+        return next_state
+
+    def _details(self) -> Sequence[Mapping[str, Any]]:
+        return self._last_details
+
+    def _sensor(self, state: np.ndarray) -> np.ndarray:
+        return self._with_noise(self._camera.images(state), self.np_random)
+
+    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        return np.zeros(len(state))
+
+    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+        return np.where(state[:, 2] > LIFTED, 0.0, 1.0)
+
+    def _with_noise(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Add noise to depth images, ``(N, 1, 128, 128)``, and cut off what is outside the observation space."""
+        if self.depth_noise_std > 0:
+            for image in images:
+                image += self.depth_noise_std * rng.standard_normal(image.shape)
+        return np.clip(images, 0.0, MAX_DEPTH, out=images)
+
+    # -- pictures -----------------------------------------------------------------------------------------------------
+
+    def render(self) -> np.ndarray | None:
+        """
+        Show the scene as it is: before the grasp, or after it.
+
+        ``"rgb_array"``: the scene beside the depth image, ``(256, 644, 3)`` uint8, near points bright; see also
+        :meth:`film`. ``"human"``: in PyBullet's window, where the grasp is played at its speed; ``None`` is returned.
+        Sensor noise is drawn anew, so that drawing does not change an episode.
+        """
+        if self.render_mode is None:
+            return None
+        if self._state is None:
+            raise ValueError("there is nothing to render before the first reset()")
+        if self.render_mode == "human":
+            for configuration in self._shown():
+                self._view.place(configuration)
+                time.sleep(1 / self.metadata["render_fps"])
+            return None
+        self._view.place(self._shown()[-1])
+        return self._view.picture(self._depth_of(self._state[0]))
+
+    def film(self) -> Iterator[np.ndarray]:
+        """
+        Draw the last grasp from beginning to end, 30 pictures for each second of it; see :meth:`render`.
+
+        The depth image beside it stays the one that the grasp was chosen by.
+
+        :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or nothing has been grasped since ``reset``.
+        """
+        if self.render_mode != "rgb_array":
+            raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a film")
+        if self._time == 0:
+            raise ValueError("there is no grasp to show before step()")
+        _, _, to_z, to_w = self._film[0].mug_orientation
+        depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w)])
+        for configuration in self._film:
+            self._view.place(configuration)
+            yield self._view.picture(depth)
+
+    def _shown(self) -> list[Configuration]:
+        """Return what there is to see: the last grasp, or the mug where it stands and the robot at rest."""
+        assert self._state is not None
+        if self._time > 0:
+            return self._film
+        x, y, z, yaw = self._state[0].tolist()
+        return [PandaView.at_rest((x, y, z), yaw)]
+
+    def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
+        (depth,) = self._with_noise(self._camera.images(np.array([state])), np.random.default_rng(0))
+        return depth
+
+    def close(self) -> None:
+        """Close the Bullet worlds and the window; closing twice is fine."""
+        self._is_closed = True
+        for name in ("_simulation", "_camera", "_view"):
+            if name in self.__dict__:
+                getattr(self, name).close()
+
+    def _check_open(self) -> None:
+        # BulletClient says the same of a world that has been closed, but here there may have been none yet.
+        if self._is_closed:
+            raise RuntimeError("this environment has been closed: make a new one")

@@ -1,0 +1,150 @@
+"""
+The grasping scene as data: table, mug and camera, for the simulation as for every picture.
+
+Coordinates: the robot stands at the origin and looks along +x, y is to its left, z upward; the table's top is z = 0.
+Lengths are in metres, angles in radians.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pybullet_data
+
+from .bullet import BulletClient
+
+ASSETS = pybullet_data.getDataPath()
+ROBOT_FILE = os.path.join(ASSETS, "franka_panda", "panda.urdf")
+TABLE_FILE = os.path.join(ASSETS, "table", "table.urdf")
+MUG_FILE = os.path.join(ASSETS, "objects", "mug.obj")
+
+TABLE_POSITION = (0.4, 0.0, -0.625)  # puts the table's top at z = 0
+MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
+UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
+
+# The mug of PyBullet, made wider and lower: 93 mm across and 81 mm high as the paper's. It is wider than the gripper
+# opens, so that it can be grasped by its rim only, one finger inside.
+MESH_SCALE = np.array([1.134, 1.134, 0.81])
+MESH_RADIUS, MESH_HEIGHT = 0.041, 0.1  # of the cup in the file
+N_STAVES = 12
+WALL_THICKNESS = 0.0075
+BASE_HEIGHT = 0.006
+# Ends (y, z) of the handle's three bars in the file, and their half width and thickness.
+HANDLE_BARS = (
+    ((0.0768, 0.0225), (0.0768, 0.0775)),
+    ((0.039, 0.0775), (0.0768, 0.0775)),
+    ((0.039, 0.0225), (0.0768, 0.0225)),
+)
+BAR_HALF_WIDTH, BAR_THICKNESS = 0.0055, 0.0085
+MASS = 0.1  # kg
+MAX_SHAPES = 16
+INERTIA = 2e-4  # kg m^2, about each axis
+CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame: a little towards the handle
+
+
+@dataclass(frozen=True)
+class PandaScene:
+    """
+    What can be varied in the scene.
+
+    The cup's frame has the cup's axis for its z axis and the handle along +y. The mug's frame, whose position and
+    rotation are the state, has its origin beside the axis.
+
+    :param mug_scale: Size of the mug, as a multiple of the paper's.
+    :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
+    :param friction: Lateral friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
+    """
+
+    mug_scale: float
+    frame_offset: float
+    friction: float
+
+    @property
+    def mesh_scale(self) -> np.ndarray:
+        """What the mesh in the file is multiplied by, ``(3,)``."""
+        return self.mug_scale * MESH_SCALE
+
+    @property
+    def mug_radius(self) -> float:
+        """Outer radius of the cup."""
+        return float(self.mesh_scale[0] * MESH_RADIUS)
+
+    @property
+    def mug_height(self) -> float:
+        """Height of the rim above the table."""
+        return float(self.mesh_scale[2] * MESH_HEIGHT)
+
+    @property
+    def cup_origin(self) -> np.ndarray:
+        """Origin of the cup's frame in the mug's, ``(3,)``."""
+        return np.array([0.0, -self.frame_offset, 0.0])
+
+    @property
+    def centre_of_mass(self) -> np.ndarray:
+        """In the mug's frame, ``(3,)``. Bullet's base position is that of the centre of mass."""
+        return self.cup_origin + self.mug_scale * CENTRE_OF_MASS
+
+    def collision_shapes(self) -> list[dict[str, Any]]:
+        """
+        Build the mug from a disc, twelve staves around it and three bars for the handle.
+
+        A mesh would not do: Bullet takes the convex hull of one that moves, and the hull of a cup is not hollow.
+
+        :return: type, size, position and orientation in the mug's frame of each shape
+        """
+        radius, height, thickness = self.mug_radius, self.mug_height, self.mug_scale * WALL_THICKNESS
+        base = self.mug_scale * BASE_HEIGHT
+        # Only the base touches the table: the staves begin in the middle of it.
+        shapes = [dict(radius=0.93 * radius, length=base, position=(0.0, 0.0, base / 2), yaw=0.0)]
+        stave = (thickness / 2, radius * np.tan(np.pi / N_STAVES), (height - base / 2) / 2)
+        for yaw in 2 * np.pi * np.arange(N_STAVES) / N_STAVES:
+            across = radius - thickness / 2
+            position = (across * np.cos(yaw), across * np.sin(yaw), base / 2 + stave[2])
+            shapes.append(dict(half_extents=stave, position=position, yaw=yaw))
+        scale_x, scale_y, scale_z = self.mesh_scale
+        half_width, half_thickness = BAR_HALF_WIDTH * scale_x, BAR_THICKNESS * min(scale_x, scale_z) / 2
+        for (y_0, z_0), (y_1, z_1) in np.array(HANDLE_BARS) * (scale_y, scale_z):
+            bar = (half_width, (y_1 - y_0) / 2 + half_thickness, (z_1 - z_0) / 2 + half_thickness)
+            shapes.append(dict(half_extents=bar, position=(0.0, (y_0 + y_1) / 2, (z_0 + z_1) / 2), yaw=0.0))
+        return shapes
+
+
+def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
+    """Add the mug as it looks, the hollow mesh; return its body's id. Its base position is that of the mug's frame."""
+    shape = client.createVisualShape(
+        client.GEOM_MESH,
+        fileName=MUG_FILE,
+        meshScale=scene.mesh_scale.tolist(),
+        visualFramePosition=scene.cup_origin.tolist(),
+        rgbaColor=MUG_COLOR,
+        specularColor=(0.3, 0.3, 0.3),
+    )
+    return int(client.createMultiBody(baseVisualShapeIndex=shape))
+
+
+def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
+    """
+    Add the mug as it is felt; return its body's id. Its base position is that of its centre of mass.
+
+    :raises RuntimeError: if PyBullet did not take all of the shapes.
+    """
+    shapes = scene.collision_shapes()
+    # PyBullet takes 16 shapes a body, which is what these are, and drops any further without a word.
+    if len(shapes) > MAX_SHAPES:
+        raise RuntimeError(f"the mug has {len(shapes)} shapes, PyBullet takes {MAX_SHAPES}")
+    body = client.createCollisionShapeArray(
+        [client.GEOM_BOX if "half_extents" in shape else client.GEOM_CYLINDER for shape in shapes],
+        halfExtents=[shape.get("half_extents", (0.0, 0.0, 0.0)) for shape in shapes],
+        radii=[shape.get("radius", 0.0) for shape in shapes],
+        lengths=[shape.get("length", 0.0) for shape in shapes],
+        collisionFramePositions=[(scene.cup_origin + shape["position"]).tolist() for shape in shapes],
+        collisionFrameOrientations=[client.getQuaternionFromEuler([0.0, 0.0, shape["yaw"]]) for shape in shapes],
+    )
+    mug = client.createMultiBody(MASS, body, baseInertialFramePosition=scene.centre_of_mass.tolist())
+    client.changeDynamics(
+        mug, -1, lateralFriction=scene.friction, spinningFriction=0.0, localInertiaDiagonal=[INERTIA] * 3
+    )
+    return int(mug)

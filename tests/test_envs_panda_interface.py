@@ -1,0 +1,285 @@
+"""The grasping problem as Gymnasium, Stable-Baselines3 and a reader of pictures see it, and what it refuses."""
+
+import os
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from panda_oracle import mixed_actions, oracle_actions, run_python
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_tdpg import BatchedVecEnv, make_episodes_env, vec_env
+from sb3_tdpg.envs.panda_bullet import MOTIONS
+from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
+from sb3_tdpg.envs.scenarios import PANDA_GRASP
+
+
+@pytest.fixture
+def env():
+    env = PandaGraspEnv()
+    yield env
+    env.close()
+
+
+# -- the start -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("row", "half_width", "yaw"), [
+    (0, 0.05, (-np.pi / 4, np.pi / 4)), (1, 0.05, (0, 2 * np.pi)), (2, 0.075, (-np.pi / 4, np.pi / 4))
+], ids=[row.name for row in PANDA_GRASP])  # fmt: skip
+def test_the_mug_starts_anywhere_in_the_ranges_of_table_three(row, half_width, yaw):
+    made = gym.make(PANDA_GRASP[row].env_id, **PANDA_GRASP[row].env_kwargs).unwrapped
+    states = made._initial_state(20_000)
+    low, high = [0.5 - half_width, -half_width, 0, yaw[0]], [0.5 + half_width, half_width, 0, yaw[1]]
+    np.testing.assert_allclose(states.min(axis=0), low, atol=2e-3)
+    np.testing.assert_allclose(states.max(axis=0), high, atol=2e-3)
+    np.testing.assert_allclose(states.mean(axis=0), (np.array(low) + high) / 2, atol=0.03)
+    assert made.state_space.contains(states[0])
+
+
+def test_table_three_has_the_numbers_of_the_paper():
+    numbers = [(row.name, row.paper["PG"].mean, row.paper["TDPG"].mean) for row in PANDA_GRASP]
+    assert numbers == [("Training", 0.107, 0.094), ("Rotation", 0.182, 0.132), ("Translation", 0.367, 0.358)]
+
+
+@pytest.mark.parametrize(("keywords", "changes"), [
+    (dict(mug_scale=0.9), True), (dict(frame_offset=0.0), True), (dict(depth_noise_std=0.01), True),
+    (dict(friction=0.9), False), (dict(solver_iterations=80), False), (dict(motion="reference"), False),
+], ids=str)  # fmt: skip
+def test_a_keyword_of_the_scene_changes_the_image_one_of_the_physics_does_not_and_neither_the_state(
+    env, keywords, changes
+):
+    image, info = env.reset(seed=0)
+    other = PandaGraspEnv(**keywords)
+    other_image, other_info = other.reset(seed=0)
+    other.close()
+    assert np.array_equal(image, other_image) != changes
+    np.testing.assert_array_equal(info["state"], other_info["state"])
+
+
+@pytest.mark.parametrize(("keywords", "iterations"), [
+    ({}, 50), (dict(motion="reference"), 150), (dict(solver_iterations=80), 80)
+], ids=str)  # fmt: skip
+def test_the_motion_decides_on_the_solver_s_iterations_unless_they_are_given(keywords, iterations):
+    made = PandaGraspEnv(**keywords)
+    assert made._simulation.client.getPhysicsEngineParameters()["numSolverIterations"] == iterations
+    assert made._simulation.motion is MOTIONS[keywords.get("motion", "fast")]
+    made.close()
+
+
+# -- vectorised ------------------------------------------------------------------------------------------------------
+
+
+def test_every_kind_of_vectorised_environment_gives_the_same_outcomes_and_details():
+    kinds = {
+        "dummy": make_vec_env("PandaGrasp-v0", 4, seed=3, vec_env_cls=DummyVecEnv),
+        "processes": make_episodes_env("PandaGrasp-v0", 4, seed=3),
+        "batch": BatchedVecEnv(PandaGraspEnv(), 4),
+    }
+    assert isinstance(kinds["processes"], SubprocVecEnv)
+    first_images = {name: each.reset() for name, each in kinds.items()}
+    states = np.array([info["state"] for info in kinds["dummy"].reset_infos])
+    np.testing.assert_array_equal([info["state"] for info in kinds["processes"].reset_infos], states)
+    kinds["batch"]._state = states.copy()
+    first_images["batch"] = kinds["batch"].env._sensor(states)
+    actions = mixed_actions(states, seed=1)
+    actions[0] = oracle_actions(states)[0]
+    steps = {name: each.step(actions) for name, each in kinds.items()}
+    for name in ("processes", "batch"):
+        np.testing.assert_array_equal(first_images[name], first_images["dummy"])
+        (_, rewards, dones, infos), (_, expected_rewards, _, expected) = steps[name], steps["dummy"]
+        np.testing.assert_array_equal(rewards, expected_rewards)
+        assert dones.all()
+        for info, expected_info in zip(infos, expected, strict=True):
+            for key in ("state", "grasp", "terminal_observation"):
+                np.testing.assert_array_equal(info[key], expected_info[key])
+            for key in ("cost", "success", "is_success", "mug_height", "contacts"):
+                assert info[key] == expected_info[key]
+            assert info["episode"]["r"] == expected_info["episode"]["r"]
+    assert steps["batch"][3][0]["success"]
+    for each in kinds.values():
+        each.close()
+
+
+@pytest.mark.parametrize(("cores", "n_episodes", "n_envs", "kind", "expected"), [
+    (2, 10, None, SubprocVecEnv, 2),
+    (4, 10, None, SubprocVecEnv, 2),
+    (5, 10, None, SubprocVecEnv, 5),
+    (1, 10, None, BatchedVecEnv, 10),
+    (2, 7, None, BatchedVecEnv, 7),
+    (2, 10, 1, BatchedVecEnv, 1),
+    (1, 9, 3, SubprocVecEnv, 3),
+])  # fmt: skip
+def test_an_id_gets_a_process_for_each_core_that_divides_the_episodes(
+    monkeypatch, cores, n_episodes, n_envs, kind, expected
+):
+    monkeypatch.setattr(vec_env, "usable_cores", lambda: cores)
+    made = make_episodes_env("sb3_tdpg:PandaGrasp-v0", n_envs, n_episodes=n_episodes, env_kwargs=dict(friction=0.4))
+    assert type(made) is kind
+    assert made.num_envs == expected
+    assert all(made.env_is_wrapped(Monitor))
+    assert made.get_attr("scene")[0].friction == 0.4
+    made.close()
+
+
+def test_a_script_without_a_main_guard_may_use_processes(tmp_path):
+    if not hasattr(os, "fork"):
+        pytest.skip("other start methods import the script once more")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import numpy as np\n"
+        "from sb3_tdpg import make_episodes_env\n"
+        "env = make_episodes_env('PandaGrasp-v0', 2, seed=0)\n"
+        "env.reset()\n"
+        "print(type(env).__name__, env.step(np.zeros((2, 4), np.float32))[2])\n"
+        "env.close()\n"
+    )
+    assert run_python("-W", "error::DeprecationWarning", str(script)).splitlines()[-1] == "SubprocVecEnv [ True  True]"
+
+
+def test_a_bad_keyword_is_told_before_any_process_is_started():
+    with pytest.raises(ValueError, match="motion='slow'"):
+        make_episodes_env("PandaGrasp-v0", 2, env_kwargs=dict(motion="slow"))
+
+
+# -- pictures --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pictured():
+    """An environment after a grasp that lifted the mug, with the pictures before and after it."""
+    env = PandaGraspEnv(render_mode="rgb_array", depth_noise_std=0.01)
+    _, info = env.reset(seed=1)
+    before = env.render()
+    outcome = env.step(oracle_actions(info["state"][None])[0])
+    yield env, before, env.render(), outcome
+    env.close()
+
+
+def test_the_picture_shows_the_scene_beside_the_depth_image(pictured):
+    _, before, after, _ = pictured
+    for picture in (before, after):
+        assert picture.shape == (256, 644, 3)
+        assert picture.dtype == np.uint8
+    red = (before[:, :384, 0].astype(int) - before[:, :384, 1]) > 80  # the mug
+    assert 200 < red.sum() < 5000
+    assert (before[:, :384] != after[:, :384]).any(axis=2).mean() > 0.05  # the robot has moved
+    grey = before[:, 388:]
+    assert (grey[..., 0] == grey[..., 1]).all()
+    assert np.ptp(grey) > 200
+
+
+def test_drawing_does_not_change_an_episode(pictured, env):
+    _, _, _, (observation, reward, _, _, info) = pictured
+    plain = PandaGraspEnv(depth_noise_std=0.01)
+    _, first = plain.reset(seed=1)
+    expected_observation, expected_reward, _, _, expected = plain.step(oracle_actions(first["state"][None])[0])
+    plain.close()
+    np.testing.assert_array_equal(info["state"], expected["state"])
+    np.testing.assert_array_equal(observation, expected_observation)
+    assert reward == expected_reward == 0
+    assert info["contacts"] == expected["contacts"]
+
+
+def test_the_film_shows_the_grasp_from_its_beginning_to_what_is_rendered_after_it(pictured):
+    env, before, after, _ = pictured
+    pictures = list(env.film())
+    assert len(pictures) > 15
+    np.testing.assert_array_equal(pictures[-1][:, :384], after[:, :384])
+    assert not np.array_equal(pictures[0][:, :384], pictures[-1][:, :384])
+    assert all(np.array_equal(picture[:, 388:], before[:, 388:]) for picture in pictures)  # what the robot went by
+    heights = [configuration.mug_position[2] for configuration in env._film]
+    assert heights[0] == pytest.approx(0.0, abs=1e-3)
+    assert max(heights) == pytest.approx(heights[-1], abs=0.01) and heights[-1] > 0.07
+
+
+def test_every_episode_of_a_batch_is_rendered_by_its_own_state():
+    batch = BatchedVecEnv(PandaGraspEnv(render_mode="rgb_array"), 2)
+    batch.seed(0)
+    batch.reset()
+    assert not np.array_equal(*batch.get_images())
+    batch.close()
+
+
+def test_what_cannot_be_shown_is_said(env):
+    assert env.render() is None
+    with pytest.raises(ValueError, match="render_mode=None must be 'rgb_array' for a film"):
+        next(env.film())
+    drawing = PandaGraspEnv(render_mode="rgb_array")
+    with pytest.raises(ValueError, match="before the first reset"):
+        drawing.render()
+    drawing.reset(seed=0)
+    with pytest.raises(ValueError, match="no grasp to show before step"):
+        next(drawing.film())
+    drawing.close()
+
+
+def test_a_window_without_a_display_is_refused_with_the_mend(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    window = PandaGraspEnv(render_mode="human")
+    window.reset(seed=0)
+    with pytest.raises(RuntimeError, match=r"DISPLAY is not set.*render_mode='rgb_array'"):
+        window.render()
+
+
+# -- opening and closing ---------------------------------------------------------------------------------------------
+
+
+def test_closing_twice_is_fine_and_a_closed_environment_says_so():
+    for uses in (True, False):
+        made = PandaGraspEnv(render_mode="rgb_array")
+        if uses:
+            made.reset(seed=0)
+            made.step(np.zeros(4))
+            made.render()
+        made.close()
+        made.close()
+        with pytest.raises(RuntimeError, match="has been closed: make a new one"):
+            made.reset()
+
+
+def test_bullet_clients_are_given_back():
+    def client_ids():
+        made = PandaGraspEnv()
+        made.reset(seed=0)
+        made.step(np.zeros(4))
+        ids = made._camera.client.client_id, made._simulation.client.client_id
+        made.close()
+        return ids
+
+    first = client_ids()
+    assert len(set(first)) == 2
+    assert all(client_ids() == first for _ in range(20))
+
+
+def test_the_registered_threshold_is_five_failures_in_a_hundred():
+    assert gym.spec("PandaGrasp-v0").reward_threshold == -0.05
+
+
+@pytest.mark.parametrize(("keywords", "message"), [
+    (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.2 m"),
+    (dict(xy_half_width=np.nan), "xy_half_width=nan must be between 0 and 0.2 m"),
+    (dict(yaw_range=(1.0, -1.0)), r"yaw_range=\(1.0, -1.0\) must be \(low, high\) of finite numbers in rad"),
+    (dict(yaw_range=3.0), "yaw_range=3.0 must be"),
+    (dict(yaw_range=(0.0, np.inf)), "yaw_range=.* must be"),
+    (dict(mug_scale=0.0), "mug_scale=0.0 must be between 0.5 and 1.5"),
+    (dict(frame_offset=1.0), "frame_offset=1.0 must be between -0.05 and 0.05 m"),
+    (dict(friction=-1.0), "friction=-1.0 must be finite and not negative"),
+    (dict(solver_iterations=0), "solver_iterations=0 must be None or an integer of at least 1"),
+    (dict(solver_iterations=1.5), "solver_iterations=1.5 must be None or an integer"),
+    (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
+    (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
+    (dict(depth_noise_std=np.nan), "depth_noise_std=nan must be finite"),
+    (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
+], ids=str)  # fmt: skip
+def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        PandaGraspEnv(**keywords)
+
+
+def test_a_keyword_that_does_not_exist_is_refused():
+    with pytest.raises(TypeError, match="grip_force"):
+        PandaGraspEnv(grip_force=1.0)
