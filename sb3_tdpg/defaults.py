@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_tdpg.features import observation_kind
 
 
 class Defaults(NamedTuple):
@@ -54,11 +55,13 @@ IMAGE = Defaults(
     total_epochs=50,
 )
 
+# Depth images come from problems whose every trial is simulated: dearer still.
+DEPTH = IMAGE._replace(n_episodes=400, batch_size=200, total_epochs=100)
+
 
 def defaults_for(observation_space: spaces.Space | None) -> Defaults:
-    """Return :data:`IMAGE` for images of bytes (channels first or last), :data:`VECTOR` for all else, or none."""
-    is_image = observation_space is not None and is_image_space(observation_space, check_channels=False)
-    return IMAGE if is_image else VECTOR
+    """Return the defaults for the kind of an observation space (:func:`~sb3_tdpg.features.observation_kind`)."""
+    return dict(vector=VECTOR, image=IMAGE, depth=DEPTH)[observation_kind(observation_space)]
 
 
 def fill_in(given: Mapping[str, Any], observation_space: spaces.Space | None) -> dict[str, Any]:

@@ -1,18 +1,39 @@
-"""Feature extractors that stand in front of the encoder."""
+"""Feature extractors that stand in front of the encoder, and the kinds of observations that choose between them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
+
+KINDS = ("vector", "image", "depth")
+
+
+def observation_kind(space: spaces.Space | None, *, normalize_images: bool = True) -> str:
+    """
+    Tell what is observed, on which the defaults depend.
+
+    :param space: The observation space.
+    :param normalize_images: Whether bytes are divided by 255; if not, an image may also come in floats in [0, 1].
+    :return: ``"image"``: bytes, channels first or last; ``"depth"``: a ``Box`` of floats in three dimensions, the
+        channels first; ``"vector"``: anything else
+    """
+    if space is not None and is_image_space(space, check_channels=False, normalized_image=not normalize_images):
+        return "image"
+    is_depth = isinstance(space, spaces.Box) and len(space.shape) == 3 and np.issubdtype(space.dtype, np.floating)
+    return "depth" if is_depth else "vector"
 
 
 class TRVCnn(BaseFeaturesExtractor):
     """
     The paper's convolutional layers: two of 6 channels, stride 2, ELU, then flattened.
+
+    Images of floats (depth in m, say) are first brought from the bounds of their space to [-1, 1], if these are finite.
 
     :param observation_space: An image space with channels first.
     :param kernel_sizes: Kernel of each of the two layers (4 and 4 for ball catching, 6 and 4 for grasping).
@@ -23,6 +44,9 @@ class TRVCnn(BaseFeaturesExtractor):
         self, observation_space: spaces.Box, kernel_sizes: Sequence[int] = (4, 4), n_channels: int = 6
     ) -> None:
         super().__init__(observation_space, features_dim=1)
+        low, high = float(observation_space.low.min()), float(observation_space.high.max())
+        is_scaled = np.issubdtype(observation_space.dtype, np.floating) and np.isfinite([low, high]).all()
+        self.offset, self.scale = ((low + high) / 2, (high - low) / 2) if is_scaled else (0.0, 1.0)
         layers: list[nn.Module] = []
         channels = observation_space.shape[0]
         for kernel_size in kernel_sizes:
@@ -35,4 +59,5 @@ class TRVCnn(BaseFeaturesExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """``(N, C, H, W) -> (N, features_dim)``."""
-        return self.cnn(observations.contiguous(memory_format=th.channels_last))
+        images = observations.contiguous(memory_format=th.channels_last)
+        return self.cnn(images if self.scale == 1.0 else (images - self.offset) / self.scale)

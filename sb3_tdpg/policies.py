@@ -15,13 +15,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution, make_proba_distribution
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_tdpg.buffers import EpisodeBatch
-from sb3_tdpg.features import TRVCnn
+from sb3_tdpg.features import TRVCnn, observation_kind
 from sb3_tdpg.networks import TimeMLP
 
 # Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
@@ -29,6 +28,27 @@ MAX_TIME_VARYING_HORIZON = 50
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
+
+
+class PolicyDefaults(NamedTuple):
+    """Arguments of :class:`TRVPolicy` that depend on the kind of observation; where there is an image, the paper's."""
+
+    trv_dim: int
+    encoder: Sequence[int]
+    action_head: Sequence[int]
+    encoder_activation_fn: type[nn.Module]
+    encoder_log_var_init: float
+    action_log_var_init: float
+    features_extractor_class: type[BaseFeaturesExtractor]
+    features_extractor_kwargs: dict[str, Any]
+
+
+# What an image shows gets lost in the noise of wide TRVs: with them training takes twice as long.
+POLICY_DEFAULTS = dict(
+    vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
+    image=PolicyDefaults(8, (32,), (), nn.Tanh, -3.0, -1.0, TRVCnn, {}),
+    depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
+)
 
 
 class PolicyStep(NamedTuple):
@@ -63,21 +83,24 @@ class TRVPolicy(BasePolicy):
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: T. The algorithm passes the environment's.
-    :param trv_dim: Number of TRVs Z; default 2 for vectors and 8 for images, as in the paper.
-    :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default ``[64, 64]`` each for vectors,
-        ``[32]`` and none for images.
-    :param activation_fn: Nonlinearity of the hidden layers; default: ELU for vectors, tanh for images, as in the paper.
+    Defaults that differ are given for vectors, for images of bytes and for depth images (of floats), in this order; the
+    sizes of the networks are the paper's.
+
+    :param trv_dim: Number of TRVs Z; default: 2, 8, 16.
+    :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
+        ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``.
+    :param activation_fn: Nonlinearity of the hidden layers; default: ELU, but tanh in the encoder of images.
     :param time_varying: One set of weights for each time step, or one for all; default: time-varying up to a horizon of
         50. A convolutional feature extractor is always shared.
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images:
         then no observation, however unlike those in training, drives the TRVs to where the action head has never been.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it; default:
-        0 for vectors, -3 for images.
-    :param action_log_var_init: The same for the action head (Box actions); default: 0 for vectors, -1 for images.
+        0, -3, -3.
+    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2.
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded.
     :param action_var_floor: Smallest variance of an action, likewise.
     :param features_extractor_class: What stands in front of the encoder; default: nothing (flatten) for vectors, the
-        paper's two convolutional layers for images.
+        paper's two convolutional layers for images (:class:`~sb3_tdpg.features.TRVCnn`).
     :param features_extractor_kwargs: Its keywords.
     :param normalize_images: Whether to divide uint8 images by 255.
     :param optimizer_class: Optimiser of the policy.
@@ -108,9 +131,10 @@ class TRVPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        is_image = is_image_space(observation_space, check_channels=False, normalized_image=not normalize_images)
+        defaults = POLICY_DEFAULTS[observation_kind(observation_space, normalize_images=normalize_images)]
         if features_extractor_class is None:
-            features_extractor_class = TRVCnn if is_image else FlattenExtractor
+            features_extractor_class = defaults.features_extractor_class
+            features_extractor_kwargs = {**defaults.features_extractor_kwargs, **(features_extractor_kwargs or {})}
         super().__init__(
             observation_space,
             action_space,
@@ -122,16 +146,15 @@ class TRVPolicy(BasePolicy):
             squash_output=False,
         )
         self.horizon = horizon
-        self.trv_dim = (8 if is_image else 2) if trv_dim is None else trv_dim
+        self.trv_dim = defaults.trv_dim if trv_dim is None else trv_dim
         self.time_varying = horizon <= MAX_TIME_VARYING_HORIZON if time_varying is None else time_varying
         self.squash_trv_mean = squash_trv_mean
-        self.activation_fn = (nn.Tanh if is_image else nn.ELU) if activation_fn is None else activation_fn
-        # What an image shows gets lost in the noise of wide TRVs: with them training takes twice as long.
-        self.encoder_log_var_init = _default(encoder_log_var_init, -3.0 if is_image else 0.0)
-        self.action_log_var_init = _default(action_log_var_init, -1.0 if is_image else 0.0)
+        self.activation_fn = activation_fn
+        self.encoder_log_var_init = _default(encoder_log_var_init, defaults.encoder_log_var_init)
+        self.action_log_var_init = _default(action_log_var_init, defaults.action_log_var_init)
         self.encoder_var_floor = encoder_var_floor
         self.action_var_floor = action_var_floor
-        default_arch = dict(encoder=[32], action_head=[]) if is_image else dict(encoder=[64, 64], action_head=[64, 64])
+        default_arch = dict(encoder=list(defaults.encoder), action_head=list(defaults.action_head))
         self.net_arch = _check_net_arch(net_arch, default_arch)
         for name, value in (("horizon", horizon), ("policy_kwargs: trv_dim", self.trv_dim)):
             if not (isinstance(value, (int, np.integer)) and value >= 1):
@@ -146,13 +169,13 @@ class TRVPolicy(BasePolicy):
         self.encoder = TimeMLP(
             horizon,
             [self.trv_dim + self.features_dim, *self.net_arch["encoder"], 2 * self.trv_dim],
-            self.activation_fn,
+            activation_fn or defaults.encoder_activation_fn,
             time_varying=self.time_varying,
         )
         self.action_head = TimeMLP(
             horizon,
             [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()],
-            self.activation_fn,
+            activation_fn or nn.ELU,
             time_varying=self.time_varying,
         )
         self.optimizer = self.optimizer_class(

@@ -60,8 +60,8 @@ class TDPG(OnPolicyAlgorithm):
     state comes from ``info["state"]`` of ``reset`` and ``step`` together with an attribute ``state_space``; an
     environment without it is taken as fully observed if its observation is a vector.
 
-    Where a default has two values below, the first is for vector observations and the second for images
-    (:mod:`sb3_tdpg.defaults`).
+    Where a default has two values below, the first is for vector observations and the second for images; depth images
+    (of floats) differ in a few more (:mod:`sb3_tdpg.defaults`).
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.policies.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.

@@ -13,6 +13,7 @@ T, N = 4, 6
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 CHW = spaces.Box(0, 255, (3, 20, 16), np.uint8)
 HWC = spaces.Box(0, 255, (20, 16, 3), np.uint8)
+DEPTH = spaces.Box(0.2, 0.7, (1, 24, 20), np.float32)
 ACTION_SPACES = {
     "box": spaces.Box(-1, 1, (2,), np.float32),
     "matrix": spaces.Box(-1, 1, (2, 3), np.float32),
@@ -50,7 +51,7 @@ def step_through(policy, observations, deterministic):
 
 @pytest.mark.parametrize("time_varying", [True, False])
 @pytest.mark.parametrize("deterministic", [True, False])
-@pytest.mark.parametrize("observation_space", [VECTOR, CHW], ids=["vector", "image"])
+@pytest.mark.parametrize("observation_space", [VECTOR, CHW, DEPTH], ids=["vector", "image", "depth"])
 def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
     observation_space, deterministic, time_varying
 ):
@@ -231,6 +232,33 @@ def test_the_paper_s_convolutions_stand_before_the_encoder_of_images():
         policy.predict(np.full((1, *CHW.shape), value, np.uint8), deterministic=True)[1][0] for value in (0, 255)
     )
     assert not np.allclose(dark, bright)
+
+
+def test_depth_images_have_the_network_of_the_papers_grasping_problem():
+    policy = make_policy(spaces.Box(0.2, 0.7, (1, 128, 128), np.float32), horizon=1)
+    convolutions = [layer for layer in policy.features_extractor.cnn if isinstance(layer, th.nn.Conv2d)]
+    assert [(c.out_channels, c.kernel_size, c.stride) for c in convolutions] == [
+        (6, (6, 6), (2, 2)),
+        (6, (4, 4), (2, 2)),
+    ]
+    shapes = [tuple(layer.weight.shape[1:]) for layer in policy.encoder.mlp.layers]
+    assert shapes == [(16 + 5400, 128), (128, 64), (64, 32)]
+    assert [tuple(layer.weight.shape[1:]) for layer in policy.action_head.mlp.layers] == [(16, 64), (64, 64), (64, 4)]
+    assert isinstance(policy.encoder.mlp.activation, th.nn.Tanh)
+    assert isinstance(policy.action_head.mlp.activation, th.nn.ELU)
+
+
+def test_images_of_floats_are_brought_from_their_bounds_to_plus_and_minus_one():
+    extractor = make_policy(DEPTH).features_extractor
+    seen = []
+    extractor.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    for depth in (0.2, 0.45, 0.7):
+        extractor(th.full((1, *DEPTH.shape), depth))
+    assert [float(image.mean()) for image in seen] == pytest.approx([-1.0, 0.0, 1.0], abs=1e-6)
+    unbounded = make_policy(spaces.Box(-np.inf, np.inf, DEPTH.shape, np.float32)).features_extractor
+    unbounded.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    unbounded(th.full((1, *DEPTH.shape), 0.45))
+    assert float(seen[-1].mean()) == pytest.approx(0.45)
 
 
 def test_a_saved_policy_predicts_the_same(tmp_path):
