@@ -41,9 +41,9 @@ class PandaGraspEnv(POMDPEnv):
         c_0 = 0, \qquad c_1 = \begin{cases} 0 & \text{if the mug's frame is more than 5 cm above the table},\\
         1 & \text{otherwise.} \end{cases}
 
-    ``info`` has, after the step, ``success``, ``mug_height`` (m), ``grasp`` (the pose of the grasp, after clipping),
-    ``contacts`` (points in which the fingers touch the mug in the end), and ``is_success``, the name under which
-    Stable-Baselines3 looks for the success.
+    ``info`` has, after the step, ``success``, ``mug`` (the state before the grasp), ``mug_height`` (m, after it),
+    ``grasp`` (its pose, after clipping), ``contacts`` (points in which the fingers touch the mug in the end), and
+    ``is_success``, the name under which Stable-Baselines3 looks for the success.
 
     An outcome is a function of state and action alone: it does not depend on the trials before it, nor on the process.
 
@@ -144,7 +144,7 @@ class PandaGraspEnv(POMDPEnv):
             height = float(next_state[i, 2])
             success = height > LIFTED
             self._last_details.append(
-                dict(success=success, is_success=success, mug_height=height, grasp=pose, contacts=contacts)
+                dict(success=success, is_success=success, mug=mug, mug_height=height, grasp=pose, contacts=contacts)
             )
         return next_state
 

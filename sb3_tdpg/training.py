@@ -42,8 +42,13 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     n_timesteps = int(settings.pop("n_timesteps"))
     callbacks: list[BaseCallback] = [_make(entry) for entry in settings.pop("callback", [])]
     env_kwargs = settings.pop("env_kwargs", {})
+    # In this process: runs are made side by side in processes of their own, and come out the same on any machine.
     env = make_episodes_env(
-        env_id, settings.pop("n_envs", None), n_episodes=settings.get("n_episodes"), env_kwargs=env_kwargs
+        env_id,
+        settings.pop("n_envs", None),
+        n_episodes=settings.get("n_episodes"),
+        env_kwargs=env_kwargs,
+        use_processes=False,
     )
     for entry in settings.pop("vec_env_wrapper", []):
         env = _make(entry, env)

@@ -149,6 +149,7 @@ def make_episodes_env(
     n_episodes: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     seed: int | None = None,
+    use_processes: bool = True,
 ) -> VecEnv:
     """
     Vectorise a registered id in the fastest way that this plugin knows.
@@ -169,6 +170,8 @@ def make_episodes_env(
     :param n_episodes: Episodes that are to be run at a time; default: as many as TDPG runs in an epoch by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
+    :param use_processes: Whether what is simulated one by one may have processes of its own. Which episodes a seed gives
+        depends on their number, and so on the cores; without them it gives the same on every machine.
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
@@ -180,7 +183,8 @@ def make_episodes_env(
     if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
         env = cast(POMDPEnv, creator(**{**spec.kwargs, **env_kwargs}))
         n_episodes = n_episodes or defaults_for(env.observation_space).n_episodes
-        if env.wants_processes and (n_processes := n_envs or _largest_divisor(n_episodes, usable_cores())) > 1:
+        wants_processes = use_processes and env.wants_processes
+        if wants_processes and (n_processes := n_envs or _largest_divisor(n_episodes, usable_cores())) > 1:
             env.close()
             # With its module, so that a process that does not know of the registration comes to know it.
             return _in_processes(f"{creator.__module__}:{bare_id}", n_processes, env_kwargs, seed)

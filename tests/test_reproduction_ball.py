@@ -35,7 +35,7 @@ def tiny(monkeypatch):
         for task in tasks:
             complete_run(*task, n_eval_episodes=n_eval_episodes)
 
-    monkeypatch.setattr(ball, "complete_runs", complete_runs)
+    monkeypatch.setattr("sb3_tdpg.reproduction.common.complete_runs", complete_runs)
     return order
 
 

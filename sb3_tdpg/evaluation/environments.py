@@ -25,7 +25,9 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
     :param n_episodes: Episodes that are to be run at a time.
     :param n_envs: Number of environments; default: see :func:`~sb3_tdpg.vec_env.make_episodes_env`.
     """
-    env = make_episodes_env(scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs)
+    env = make_episodes_env(
+        scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
+    )
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
         normalize = copy.copy(normalize)  # its copy comes without an environment

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,8 +31,8 @@ from sb3_tdpg.evaluation import (
     write_run_config,
 )
 from sb3_tdpg.files import write_atomically
-from sb3_tdpg.reproduction.common import commits_of, how_made, markdown_table, met, publish_files
-from sb3_tdpg.runs import Run, complete_runs, read_progress
+from sb3_tdpg.reproduction.common import Method, Trained, commits_of, how_made, markdown_table, met, publish_files
+from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
 
 # Fixed before any policy was evaluated on the test rows. Seeds below 100 were seen while the blocks were made.
@@ -52,25 +51,6 @@ GOALS: Mapping[str, Mapping[str, float]] = {
         "Test backgrounds, mean of 7": 30.0,
     },
 }
-
-
-@dataclass(frozen=True)
-class Method:
-    """
-    How one column of the table is trained and evaluated.
-
-    :param label: The column's title.
-    :param block: Block of ``hyperparams/tdpg.yml``.
-    :param start: Label of the method whose policy it starts from, with the same seed; ``None``: from scratch.
-    :param renderer: What draws the images that it is evaluated on.
-    :param overrides: Settings that replace those of the block.
-    """
-
-    label: str
-    block: str
-    start: str | None = None
-    renderer: str = "fast"
-    overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
 # A second stage is as long as the first one; a control differs from its method in nothing but the penalty.
@@ -152,34 +132,19 @@ def reproduce_ball(
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     everything = [(m, seed) for m in methods for seed in seeds]
     everything += [(m, seed) for m in PAPER_METHODS for seed in paper_seeds]
-    folders: dict[tuple[str, int], Path] = {}
-    runs: dict[tuple[str, int], Run] = {}
-    for method, seed in everything:
-        start = None if method.start is None else folders[method.start, seed]
-        settings = {**method.overrides, **overrides}
-        run = Run(method.label, "BallCatch-v0", method.block, seed, settings, start=start)
-        runs[method.label, seed], folders[method.label, seed] = run, out / "runs" / run.folder_name
-
-    # A stage must be there before the next one is begun.
-    stages: dict[str, int] = {}
-    for method, _ in everything:
-        stages[method.label] = 0 if method.start is None else 1 + stages[method.start]
-    for stage in sorted(set(stages.values())):
-        tasks = [
-            (
-                runs[m.label, seed],
-                folders[m.label, seed],
-                [row.with_kwargs(renderer=m.renderer) for row in rows]
-                + [d.with_kwargs(renderer="fast") for d in diagnosis],
-            )
-            for m, seed in everything
-            if stages[m.label] == stage
-        ]
-        # The longest first, so that the cores finish together.
-        tasks.sort(key=lambda task: (not task[0].method.startswith("paper"), "pybullet" not in str(task[2])))
-        complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-
-    records = pd.concat([_read_records(folder) for folder in folders.values()], ignore_index=True)
+    trained = Trained("BallCatch-v0", out, everything, overrides)
+    trained.complete(
+        lambda m: (
+            [row.with_kwargs(renderer=m.renderer) for row in rows]
+            + [row.with_kwargs(renderer="fast") for row in diagnosis]
+        ),
+        n_eval_episodes=n_eval_episodes,
+        jobs=jobs,
+        is_long=lambda m: m in PAPER_METHODS or m.renderer == "pybullet",
+    )
+    records = trained.records()
+    # The final distance between robot and ball.
+    records = records.assign(distance=(records["final_state_0"] - records["final_state_1"]).abs())
     renderers = records["model"].map({m.label: m.renderer for m, _ in everything})
     is_row = records["scenario"].isin([row.name for row in rows])
     records = records.assign(renderer=renderers.where(is_row, "fast"))
@@ -205,12 +170,12 @@ def reproduce_ball(
     save_figure(
         diagnosis_bars(of_diagnosis[of_diagnosis["model"].isin([m.label for m in methods])]), out / "diagnosis.png"
     )
-    first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in methods if m.start is not None}
+    first = {m.label: read_progress(trained.folders[m.label, FIRST_SEED]) for m in methods if m.start is not None}
     save_figure(training_curves(first), out / "training.png")
     by_seed = table.groupby(["model", "train_seed", "scenario"], sort=False)[["cost", "distance"]].mean().reset_index()
     write_frame_atomically(by_seed, out / "seeds.csv")
     how = provenance()
-    write_run_config(out / "config.json", dict(runs=[run.config for run in runs.values()], provenance=how))
+    write_run_config(out / "config.json", dict(runs=trained.configs, provenance=how))
 
     aggregated = aggregate_seeds(table)
     distances = aggregate_seeds(table.assign(cost=table["distance"]))
@@ -238,7 +203,7 @@ def reproduce_ball(
         dict(
             model=m.label,
             train_seed=seed,
-            **trv_knowledge(TDPG.load(folders[m.label, seed] / "model.zip", device="cpu"), launch_kwargs),
+            **trv_knowledge(TDPG.load(trained.folders[m.label, seed] / "model.zip", device="cpu"), launch_kwargs),
         )
         for m in methods
         for seed in seeds
@@ -246,7 +211,7 @@ def reproduce_ball(
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby("model", sort=False).mean().reset_index()
     sections += ["## What the TRVs know", KNOWLEDGE, markdown_table(means, digits=2)]
-    made = how_made(_target(is_fixed, controls), how, commits_of(list(folders.values())))
+    made = how_made(_target(is_fixed, controls), how, commits_of(list(trained.folders.values())))
     summary = "\n\n".join([*sections, made]) + "\n"
     write_atomically(out / "summary.md", summary)
     if publish is not None:
@@ -257,12 +222,6 @@ def reproduce_ball(
 def _target(is_fixed: bool, controls: bool) -> str:
     """Return the command that makes the summary again."""
     return "make reproduce-ball" + ("-controls" if controls and is_fixed else "" if is_fixed else "-varying")
-
-
-def _read_records(folder: Path) -> pd.DataFrame:
-    """Return the episodes of a run, with the final distance between robot and ball."""
-    records = pd.read_csv(folder / "episodes.csv")
-    return records.assign(distance=(records["final_state_0"] - records["final_state_1"]).abs())
 
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:

@@ -1,14 +1,92 @@
-"""What the reproductions share: small tables, how something was made, and the copy for the documentation."""
+"""What the reproductions share: methods in stages, small tables, how something was made, the copy for the docs."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.runs import Run, complete_runs
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    How one column of a table is trained and evaluated.
+
+    :param label: The column's title.
+    :param block: Block of ``hyperparams/tdpg.yml``.
+    :param start: Label of the method whose policy it starts from, with the same seed; ``None``: from scratch.
+    :param renderer: What draws the images that it is evaluated on, where the environment has several.
+    :param overrides: Settings that replace those of the block.
+    """
+
+    label: str
+    block: str
+    start: str | None = None
+    renderer: str = "fast"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Trained:
+    """
+    Runs of methods in stages: a method that starts from another one waits for it.
+
+    :param env_id: The training environment.
+    :param out: Folder for ``runs/``.
+    :param everything: Methods with their seeds, each after what it starts from.
+    :param overrides: Settings that replace those of every method.
+    """
+
+    def __init__(
+        self, env_id: str, out: Path, everything: Sequence[tuple[Method, int]], overrides: Mapping[str, Any]
+    ) -> None:
+        self.everything = everything
+        self.folders: dict[tuple[str, int], Path] = {}
+        self.runs: dict[tuple[str, int], Run] = {}
+        for method, seed in everything:
+            start = None if method.start is None else self.folders[method.start, seed]
+            run = Run(method.label, env_id, method.block, seed, {**method.overrides, **overrides}, start=start)
+            self.runs[method.label, seed], self.folders[method.label, seed] = run, out / "runs" / run.folder_name
+
+    def complete(
+        self,
+        rows: Callable[[Method], Sequence[Scenario]],
+        *,
+        n_eval_episodes: int,
+        jobs: int | None = None,
+        is_long: Callable[[Method], bool] = lambda _: False,
+    ) -> None:
+        """
+        Complete all runs, see :func:`~sb3_tdpg.runs.complete_runs`.
+
+        :param rows: What each method is evaluated on.
+        :param n_eval_episodes: Episodes of each row.
+        :param jobs: Runs at a time; default: the number of cores.
+        :param is_long: What to begin with in each stage, so that the cores finish together.
+        """
+        stages: dict[str, int] = {}
+        for method, _ in self.everything:
+            stages[method.label] = 0 if method.start is None else 1 + stages[method.start]
+        for stage in sorted(set(stages.values())):
+            here = sorted((x for x in self.everything if stages[x[0].label] == stage), key=lambda x: not is_long(x[0]))
+            tasks = [(self.runs[m.label, seed], self.folders[m.label, seed], rows(m)) for m, seed in here]
+            complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
+
+    def records(self) -> pd.DataFrame:
+        """Return the episodes of all runs."""
+        return pd.concat([pd.read_csv(f / "episodes.csv") for f in self.folders.values()], ignore_index=True)
+
+    @property
+    def configs(self) -> list[dict[str, Any]]:
+        """What makes the runs."""
+        return [run.config for run in self.runs.values()]
 
 
 def met(condition: bool) -> str:
