@@ -8,7 +8,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying wheel clean
+.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -58,7 +58,7 @@ docs: $(STAMP) ## build the documentation into docs/_build/html
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py
 
-reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying ## reproduce every experiment
+reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying reproduce-grasp ## reproduce every experiment
 
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
@@ -71,6 +71,9 @@ reproduce-ball-controls: $(STAMP) ## add the controls without the penalty, and t
 
 reproduce-ball-varying: $(STAMP) ## the same where the launch varies, a scenario of our own
 	$(PY) -m sb3_tdpg reproduce ball-varying --out results/ball_catch_varying --publish docs/results/ball_catch_varying
+
+reproduce-grasp: $(STAMP) ## reproduce Table III: policy gradient, TDPG and its control on grasping
+	$(PY) -m sb3_tdpg reproduce grasp --out results/panda_grasp --publish docs/results/panda_grasp
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

@@ -43,14 +43,20 @@ def _demo(out: Path, **options: Any) -> None:
 
 def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
     from sb3_tdpg.reproduction.ball import reproduce_ball
+    from sb3_tdpg.reproduction.grasp import reproduce_grasp
     from sb3_tdpg.reproduction.lava import reproduce_lava
 
     given = {name: value for name, value in options.items() if value is not None}
+    if "controls" in given and not experiment.startswith("ball"):
+        raise ValueError(f"--no-controls is for ball and ball-varying: {experiment} does not do without any")
     if experiment == "lava":
-        if "controls" in given:
-            raise ValueError("--no-controls is for ball and ball-varying: lava has no controls")
         out = out or Path("results/lava_reproduction")
         text = reproduce_lava(out, **given)
+    elif experiment == "grasp":
+        if "n_paper_seeds" in given:
+            raise ValueError("--n-paper-seeds is for lava and ball: the paper's own settings of grasp are not trained")
+        out = out or Path("results/panda_grasp")
+        text = reproduce_grasp(out, **given)
     else:
         out = out or Path("results", experiment.replace("-", "_").replace("ball", "ball_catch"))
         text = reproduce_ball(out, launch="varying" if experiment == "ball-varying" else "fixed", **given)
@@ -77,12 +83,14 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_sizes(demo)
 
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
-    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying"))
+    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp"))
     reproduce.add_argument(
         "--out", type=Path, default=None, help="folder for the results (default: one in results/ for each experiment)"
     )
     reproduce.add_argument("--publish", type=Path, default=None, help="copy all but the runs to this folder")
-    reproduce.add_argument("--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, ball 5)")
+    reproduce.add_argument(
+        "--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, others 5)"
+    )
     reproduce.add_argument(
         "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
     )

@@ -170,8 +170,8 @@ def make_episodes_env(
     :param n_episodes: Episodes that are to be run at a time; default: as many as TDPG runs in an epoch by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether what is simulated one by one may have processes of its own. Which episodes a seed gives
-        depends on their number, and so on the cores; without them it gives the same on every machine.
+    :param use_processes: Whether what is simulated one by one may have processes of its own. Which episodes a seed
+        gives depends on their number, and so on the cores; without them it gives the same on every machine.
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})

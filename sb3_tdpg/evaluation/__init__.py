@@ -3,12 +3,13 @@
 from sb3_tdpg.evaluation.figures import (
     cost_histograms,
     diagnosis_bars,
+    failures_by_yaw,
     lava_trajectories,
     robustness_curves,
     save_figure,
     training_curves,
 )
-from sb3_tdpg.evaluation.knowledge import trv_knowledge
+from sb3_tdpg.evaluation.knowledge import grasp_knowledge, trv_knowledge
 from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.records import evaluate_scenarios
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, probability_of_improvement
@@ -23,6 +24,8 @@ __all__ = [
     "cost_histograms",
     "diagnosis_bars",
     "evaluate_scenarios",
+    "failures_by_yaw",
+    "grasp_knowledge",
     "lava_trajectories",
     "probability_of_improvement",
     "provenance",

@@ -198,6 +198,28 @@ def _legend_above(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 
+def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
+    """
+    Draw the share of failed grasps over the mug's yaw, in polar coordinates: it shows where the handle matters.
+
+    :param records: Episodes with the columns ``model``, ``yaw`` (rad) and ``cost`` (1 for a failure).
+    :param n_bins: Sectors of the circle.
+    """
+    figure = _new_figure(5.2, 5.2)
+    axes = figure.add_subplot(projection="polar")
+    edges = np.linspace(0, 2 * np.pi, n_bins + 1)
+    middles = (edges[:-1] + edges[1:]) / 2
+    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
+        sector = np.digitize(group["yaw"].to_numpy() % (2 * np.pi), edges) - 1
+        share = group["cost"].groupby(sector).mean().reindex(range(n_bins)).to_numpy()
+        axes.plot(np.append(middles, middles[0]), np.append(share, share[0]), color=color, label=str(label), marker=".")
+    axes.set_title("share of failed grasps by the mug's yaw", fontsize=10, color=INK)
+    axes.set_ylim(bottom=0)
+    axes.tick_params(labelsize=8)
+    axes.legend(loc="upper right", bbox_to_anchor=(1.1, 1.1), fontsize=8, frameon=False)
+    return figure
+
+
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> None:
     """
     Write a figure so that at no time a half-written file is there.

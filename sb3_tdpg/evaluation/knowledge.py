@@ -1,5 +1,5 @@
 """
-What the TRVs of ball catching still know of things that do not matter: a regression of each on the TRVs.
+What the TRVs still know, of what matters and of what does not: a regression of each on the TRVs.
 
 Dimension key: T horizon, N episodes, Z TRVs.
 """
@@ -65,6 +65,37 @@ def trv_knowledge(
     brightness = constant(np.concatenate(factors)[:, None])
     color = constant(np.concatenate(colors))
     return {name: _r2(known, y) for name, y in (("position", position), ("brightness", brightness), ("wall", color))}
+
+
+def grasp_knowledge(
+    model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_episodes: int = 2000, seed: int = 0
+) -> dict[str, float]:
+    """
+    Tell how much of the mug's pose can be read from the TRVs of the grasping problem.
+
+    Each is regressed on the TRVs and their squares and products for half of the mugs; R^2 is that for the other half.
+    Nothing is grasped.
+
+    :param model: A model of ``PandaGrasp-v0``.
+    :param env_kwargs: Keywords of the environment.
+    :param n_episodes: Mugs, an even number.
+    :param seed: Seed of the mugs' poses and of the policy.
+    :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (its sine and cosine, averaged)
+    """
+    seeds = evaluation_seeds(seed)
+    scenario = Scenario("mugs", "PandaGrasp-v0", env_kwargs or {})
+    env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
+    env.seed(seeds.env)
+    observations = env.reset()
+    x, y, _, yaw = np.stack([info["state"] for info in env.unwrapped.reset_infos]).T
+    env.close()
+    with isolated_randomness(seeds.policy, model):
+        _, memory = model.predict(observations, deterministic=False)
+    trvs = memory[0]
+    row, column = np.triu_indices(trvs.shape[1])
+    known = np.concatenate([trvs, trvs[:, row] * trvs[:, column]], axis=1)[None]
+    targets = dict(x=x[:, None], y=y[:, None], yaw=np.stack([np.sin(yaw), np.cos(yaw)], axis=1))
+    return {name: _r2(known, target[None]) for name, target in targets.items()}
 
 
 def _run(model: Any, env: Any, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,6 @@ from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
     diagnosis_bars,
-    probability_of_improvement,
     provenance,
     robustness_curves,
     save_figure,
@@ -31,7 +30,16 @@ from sb3_tdpg.evaluation import (
     write_run_config,
 )
 from sb3_tdpg.files import write_atomically
-from sb3_tdpg.reproduction.common import Method, Trained, commits_of, how_made, markdown_table, met, publish_files
+from sb3_tdpg.reproduction.common import (
+    Method,
+    Trained,
+    commits_of,
+    comparisons_table,
+    goals_table,
+    how_made,
+    markdown_table,
+    publish_files,
+)
 from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
 
@@ -75,6 +83,8 @@ VARYING_METHODS: tuple[Method, ...] = (
     Method("TDPG, plain images", "BallCatch-v0-varying-plain", "PG"),
     Method("control, plain images", "BallCatch-v0-varying-pg", "PG", overrides=dict(n_timesteps=120_000)),
 )
+
+KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "backgrounds": BACKGROUND_ROWS}
 
 COMPARISON = (
     "Probability that a seed of the method has a lower mean cost over these rows than a seed of what it is compared "
@@ -197,8 +207,8 @@ def reproduce_ball(
         quantity = "final distance between robot and ball in m"
         sections += [comparison_markdown(part, distance_rows, quantity=quantity, digits=3)]
     if is_fixed:
-        sections += ["## Goals", goals_table(aggregated)]
-    sections += ["## What the penalty is worth", COMPARISON, comparisons_table(table)]
+        sections += ["## Goals", goals_table(aggregated, GOALS)]
+    sections += ["## What the penalty is worth", COMPARISON, comparisons_table(table, COMPARISONS, KINDS)]
     knowledge = pd.DataFrame(
         dict(
             model=m.label,
@@ -250,45 +260,3 @@ def group_rows(rows: Sequence[Scenario]) -> list[Scenario]:
 def _distance_row(row: Scenario) -> Scenario:
     paper = {m: PaperResult(result.distance) for m, result in row.paper.items() if result.distance is not None}
     return replace(row, paper=paper)
-
-
-def goals_table(aggregated: pd.DataFrame) -> str:
-    """Hold the interquartile means against :data:`GOALS`."""
-    cells = aggregated.set_index(["model", "scenario"])["iqm"]
-    rows = [
-        dict(
-            method=method,
-            row=row,
-            goal=f"<= {goal:g}",
-            ours=f"{cells[method, row]:.2f}",
-            verdict=met(cells[method, row] <= goal),
-        )
-        for method, goals in GOALS.items()
-        for row, goal in goals.items()
-    ]
-    return markdown_table(pd.DataFrame(rows))
-
-
-def comparisons_table(table: pd.DataFrame) -> str:
-    """Say how likely a seed with the penalty beats a seed of its control."""
-    rows = []
-    kinds = {"training": ("Training",), "sensor noise": NOISE_ROWS, "backgrounds": BACKGROUND_ROWS}
-    models = set(table["model"])
-    for model, control in COMPARISONS:
-        if not {model, control} <= models:
-            continue
-        for name, members in kinds.items():
-            part = table[table["scenario"].isin(members)]
-            value, low, high = probability_of_improvement(part, model, control)
-            cost = part.groupby("model")["cost"].mean()
-            rows.append(
-                {
-                    "method": model,
-                    "against": control,
-                    "rows": name,
-                    "P(improvement) [95 %]": f"{value:.2f} [{low:.2f}, {high:.2f}]",
-                    "mean cost": f"{cost[model]:.2f}",
-                    "of the other": f"{cost[control]:.2f}",
-                }
-            )
-    return markdown_table(pd.DataFrame(rows))

@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import probability_of_improvement
 from sb3_tdpg.runs import Run, complete_runs
 
 
@@ -100,6 +101,60 @@ def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
     rows = frame.itertuples(index=False)
     cells = ([f"{x:.{digits}f}" if isinstance(x, float) else str(x) for x in row] for row in rows)
     return "\n".join([*header, *(f"| {' | '.join(row)} |" for row in cells)])
+
+
+def goals_table(aggregated: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
+    """
+    Hold interquartile means against goals.
+
+    :param aggregated: From :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
+    :param goals: The largest value by method and row.
+    """
+    cells = aggregated.set_index(["model", "scenario"])["iqm"]
+    rows = [
+        dict(
+            method=method,
+            row=row,
+            goal=f"<= {goal:g}",
+            ours=f"{cells[method, row]:.3g}",
+            verdict=met(cells[method, row] <= goal),
+        )
+        for method, of_method in goals.items()
+        for row, goal in of_method.items()
+    ]
+    return markdown_table(pd.DataFrame(rows))
+
+
+def comparisons_table(
+    table: pd.DataFrame, comparisons: Sequence[tuple[str, str]], kinds: Mapping[str, Sequence[str]]
+) -> str:
+    """
+    Say how likely a seed of one method beats a seed of another.
+
+    :param table: Records with a column ``train_seed``.
+    :param comparisons: Labels of a method and of what it is compared with; left out if one is not there.
+    :param kinds: Rows over which the mean is taken, by name.
+    """
+    rows = []
+    models = set(table["model"])
+    for model, control in comparisons:
+        if not {model, control} <= models:
+            continue
+        for name, members in kinds.items():
+            part = table[table["scenario"].isin(members)]
+            value, low, high = probability_of_improvement(part, model, control)
+            cost = part.groupby("model")["cost"].mean()
+            rows.append(
+                {
+                    "method": model,
+                    "against": control,
+                    "rows": name,
+                    "P(improvement) [95 %]": f"{value:.2f} [{low:.2f}, {high:.2f}]",
+                    "mean cost": f"{cost[model]:.3g}",
+                    "of the other": f"{cost[control]:.3g}",
+                }
+            )
+    return markdown_table(pd.DataFrame(rows))
 
 
 def commits_of(folders: Sequence[Path]) -> list[str]:
