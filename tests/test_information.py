@@ -28,6 +28,7 @@ from sb3_tdpg.information import (
     LogDet,
     Mine,
     get_estimator_class,
+    own_sample_bound,
 )
 from sb3_tdpg.information.critic import Scores
 
@@ -138,6 +139,21 @@ def test_leave_one_out_keeps_its_digits_far_from_the_origin():
     batch = random_batch()
     shifted = batch._replace(trvs=batch.trvs + 1000, means=batch.means + 1000)
     th.testing.assert_close(LeaveOneOut(4, 2, 2)(shifted), LeaveOneOut(4, 2, 2)(batch), rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("gain", [0.3, 1.0, 2.0])
+def test_where_the_encoder_sees_the_state_the_information_lies_between_the_known_density_bounds(gain):
+    batch = gaussian_batch(2000, [[gain, gain]])
+    (truth,) = gaussian_information([[gain, gain]])
+    lower, upper = own_sample_bound(batch).item(), LeaveOneOut(1, 2, 2)(batch).item()
+    assert lower - 0.05 <= truth <= upper + 0.05
+    assert upper - lower < 0.1
+
+
+def test_the_lower_bound_cannot_exceed_the_logarithm_of_the_number_of_samples():
+    batch = gaussian_batch(100, [[1.0, 1.0]], noise_std=1e-6)
+    assert own_sample_bound(batch).item() == pytest.approx(math.log(100), abs=1e-3)
+    assert own_sample_bound(batch).item() <= math.log(100) + 1e-5
 
 
 def test_with_several_modes_leave_one_out_is_tight_and_logdet_loose():

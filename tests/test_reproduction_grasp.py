@@ -5,12 +5,15 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 
+from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP
-from sb3_tdpg.evaluation import failures_by_yaw, knowledge
+from sb3_tdpg.evaluation import encode_mugs, failures_by_yaw, grasp_knowledge
 from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.reproduction import common, grasp
 from sb3_tdpg.runs import Run, complete_run
 
@@ -22,7 +25,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 8, "batch_size": 8}))
     for module, name in ((grasp, "aggregate_seeds"), (common, "probability_of_improvement")):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
-    monkeypatch.setattr(grasp, "grasp_knowledge", partial(grasp.grasp_knowledge, n_episodes=400))
+    monkeypatch.setattr(grasp, "encode_mugs", partial(grasp.encode_mugs, n_episodes=100))
 
     def complete_runs(tasks, *, n_eval_episodes, jobs):
         for task in tasks:
@@ -83,34 +86,23 @@ def test_the_failures_are_drawn_in_the_sector_of_their_yaw():
     assert angles[5] == pytest.approx(5.5 * 2 * np.pi / 24)
 
 
-class Tells:
-    """A model whose TRVs are the mug's x and the cosine of its yaw, read off the depth image's own state."""
-
-    device = "cpu"
-
-    def __init__(self, monkeypatch):
-        env = PandaGraspEnv()
-        self.observation_space, self.action_space, self.horizon = env.observation_space, env.action_space, 1
-        self.states = None
-        original = PandaGraspEnv._sensor
-
-        def sensor(env, state):
-            self.states = state
-            return np.zeros((len(state), 1, 128, 128), np.float32) + np.float32(0.3)
-
-        assert original is not sensor
-        monkeypatch.setattr(PandaGraspEnv, "_sensor", sensor)
-
-    def get_vec_normalize_env(self):
-        return None
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        known = np.stack([self.states[:, 0], np.cos(self.states[:, 3])], axis=1)
-        return np.zeros((len(observation), 4), np.float32), ((known - known.mean(0)) / known.std(0),)
-
-
-def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(monkeypatch):
-    known = knowledge.grasp_knowledge(Tells(monkeypatch), dict(yaw_range=(0.0, 2 * np.pi)), n_episodes=400)
+def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other():
+    poses = th.rand(1, 400, 4, generator=th.Generator().manual_seed(0), dtype=th.float64) * th.tensor(
+        [0.1, 0.1, 0, 6.3]
+    )
+    told = th.stack([poses[..., 0], th.cos(poses[..., 3])], dim=-1)
+    known = grasp_knowledge(InformationBatch(poses, told, told, th.ones_like(told)))
     assert known["x"] > 0.99
     assert known["y"] < 0.1
     assert known["yaw"] == pytest.approx(0.5, abs=0.1), "the cosine, not the sine"
+
+
+def test_the_mugs_that_a_policy_is_shown_are_those_of_the_environment():
+    model = TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), n_episodes=4, batch_size=4, device="cpu")
+    batch = encode_mugs(model, dict(yaw_range=(2.0, 2.5)), n_episodes=20)
+    assert batch.states.shape == (1, 20, 4)
+    assert ((batch.states[..., 3] >= 2.0) & (batch.states[..., 3] <= 2.5)).all()
+    assert batch.trvs.shape == batch.means.shape == batch.stds.shape == (1, 20, 16)
+    assert (batch.trvs != batch.means).all()
+    again = encode_mugs(model, dict(yaw_range=(2.0, 2.5)), n_episodes=20)
+    assert all(th.equal(a, b) for a, b in zip(batch[:4], again[:4], strict=True))

@@ -10,11 +10,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch as th
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.envs.textures import load_texture
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.information import InformationBatch
 
 # Walls that no policy was trained or tested on.
 FIRST_WALL = 1000
@@ -67,31 +69,42 @@ def trv_knowledge(
     return {name: _r2(known, y) for name, y in (("position", position), ("brightness", brightness), ("wall", color))}
 
 
-def grasp_knowledge(
+def encode_mugs(
     model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_episodes: int = 2000, seed: int = 0
-) -> dict[str, float]:
+) -> InformationBatch:
+    """
+    Show a policy of the grasping problem mugs, and return what its TRVs make of them. Nothing is grasped.
+
+    :param model: A model of ``PandaGrasp-v0``.
+    :param env_kwargs: Keywords of the environment.
+    :param n_episodes: Mugs N.
+    :param seed: Seed of the mugs' poses and of the policy.
+    :return: poses ``(1, N, 4)`` as states, TRVs, means and standard deviations ``(1, N, Z)``
+    """
+    seeds = evaluation_seeds(seed)
+    env = scenario_env(Scenario("mugs", "PandaGrasp-v0", env_kwargs or {}), model, n_episodes=n_episodes)
+    env.seed(seeds.env)
+    observations = th.as_tensor(env.reset(), device=model.device)
+    states = np.stack([info["state"] for info in env.unwrapped.reset_infos])
+    env.close()
+    no_memory = th.zeros(n_episodes, model.policy.trv_dim, device=model.device)
+    with isolated_randomness(seeds.policy, model), th.no_grad():
+        step = model.policy.step(observations, no_memory, np.zeros(n_episodes, np.int64))
+    known = (x.cpu()[None] for x in (step.trvs, step.means, step.stds))
+    return InformationBatch(th.as_tensor(states)[None], *known)
+
+
+def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     """
     Tell how much of the mug's pose can be read from the TRVs of the grasping problem.
 
     Each is regressed on the TRVs and their squares and products for half of the mugs; R^2 is that for the other half.
-    Nothing is grasped.
 
-    :param model: A model of ``PandaGrasp-v0``.
-    :param env_kwargs: Keywords of the environment.
-    :param n_episodes: Mugs, an even number.
-    :param seed: Seed of the mugs' poses and of the policy.
+    :param batch: From :func:`encode_mugs`, with an even number of mugs.
     :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (its sine and cosine, averaged)
     """
-    seeds = evaluation_seeds(seed)
-    scenario = Scenario("mugs", "PandaGrasp-v0", env_kwargs or {})
-    env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
-    env.seed(seeds.env)
-    observations = env.reset()
-    x, y, _, yaw = np.stack([info["state"] for info in env.unwrapped.reset_infos]).T
-    env.close()
-    with isolated_randomness(seeds.policy, model):
-        _, memory = model.predict(observations, deterministic=False)
-    trvs = memory[0]
+    x, y, _, yaw = batch.states[0].numpy().T
+    trvs = batch.trvs[0].numpy()
     row, column = np.triu_indices(trvs.shape[1])
     known = np.concatenate([trvs, trvs[:, row] * trvs[:, column]], axis=1)[None]
     targets = dict(x=x[:, None], y=y[:, None], yaw=np.stack([np.sin(yaw), np.cos(yaw)], axis=1))

@@ -8,7 +8,7 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.logdet import LogDet
-from sb3_tdpg.information.loo import LeaveOneOut
+from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.information.smile import Smile
@@ -51,4 +51,5 @@ __all__ = [
     "Nwj",
     "Smile",
     "get_estimator_class",
+    "own_sample_bound",
 ]

@@ -25,17 +25,42 @@ class LeaveOneOut(InformationEstimator):
     bound = "upper"
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        trvs, means, stds = batch.trvs, batch.means, batch.stds
-        n = trvs.shape[1]
-        precision = stds.square().reciprocal()  # (T, N, Z)
-        # sum_z (x_iz - m_jz)^2 / s_jz^2 as products of matrices: (T, N, N) without a (T, N, N, Z) intermediate. Centred
-        # first, since the expansion of the square loses digits far from the origin.
-        centre = means.mean(dim=1, keepdim=True).detach()
-        x, m = trvs - centre, means - centre
-        quadratic = (
-            x.square() @ precision.mT - 2 * x @ (m * precision).mT + (m.square() * precision).sum(-1)[:, None, :]
-        )
-        log_density = -0.5 * quadratic - stds.log().sum(-1)[:, None, :]  # (T, i, j), up to a constant that cancels
+        log_density = log_density_matrix(batch)
+        n = log_density.shape[1]
         own = log_density.diagonal(dim1=1, dim2=2)
-        others = log_density.masked_fill(th.eye(n, dtype=th.bool, device=trvs.device), -math.inf)
+        others = log_density.masked_fill(th.eye(n, dtype=th.bool, device=own.device), -math.inf)
         return (own - th.logsumexp(others, dim=2)).mean(dim=1) + math.log(n - 1)
+
+
+def own_sample_bound(batch: InformationBatch) -> th.Tensor:
+    r"""
+    Bound the information from below with the mixture of all episodes' encoder densities, its own among them.
+
+    .. math::
+        I[e_t; \tilde x_t] \ge E\left[\frac1N \sum_i \log
+        \frac{q(\tilde x_i | e_i)}{\frac1N \sum_j q(\tilde x_i | e_j)}\right], \qquad e_t = (\tilde x_{t-1}, y_t).
+
+    This is InfoNCE with the best critic that there is, and at most ln N. It bounds :math:`I[x_t; \tilde x_t]`, too, where
+    the encoder's input is a function of the state: without memory (T = 1) and sensor noise.
+
+    :return: ``(T,)``, nats
+    """
+    log_density = log_density_matrix(batch)
+    own = log_density.diagonal(dim1=1, dim2=2)
+    return (own - th.logsumexp(log_density, dim=2)).mean(dim=1) + math.log(log_density.shape[1])
+
+
+def log_density_matrix(batch: InformationBatch) -> th.Tensor:
+    """
+    Log q(x~_i | e_j) of every sample under every episode's encoder, up to a constant: ``(T, i, j)``.
+
+    :param batch: Every episode of it is alive.
+    """
+    trvs, means, stds = batch.trvs, batch.means, batch.stds
+    precision = stds.square().reciprocal()  # (T, N, Z)
+    # sum_z (x_iz - m_jz)^2 / s_jz^2 as products of matrices: (T, N, N) without a (T, N, N, Z) intermediate. Centred
+    # first, since the expansion of the square loses digits far from the origin.
+    centre = means.mean(dim=1, keepdim=True).detach()
+    x, m = trvs - centre, means - centre
+    quadratic = x.square() @ precision.mT - 2 * x @ (m * precision).mT + (m.square() * precision).sum(-1)[:, None, :]
+    return -0.5 * quadratic - stds.log().sum(-1)[:, None, :]
