@@ -40,8 +40,8 @@ def own_sample_bound(batch: InformationBatch) -> th.Tensor:
         I[e_t; \tilde x_t] \ge E\left[\frac1N \sum_i \log
         \frac{q(\tilde x_i | e_i)}{\frac1N \sum_j q(\tilde x_i | e_j)}\right], \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    This is InfoNCE with the best critic that there is, and at most ln N. It bounds :math:`I[x_t; \tilde x_t]`, too, where
-    the encoder's input is a function of the state: without memory (T = 1) and sensor noise.
+    This is InfoNCE with the best critic that there is, and at most ln N. Where the encoder's input is a function of the
+    state (no memory, T = 1, and no sensor noise), it bounds :math:`I[x_t; \tilde x_t]`, too.
 
     :return: ``(T,)``, nats
     """
