@@ -64,8 +64,8 @@ COMPARISON = (
 KNOWLEDGE = (
     "Share of the variance (R^2 on mugs left out of the regression, mean over seeds) of the mug's position and of the "
     "sine and cosine of its yaw that TRVs, their squares and products explain; in training, and with all yaws. And "
-    "bounds on the information in nats: I[x; x~] itself lies between them, since the image is a function of the mug's pose and "
-    "there is no memory. The lower one cannot exceed ln 2000 = 7.6."
+    "bounds on the information in nats: I[x; x~] itself lies between them, since the image is a function of the mug's "
+    "pose and there is no memory. The lower one cannot exceed ln 2000 = 7.6."
 )
 
 
