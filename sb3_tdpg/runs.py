@@ -209,24 +209,31 @@ def complete_runs(
     """
     Complete runs in parallel processes, with a progress bar; Ctrl-C keeps what is finished.
 
-    :param tasks: Runs, their folders and what to evaluate, see :func:`complete_run`.
+    :param tasks: Runs, their folders and what to evaluate, see :func:`complete_run`. One that starts from the policy of
+        another one waits for it.
     :param n_eval_episodes: Episodes of each scenario.
     :param jobs: Runs at a time; default: the number of cores.
     """
     jobs = jobs or os.cpu_count() or 1
+    waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
+    running: dict[Future[Path], Path] = {}
     with (
         tqdm(total=len(tasks), unit="run", smoothing=0.1) as progress,
         ProcessPoolExecutor(jobs, mp.get_context("spawn"), initializer=_init_worker) as pool,
     ):
-        futures = {
-            pool.submit(complete_run, run, folder, scenarios, n_eval_episodes=n_eval_episodes): folder
-            for run, folder, scenarios in tasks
-        }
         try:
-            for future in _as_finished(futures):
-                future.result()
-                progress.set_postfix_str(futures[future].name, refresh=False)
-                progress.update()
+            while waiting or running:
+                for task in [task for task in waiting if task[0].start not in unfinished]:
+                    waiting.remove(task)
+                    running[pool.submit(complete_run, *task, n_eval_episodes=n_eval_episodes)] = task[1]
+                # With a timeout, so that Ctrl-C is seen at once.
+                finished, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    folder = future.result()
+                    running.pop(future)
+                    unfinished.remove(folder)
+                    progress.set_postfix_str(folder.name, refresh=False)
+                    progress.update()
         except BaseException:
             workers = list(getattr(pool, "_processes", {}).values())  # shutdown() forgets them
             pool.shutdown(wait=False, cancel_futures=True)
@@ -234,14 +241,6 @@ def complete_runs(
                 process.terminate()
             progress.write("stopped; finished runs and checkpoints are kept, and the same command goes on from them")
             raise
-
-
-def _as_finished(futures: Mapping[Future[Path], Path]) -> Iterator[Future[Path]]:
-    pending = set(futures)
-    while pending:
-        # With a timeout, so that Ctrl-C is seen at once.
-        finished, pending = wait(pending, timeout=1.0, return_when=FIRST_COMPLETED)
-        yield from finished
 
 
 def _init_worker() -> None:

@@ -1,4 +1,4 @@
-"""What the reproductions share: methods in stages, small tables, how something was made, the copy for the docs."""
+"""What the reproductions share: runs of several methods, small tables, how something was made, the copy for docs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Method:
 
 class Trained:
     """
-    Runs of methods in stages: a method that starts from another one waits for it.
+    Runs of methods, of which some start from the policy of another one with the same seed.
 
     :param env_id: The training environment.
     :param out: Folder for ``runs/``.
@@ -70,15 +70,13 @@ class Trained:
         :param rows: What each method is evaluated on.
         :param n_eval_episodes: Episodes of each row.
         :param jobs: Runs at a time; default: the number of cores.
-        :param is_long: What to begin with in each stage, so that the cores finish together.
+        :param is_long: What to begin with, so that the cores finish together.
         """
-        stages: dict[str, int] = {}
-        for method, _ in self.everything:
-            stages[method.label] = 0 if method.start is None else 1 + stages[method.start]
-        for stage in sorted(set(stages.values())):
-            here = sorted((x for x in self.everything if stages[x[0].label] == stage), key=lambda x: not is_long(x[0]))
-            tasks = [(self.runs[m.label, seed], self.folders[m.label, seed], rows(m)) for m, seed in here]
-            complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
+        tasks = [
+            (self.runs[method.label, seed], self.folders[method.label, seed], rows(method))
+            for method, seed in sorted(self.everything, key=lambda item: not is_long(item[0]))
+        ]
+        complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
     def records(self) -> pd.DataFrame:
         """Return the episodes of all runs."""
