@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .base import POMDPEnv
-from .panda_bullet import MOTIONS, Configuration, GraspSimulation
+from .panda_bullet import LIFTED, MOTIONS, Configuration, GraspSimulation
 from .panda_camera import IMAGE_SIZE, DepthCamera
 from .panda_scene import PandaScene
 from .panda_view import PandaView
@@ -23,8 +23,6 @@ ACTION_SCALE = 0.1
 LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
 HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
 MAX_DEPTH = 1.0  # m; the table is at most 0.61 m away
-LIFTED = 0.05  # m
-
 WORKSPACE = np.array([0.5, 0.0])  # m, its middle
 
 
