@@ -124,7 +124,7 @@ class GraspSimulation:
             fixedTimeStep=TIME_STEP,
             numSolverIterations=solver_iterations or motion.solver_iterations,
             # Contacts are solved for one after the other. By default their order depends on what was simulated before,
-            # and with it the outcome of one trial in fifteen.
+            # and with it the mug's final pose in one trial of fifteen.
             deterministicOverlappingPairs=1,
         )
         unseen = client.URDF_IGNORE_VISUAL_SHAPES
