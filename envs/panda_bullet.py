@@ -28,8 +28,14 @@ FINGERTIPS_BELOW_HAND = 0.1123  # m
 # the last joint's range, so that all yaws of a half circle to either side of the nominal one can be reached.
 HAND_TURN = np.pi / 4 - np.pi
 
-NEAR_TARGET = 0.005  # rad: a joint this near to its target has reached it
-LOOK_EVERY = 8  # steps between two looks at whether a phase is over
+LIFTED = 0.05  # m: higher than this a mug counts as lifted
+
+# When the fast motion goes on before a phase's time is over; it looks whenever LOOK_EVERY steps are done.
+LOOK_EVERY = 8
+NEAR_TARGET = 0.01  # rad: the arm has arrived, since it comes nearer while the next phase begins
+FINGERS_STAND_STILL = 0.01  # m/s
+LIFTED_FOR_GOOD = 0.06  # m
+
 FAR_AWAY = (5.0, 5.0, 5.0)  # m
 
 
@@ -52,7 +58,7 @@ class Motion(NamedTuple):
     clears_rim: bool  # it starts higher if it must for the fingertips to be above the rim
     lift_by: float | None  # m; None: the hand goes to lift_to
     lift_to: float
-    ends_early: bool  # a phase is over when the arm has arrived, and the lift when the mug has been lost
+    ends_early: bool  # a phase is over when nothing more is to come of it
 
 
 MOTIONS = {
@@ -118,7 +124,7 @@ class GraspSimulation:
             fixedTimeStep=TIME_STEP,
             numSolverIterations=solver_iterations or motion.solver_iterations,
             # Contacts are solved for one after the other. By default their order depends on what was simulated before,
-            # and with it the outcome of one trial in fifteen.
+            # and with it the mug's final pose in one trial of fifteen.
             deterministicOverlappingPairs=1,
         )
         unseen = client.URDF_IGNORE_VISUAL_SHAPES
@@ -161,10 +167,9 @@ class GraspSimulation:
         lift_to = motion.lift_to if motion.lift_by is None else z + motion.lift_by
         high = self._joints_for((x, y, lift_to), orientation)
         self._put_arm(start)
-        self._run(motion.approach, low, FINGER_OPEN, watch)
-        self._run(motion.close, low, 0.0, watch, whole=True)
-        if self._contacts() or not motion.ends_early:
-            self._run(motion.lift, high, 0.0, watch, holds_mug=True)
+        self._run(motion.approach, low, FINGER_OPEN, lambda: self._is_at(low), watch)
+        self._run(motion.close, low, 0.0, self._fingers_stand_still, watch)
+        self._run(motion.lift, high, 0.0, lambda: self._is_decided() or self._is_at(high), watch)
         return Outcome(self._mug_state(state[3]), self._contacts())
 
     def _run(
@@ -172,17 +177,10 @@ class GraspSimulation:
         phase: Phase,
         joints: tuple[float, ...],
         fingers: float,
+        is_over: Callable[[], bool],
         watch: Callable[[Configuration], object] | None,
-        *,
-        whole: bool = False,
-        holds_mug: bool = False,
     ) -> None:
-        """
-        Move towards a goal for as long as a phase lasts.
-
-        :param whole: The phase is never cut short.
-        :param holds_mug: It is over when no finger touches the mug.
-        """
+        """Move arm and fingers towards a goal for as long as a phase lasts."""
         client, robot = self.client, self._robot
         for joint, goal in zip(ARM_JOINTS, joints, strict=True):
             client.setJointMotorControl2(
@@ -192,15 +190,14 @@ class GraspSimulation:
             client.setJointMotorControl2(
                 robot, joint, client.POSITION_CONTROL, fingers, force=FINGER_FORCE, maxVelocity=phase.finger_speed
             )
-        may_end = self.motion.ends_early and not whole
         step = client.stepSimulation
         for i in range(phase.max_steps):
-            if watch is not None and i % LOOK_EVERY == 0:
-                watch(self._configuration())
+            if i % LOOK_EVERY == 0:
+                if watch is not None:
+                    watch(self._configuration())
+                if self.motion.ends_early and i > 0 and is_over():
+                    return
             step()
-            looks = may_end and i % LOOK_EVERY == LOOK_EVERY - 1
-            if looks and (self._is_at(joints) or (holds_mug and not self._contacts())):
-                break
         if watch is not None:
             watch(self._configuration())
 
@@ -236,6 +233,16 @@ class GraspSimulation:
     def _is_at(self, joints: tuple[float, ...]) -> bool:
         states = self.client.getJointStates(self._robot, ARM_JOINTS)
         return all(abs(state[0] - goal) < NEAR_TARGET for state, goal in zip(states, joints, strict=True))
+
+    def _fingers_stand_still(self) -> bool:
+        """Tell whether they hold something, or each other."""
+        return all(
+            abs(state[1]) < FINGERS_STAND_STILL for state in self.client.getJointStates(self._robot, FINGER_JOINTS)
+        )
+
+    def _is_decided(self) -> bool:
+        """Tell whether the mug has been lost, or is so high that it counts as lifted."""
+        return not self._contacts() or self._mug_frame()[0][2] > LIFTED_FOR_GOOD
 
     def _contacts(self) -> int:
         """Count the points in which the fingers touch the mug."""

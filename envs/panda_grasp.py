@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .base import POMDPEnv
-from .panda_bullet import MOTIONS, Configuration, GraspSimulation
+from .panda_bullet import LIFTED, MOTIONS, Configuration, GraspSimulation
 from .panda_camera import IMAGE_SIZE, DepthCamera
 from .panda_scene import PandaScene
 from .panda_view import PandaView
@@ -22,10 +22,8 @@ ACTION_SCALE = 0.1
 # down the palm would press on the rim, which lifts nothing. yaw: 1 rad to either side.
 LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
 HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
-# m; what the sensor tells apart. Table and mug are 0.32 to 0.61 m away.
+# m; what the sensor tells apart. Table and mug are 0.31 to 0.61 m away.
 MIN_DEPTH, MAX_DEPTH = 0.2, 0.7
-LIFTED = 0.05  # m
-
 WORKSPACE = np.array([0.5, 0.0])  # m, its middle
 
 

@@ -40,9 +40,9 @@ HANDLE_BARS = (
 )
 BAR_HALF_WIDTH, BAR_THICKNESS = 0.0055, 0.0085
 MASS = 0.1  # kg
-MAX_SHAPES = 16
 INERTIA = 2e-4  # kg m^2, about each axis
 CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame: a little towards the handle
+MAX_SHAPES = 16  # PyBullet takes so many for a body, and drops any further without a word
 
 
 @dataclass(frozen=True)
@@ -129,10 +129,9 @@ def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
     """
     Add the mug as it is felt; return its body's id. Its base position is that of its centre of mass.
 
-    :raises RuntimeError: if PyBullet did not take all of the shapes.
+    :raises RuntimeError: if there are more shapes than PyBullet takes.
     """
     shapes = scene.collision_shapes()
-    # PyBullet takes 16 shapes a body, which is what these are, and drops any further without a word.
     if len(shapes) > MAX_SHAPES:
         raise RuntimeError(f"the mug has {len(shapes)} shapes, PyBullet takes {MAX_SHAPES}")
     body = client.createCollisionShapeArray(

@@ -10,12 +10,13 @@ from .ball_view import enlarge
 from .bullet import BulletClient
 from .panda_bullet import ARM_JOINTS, FINGER_JOINTS, FINGER_OPEN, HOME, Configuration
 from .panda_camera import IMAGE_SIZE
-from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
+from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, UNTURNED, PandaScene, add_mug_picture
 
 HEIGHT, WIDTH = 256, 384  # pixels of the view
-MIDDLE = (0.36, 0.0, 0.22)  # m, what it looks at
-DISTANCE, YAW, PITCH, FOV = 0.85, 145.0, -24.0, 46.0  # m and degrees: from where it sees robot, mug and handle
+MIDDLE = (0.38, 0.0, 0.2)  # m, what it looks at
+DISTANCE, YAW, PITCH, FOV = 0.82, 145.0, -18.0, 46.0  # m and degrees: from where it sees robot, mug and handle
 LIGHT = (1.0, 1.2, 2.5)  # direction
+SHADOW_COLOR = (0.45, 0.36, 0.28, 1.0)
 FLOOR_FILE = os.path.join(ASSETS, "plane.urdf")
 FLOOR_HEIGHT = -0.625  # m
 NEAREST, FURTHEST = 0.30, 0.61  # m, what is white and what is black in the picture of the depth
@@ -38,6 +39,12 @@ class PandaView:
         client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
         self._robot = int(client.loadURDF(ROBOT_FILE, useFixedBase=True))
         self._mug = add_mug_picture(client, scene)
+        self._cup_origin = scene.cup_origin.tolist()
+        # TinyRenderer throws no shadow on the table, and without one a picture does not tell whether the mug is lifted.
+        shadow = client.createVisualShape(
+            client.GEOM_CYLINDER, radius=scene.mug_radius, length=0.001, rgbaColor=SHADOW_COLOR, specularColor=[0, 0, 0]
+        )
+        self._shadow = int(client.createMultiBody(baseVisualShapeIndex=shadow))
 
     @staticmethod
     def at_rest(position: tuple[float, float, float], yaw: float) -> Configuration:
@@ -53,6 +60,10 @@ class PandaView:
         self.client.resetBasePositionAndOrientation(
             self._mug, configuration.mug_position, configuration.mug_orientation
         )
+        (x, y, _), _ = self.client.multiplyTransforms(
+            configuration.mug_position, configuration.mug_orientation, self._cup_origin, UNTURNED
+        )
+        self.client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
 
     def picture(self, depth: np.ndarray) -> np.ndarray:
         """

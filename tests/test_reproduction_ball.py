@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+from small_problems import complete_runs_here
 
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.ball_catch import RENDERERS
@@ -28,15 +29,14 @@ def tiny(monkeypatch):
     monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
     for name in ("aggregate_seeds", "probability_of_improvement"):
         monkeypatch.setattr(ball, name, partial(getattr(ball, name), n_bootstrap=10))
-    order = []
+    asked = []
 
     def complete_runs(tasks, *, n_eval_episodes, jobs):
-        order.append([run.method for run, *_ in tasks])
-        for task in tasks:
-            complete_run(*task, n_eval_episodes=n_eval_episodes)
+        asked.append([run.method for run, *_ in tasks])
+        complete_runs_here(tasks, n_eval_episodes=n_eval_episodes)
 
     monkeypatch.setattr("sb3_tdpg.reproduction.common.complete_runs", complete_runs)
-    return order
+    return asked
 
 
 def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
@@ -59,15 +59,13 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     # A terminal cost of 100 for each metre, and a little for driving.
     assert (records["cost"] >= 100 * records["distance"] - 0.1).all()
     assert (records["cost"] <= 100 * records["distance"] + 25 * 0.2 + 0.1).all()
-    assert all("PG" in label and not label.startswith("TDPG") for label in tiny[0])
-    assert all(label not in tiny[0] for label in tiny[1] if label.startswith("TDPG"))
 
 
 def test_the_controls_may_be_added_later(tmp_path, tiny):
     arguments = dict(n_seeds=1, n_eval_episodes=2, n_timesteps=100)
     summary = ball.reproduce_ball(tmp_path, controls=False, **arguments)
     assert "its control" not in summary
-    assert [label for stage in tiny for label in stage] == ["PG", "PG, perturbed images", "TDPG"]
+    assert sorted(tiny[0]) == ["PG", "PG, perturbed images", "TDPG"]
     before = (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes()
     assert "its control" in ball.reproduce_ball(tmp_path, **arguments)
     assert (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes() == before

@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 import torch as th
 
+from small_problems import complete_runs_here
+
 from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
@@ -27,11 +29,7 @@ def tiny(monkeypatch):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     monkeypatch.setattr(grasp, "encode_mugs", partial(grasp.encode_mugs, n_episodes=100))
 
-    def complete_runs(tasks, *, n_eval_episodes, jobs):
-        for task in tasks:
-            complete_run(*task, n_eval_episodes=n_eval_episodes)
-
-    monkeypatch.setattr(common, "complete_runs", complete_runs)
+    monkeypatch.setattr(common, "complete_runs", complete_runs_here)
 
 
 def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):

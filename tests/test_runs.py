@@ -14,6 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pandas as pd
 import pytest
+from small_problems import assert_same_parameters, parameters
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.callbacks import TDPGProgressBar
@@ -21,7 +22,7 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.reproduction.lava import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
-from sb3_tdpg.runs import Run, complete_run, read_progress
+from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
@@ -227,6 +228,17 @@ def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
     assert "the same command goes on" in error
     assert "Traceback" not in error
     assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
+
+
+def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
+    overrides = {"n_timesteps": 200, "n_episodes": 20}
+    first = Run("PG", "Lava-v0", "Lava-v0-pg", 0, overrides)
+    # A rate of zero: what comes out is what it started from.
+    second = Run("more", "Lava-v0", "Lava-v0-pg", 0, {**overrides, "learning_rate": 0.0}, start=tmp_path / "first")
+    tasks = [(second, tmp_path / "second", LAVA[:1]), (first, tmp_path / "first", LAVA[:1])]
+    complete_runs(tasks, n_eval_episodes=4, jobs=2)
+    models = [TDPG.load(tmp_path / name / "model.zip", device="cpu") for name in ("first", "second")]
+    assert_same_parameters(*(parameters(model.policy) for model in models))
 
 
 @pytest.mark.slow

@@ -36,6 +36,10 @@ from sb3_tdpg.envs.ball_bullet import BulletRenderer  # noqa: E402
 from sb3_tdpg.envs.ball_catch import BallCatchEnv  # noqa: E402
 from sb3_tdpg.envs.ball_fast import FastRenderer  # noqa: E402
 from sb3_tdpg.envs.ball_scene import Renderer  # noqa: E402
+from sb3_tdpg.envs.panda_bullet import MOTIONS, GraspSimulation  # noqa: E402
+from sb3_tdpg.envs.panda_camera import DepthCamera  # noqa: E402
+from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv  # noqa: E402
+from sb3_tdpg.envs.panda_scene import TABLE_FILE, TABLE_POSITION  # noqa: E402
 from sb3_tdpg.information import InformationBatch, Mine  # noqa: E402
 from tests.reference_loop import LoopTDPG, draw_randomness, unbatch  # noqa: E402
 
@@ -291,6 +295,90 @@ def bench_camera(sizes: Sizes) -> Iterable[Row]:
     reference.close()
 
 
+# -- (f) grasping -----------------------------------------------------------------------------------------------------
+
+
+class GraspTrials:
+    """Trials of an untrained policy's kind, half of which lift the mug, and what they are made of."""
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+        self.env = PandaGraspEnv()
+        self.env.reset(seed=SEED)
+        self.states = self.env._initial_state(n)
+        self.poses = np.tile(NOMINAL_GRASP, (n, 1))
+        self.poses[:, :2] = self.states[:, :2] + [0.045, 0.01]
+        self.poses += np.random.default_rng(SEED).normal(size=(n, 4)) * [0.03, 0.03, 0.01, 0.3]
+        box = self.env.action_space
+        self.actions = np.clip((self.poses - NOMINAL_GRASP) / 0.1, box.low, box.high)
+        self.poses = NOMINAL_GRASP + 0.1 * self.actions
+
+    def run(self) -> None:
+        """Whole trials, as in training: the image before and the one after the grasp among them."""
+        self.env.reset_batch(self.n)
+        self.env.step_batch(self.states, self.actions, is_last=True)
+
+    def grasp(self, simulation: GraspSimulation) -> None:
+        """The simulation alone."""
+        for state, pose in zip(self.states, self.poses, strict=True):
+            simulation.grasp(state, pose)
+
+    def restore(self) -> None:
+        """What brings the world back to its beginning."""
+        for state in self.states:
+            self.env._simulation._restore(state)
+
+    def rebuild(self) -> None:
+        """Make the world anew."""
+        GraspSimulation(self.env.scene, MOTIONS["fast"]).close()
+
+    def split(self, repetitions: int) -> str:
+        """Trials in a second, and where the time goes: medians."""
+
+        def median(function: Callable[[], object]) -> float:
+            return statistics.median(seconds(function, self.n) for _ in range(repetitions))
+
+        self.run()
+        whole, restore = median(self.run), median(self.restore)
+        depth = median(lambda: self.env._camera.images(self.states))
+        simulation = median(lambda: self.grasp(self.env._simulation)) - restore
+        return (
+            f"PandaGrasp-v0, fast motion: {1 / whole:.0f} trials a second of CPU time. A trial takes "
+            f"{format_time(whole)}: reset of the world {format_time(restore)}, two depth images "
+            f"{format_time(2 * depth)}, simulation {format_time(simulation)}."
+        )
+
+
+def bench_grasp(sizes: Sizes) -> Iterable[Row]:
+    """Compare the parts of a trial with what they replace."""
+    trials = GraspTrials(max(10, sizes.n_episodes // 10))
+    some = max(1, trials.n // 10)
+    few = GraspTrials(some)
+    slow = GraspSimulation(trials.env.scene, MOTIONS["reference"])
+    yield compare(
+        "grasp: the fast motion against the paper's",
+        lambda: seconds(lambda: trials.grasp(trials.env._simulation), trials.n),
+        lambda: seconds(lambda: few.grasp(slow), some),
+        sizes.loop_repetitions,
+    )
+    yield compare(
+        "start of a grasp: a saved state of the world against a new world",
+        lambda: seconds(trials.restore, trials.n),
+        lambda: seconds(trials.rebuild),
+        sizes.repetitions,
+    )
+    with_table = DepthCamera(trials.env.scene)
+    with_table.client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
+    yield compare(
+        "depth image: the mug drawn before a known table against mug and table",
+        lambda: seconds(lambda: trials.env._camera.images(trials.states), trials.n),
+        lambda: seconds(lambda: with_table.images(trials.states), trials.n),
+        sizes.repetitions,
+    )
+    for each in (slow, with_table, trials.env, few.env):
+        each.close()
+
+
 # -- the table --------------------------------------------------------------------------------------------------------
 
 
@@ -342,8 +430,9 @@ def main() -> None:
     sizes = QUICK if arguments.quick else FULL
 
     start = time.perf_counter()
-    benches = (bench_epoch, bench_critics, bench_training, bench_environment, bench_camera)
+    benches = (bench_epoch, bench_critics, bench_training, bench_environment, bench_camera, bench_grasp)
     rows = [row for bench in benches for row in bench(sizes)]
+    split = GraspTrials(max(10, sizes.n_episodes // 5)).split(sizes.loop_repetitions)
     elapsed = time.perf_counter() - start
     title = "# Speed" + (" (--quick: not the paper's sizes)" if arguments.quick else "")
     notes = (
@@ -351,7 +440,7 @@ def main() -> None:
         "medians. The first policy epoch, with the critics' warm-up, is not counted. "
         f"{sizes.repetitions} repetitions ({sizes.loop_repetitions} of the loop over samples), {elapsed:.0f} s in all."
     )
-    report = "\n\n".join([title, describe_machine(), format_table(rows), notes]) + "\n"
+    report = "\n\n".join([title, describe_machine(), format_table(rows), split, notes]) + "\n"
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(report, encoding="utf-8")
     print(f"\n{report}\nwritten to {arguments.out}")
