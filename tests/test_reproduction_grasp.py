@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
-
 from small_problems import complete_runs_here
 
 from sb3_tdpg import TDPG, BatchedVecEnv
