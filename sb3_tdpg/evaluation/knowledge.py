@@ -91,7 +91,7 @@ def encode_mugs(
     with isolated_randomness(seeds.policy, model), th.no_grad():
         step = model.policy.step(observations, no_memory, np.zeros(n_episodes, np.int64))
     known = (x.cpu()[None] for x in (step.trvs, step.means, step.stds))
-    return InformationBatch(th.as_tensor(states)[None], *known)
+    return InformationBatch(th.as_tensor(states, dtype=th.float32)[None], *known)
 
 
 def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
