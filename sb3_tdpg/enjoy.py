@@ -39,6 +39,7 @@ def enjoy(
     :param n_episodes: How many.
     :param deterministic: Act without noise, which is another policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
     :param record: Also write a film there, ``.gif`` or ``.mp4``: what the environment draws, and the TRVs over time.
+        Where it has a method ``film``, that draws what happened in a step.
     :return: the episodes; without ``record`` they have no pictures
     :raises ValueError: if there is no model, it does not fit the environment, or no film can be made.
     """
@@ -116,6 +117,8 @@ def _run_episode(
 ) -> tuple[Episode, np.ndarray | None]:
     """Run the episode that begins with an observation; return its final state, too, where the environment tells it."""
     pictures = [_picture(env)] if with_pictures else []
+    film = getattr(env.unwrapped, "film", None) if with_pictures else None
+    between: list[list[np.ndarray]] = []
     memory, trvs, costs, is_over = None, [], [], False
     while not is_over:
         action, memory = model.predict(observation, memory, deterministic=deterministic)
@@ -124,9 +127,11 @@ def _run_episode(
         trvs.append(memory[0][0])
         costs.append(-float(reward))
         is_over = terminated or truncated
+        if film is not None:
+            between.append(list(film()))
         if with_pictures:
             pictures.append(_picture(env))
-    return Episode(pictures, np.stack(trvs), np.array(costs)), info.get("state")
+    return Episode(pictures, np.stack(trvs), np.array(costs), between), info.get("state")
 
 
 def _picture(env: gym.Env) -> np.ndarray:

@@ -11,7 +11,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-KINDS = ("vector", "image", "depth")
+MIN_SIDE = 12  # pixels: what the two convolutions for depth images need
 
 
 def observation_kind(space: spaces.Space | None, *, normalize_images: bool = True) -> str:
@@ -20,13 +20,16 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
 
     :param space: The observation space.
     :param normalize_images: Whether bytes are divided by 255; if not, an image may also come in floats in [0, 1].
-    :return: ``"image"``: bytes, channels first or last; ``"depth"``: a ``Box`` of floats in three dimensions, the
-        channels first; ``"vector"``: anything else
+    :return: ``"image"``: bytes, channels first or last; ``"depth"``: a ``Box`` of floats, ``(1, H, W)`` with at least
+        12 pixels a side; ``"vector"``: anything else
     """
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
+        channels, *sides = space.shape if len(space.shape) == 3 else (0,)
+        if channels == 1 and min(sides) >= MIN_SIDE:
+            return "depth"
     if space is not None and is_image_space(space, check_channels=False, normalized_image=not normalize_images):
         return "image"
-    is_depth = isinstance(space, spaces.Box) and len(space.shape) == 3 and np.issubdtype(space.dtype, np.floating)
-    return "depth" if is_depth else "vector"
+    return "vector"
 
 
 class TRVCnn(BaseFeaturesExtractor):
@@ -45,7 +48,7 @@ class TRVCnn(BaseFeaturesExtractor):
     ) -> None:
         super().__init__(observation_space, features_dim=1)
         low, high = float(observation_space.low.min()), float(observation_space.high.max())
-        is_scaled = np.issubdtype(observation_space.dtype, np.floating) and np.isfinite([low, high]).all()
+        is_scaled = np.issubdtype(observation_space.dtype, np.floating) and -np.inf < low < high < np.inf
         self.offset, self.scale = ((low + high) / 2, (high - low) / 2) if is_scaled else (0.0, 1.0)
         layers: list[nn.Module] = []
         channels = observation_space.shape[0]
@@ -60,4 +63,5 @@ class TRVCnn(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """``(N, C, H, W) -> (N, features_dim)``."""
         images = observations.contiguous(memory_format=th.channels_last)
-        return self.cnn(images if self.scale == 1.0 else (images - self.offset) / self.scale)
+        is_scaled = (self.offset, self.scale) != (0.0, 1.0)
+        return self.cnn((images - self.offset) / self.scale if is_scaled else images)

@@ -37,6 +37,7 @@ class PolicyDefaults(NamedTuple):
     encoder: Sequence[int]
     action_head: Sequence[int]
     encoder_activation_fn: type[nn.Module]
+    action_head_activation_fn: type[nn.Module]
     encoder_log_var_init: float
     action_log_var_init: float
     features_extractor_class: type[BaseFeaturesExtractor]
@@ -45,9 +46,9 @@ class PolicyDefaults(NamedTuple):
 
 # What an image shows gets lost in the noise of wide TRVs: with them training takes twice as long.
 POLICY_DEFAULTS = dict(
-    vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
-    image=PolicyDefaults(8, (32,), (), nn.Tanh, -3.0, -1.0, TRVCnn, {}),
-    depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
+    vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
+    image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, {}),
+    depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
 )
 
 
@@ -79,21 +80,25 @@ class TRVPolicy(BasePolicy):
     The memory that ``predict`` takes and returns as ``state`` is ``(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the
     index of the next time step, ``(n_envs,)``.
 
+    Defaults that differ are given for vectors, for images of bytes and for depth images (of floats), in this order; the
+    sizes of the networks are the paper's.
+
     :param observation_space: A vector, or an image with channels first.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: T. The algorithm passes the environment's.
-    Defaults that differ are given for vectors, for images of bytes and for depth images (of floats), in this order; the
-    sizes of the networks are the paper's.
-
     :param trv_dim: Number of TRVs Z; default: 2, 8, 16.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
         ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``.
-    :param activation_fn: Nonlinearity of the hidden layers; default: ELU, but tanh in the encoder of images.
+    :param activation_fn: Nonlinearity of the hidden layers; default: ELU; for images of bytes tanh, for depth
+        images tanh in the encoder.
     :param time_varying: One set of weights for each time step, or one for all; default: time-varying up to a horizon of
         50. A convolutional feature extractor is always shared.
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images:
         then no observation, however unlike those in training, drives the TRVs to where the action head has never been.
+    :param squash_trv_log_var: Whether a tanh keeps the log-variance of the TRVs in [-1, 1], too, before
+        ``encoder_log_var_init`` is added. The paper's policies for images have it; it forces noise of at least 0.6 on
+        TRVs whose means are within 1, which costs more than it helps.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it; default:
         0, -3, -3.
     :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2.
@@ -121,6 +126,7 @@ class TRVPolicy(BasePolicy):
         activation_fn: type[nn.Module] | None = None,
         time_varying: bool | None = None,
         squash_trv_mean: bool = True,
+        squash_trv_log_var: bool = False,
         encoder_log_var_init: float | None = None,
         action_log_var_init: float | None = None,
         encoder_var_floor: float = 1e-3,
@@ -149,6 +155,7 @@ class TRVPolicy(BasePolicy):
         self.trv_dim = defaults.trv_dim if trv_dim is None else trv_dim
         self.time_varying = horizon <= MAX_TIME_VARYING_HORIZON if time_varying is None else time_varying
         self.squash_trv_mean = squash_trv_mean
+        self.squash_trv_log_var = squash_trv_log_var
         self.activation_fn = activation_fn
         self.encoder_log_var_init = _default(encoder_log_var_init, defaults.encoder_log_var_init)
         self.action_log_var_init = _default(action_log_var_init, defaults.action_log_var_init)
@@ -175,7 +182,7 @@ class TRVPolicy(BasePolicy):
         self.action_head = TimeMLP(
             horizon,
             [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()],
-            activation_fn or nn.ELU,
+            activation_fn or defaults.action_head_activation_fn,
             time_varying=self.time_varying,
         )
         self.optimizer = self.optimizer_class(
@@ -205,6 +212,7 @@ class TRVPolicy(BasePolicy):
             activation_fn=self.activation_fn,
             time_varying=self.time_varying,
             squash_trv_mean=self.squash_trv_mean,
+            squash_trv_log_var=self.squash_trv_log_var,
             encoder_log_var_init=self.encoder_log_var_init,
             action_log_var_init=self.action_log_var_init,
             encoder_var_floor=self.encoder_var_floor,
@@ -224,6 +232,8 @@ class TRVPolicy(BasePolicy):
         mean, log_var = parameters.chunk(2, dim=-1)
         if self.squash_trv_mean:
             mean = th.tanh(mean)
+        if self.squash_trv_log_var:
+            log_var = th.tanh(log_var)
         return mean, _variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor).sqrt()
 
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:

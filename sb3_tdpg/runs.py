@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing as mp
-import os
 import shutil
 import signal
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from sb3_tdpg.evaluation.provenance import jsonable
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
+from sb3_tdpg.vec_env import usable_cores
 
 # A checkpoint resets the environments, so that how often it is made belongs to the run.
 MAX_CHECKPOINT_EPOCHS = 50
@@ -46,7 +46,8 @@ class Run:
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Trainings from scratch, each with a seed of its own, until one meets the limits of the block's
         selection. The paper likewise chooses its policy from several trainings.
-    :param start: Folder of a finished run whose policy the training starts from.
+    :param start: Folder of a finished run whose policy the training starts from. The environment's random numbers begin
+        anew: with the same seed, the training meets the initial states of that run's first epochs again.
     """
 
     method: str
@@ -105,9 +106,12 @@ def complete_run(
     :param n_eval_episodes: Episodes of each scenario.
     :param progress_bar: Show progress bars.
     :return: ``folder``
-    :raises ValueError: if the folder holds a run with other settings; nothing of it is touched.
+    :raises ValueError: if the folder holds a run with other settings, or there is no policy to start from; nothing is
+        touched.
     """
     rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
+    if run.start is not None and not (run.start / "model.zip").exists():
+        raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
     config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
     _check_same_run(folder / "config.json", config)
     if (folder / "episodes.csv").exists():
@@ -214,7 +218,7 @@ def complete_runs(
     :param n_eval_episodes: Episodes of each scenario.
     :param jobs: Runs at a time; default: the number of cores.
     """
-    jobs = jobs or os.cpu_count() or 1
+    jobs = jobs or usable_cores()
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
     running: dict[Future[Path], Path] = {}
     with (
@@ -223,9 +227,13 @@ def complete_runs(
     ):
         try:
             while waiting or running:
-                for task in [task for task in waiting if task[0].start not in unfinished]:
+                # No more than are at work, so that what has to wait keeps its place in the order.
+                ready = [task for task in waiting if task[0].start not in unfinished]
+                for task in ready[: jobs - len(running)]:
                     waiting.remove(task)
                     running[pool.submit(complete_run, *task, n_eval_episodes=n_eval_episodes)] = task[1]
+                if not running:
+                    raise ValueError(f"these runs wait for each other: {[task[0].folder_name for task in waiting]}")
                 # With a timeout, so that Ctrl-C is seen at once.
                 finished, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
                 for future in finished:

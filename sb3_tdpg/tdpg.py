@@ -74,8 +74,8 @@ class TDPG(OnPolicyAlgorithm):
     :param learning_rate: Learning rate of the policy, a number or a function of the remaining progress; default:
         linearly from 2e-3 to 2e-5, and from 1e-3 to 5e-5. The critics have their own (``mi_kwargs``).
     :param n_episodes: Episodes N of a policy epoch; default: 500 and 160.
-    :param n_envs: Number of environments that a string id is turned into; default: N for the environments of this
-        plugin, otherwise the largest divisor of N up to 50.
+    :param n_envs: Number of environments that a string id is turned into; default: see
+        :func:`~sb3_tdpg.make_episodes_env`.
     :param mi_estimator: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, ``"logdet"``, ``"loo"`` or a subclass of
         :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"`` and ``"logdet"``.
     :param mi_kwargs: Keywords of the estimator.
@@ -98,7 +98,7 @@ class TDPG(OnPolicyAlgorithm):
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.policies.TRVPolicy`.
     :param verbose: 0: nothing; 1: what the environment is wrapped in, and a table each epoch; 2: debug messages.
-    :param seed: Seed of all random number generators.
+    :param seed: Seed of all random number generators. With another number of environments it gives other episodes.
     :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
     :param _init_setup_model: Whether to build the networks at once.
     :raises ValueError: if an argument is out of its range or does not fit the environment; the message says how to mend
@@ -531,7 +531,7 @@ class TDPG(OnPolicyAlgorithm):
         trained on.
 
         :param total_timesteps: Environment steps; default: 400 policy epochs for vectors (a million steps of the lava
-            problem), 50 for images.
+            problem), 50 for images, 100 for depth images.
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:

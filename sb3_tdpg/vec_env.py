@@ -7,11 +7,14 @@ Dimension key: N environments side by side, X state, U action.
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
+import signal
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, cast
 
@@ -158,7 +161,7 @@ def make_episodes_env(
     environment                                         becomes                     number of environments by default
     ==================================================  ==========================  ===================================
     of this plugin                                      :class:`BatchedVecEnv`      ``n_episodes``
-    of this plugin, simulated one by one (PandaGrasp),  SB3's ``SubprocVecEnv``     the largest divisor of
+    of this plugin, simulated one by one (PandaGrasp),  :class:`ProcessVecEnv`      the largest divisor of
     on several cores                                                                ``n_episodes`` up to the cores
     any other                                           SB3's ``DummyVecEnv``       the largest divisor of
                                                                                     ``n_episodes`` up to 50
@@ -186,8 +189,9 @@ def make_episodes_env(
         wants_processes = use_processes and env.wants_processes
         if wants_processes and (n_processes := n_envs or _largest_divisor(n_episodes, usable_cores())) > 1:
             env.close()
-            # With its module, so that a process that does not know of the registration comes to know it.
-            return _in_processes(f"{creator.__module__}:{bare_id}", n_processes, env_kwargs, seed)
+            # With a module, so that a process that does not know of the registration comes to know it.
+            make = functools.partial(_make_deaf, f"{module or creator.__module__}:{bare_id}")
+            return make_vec_env(make, n_processes, seed=seed, env_kwargs=env_kwargs, vec_env_cls=ProcessVecEnv)
         env.spec = spec
         vec_env: VecEnv = BatchedVecEnv(env, n_envs or n_episodes)
         vec_env.seed(seed)
@@ -200,19 +204,41 @@ def make_episodes_env(
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
 
 
-def _in_processes(env_id: str, n_envs: int, env_kwargs: dict[str, Any], seed: int | None) -> VecEnv:
-    """Give each environment a process of its own."""
-    # A forked process goes on where this one is. Any other start method imports the user's script once more, which must
-    # then guard what it does by `if __name__ == "__main__"`.
-    start_method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
-    with warnings.catch_warnings():
-        # From Python 3.12 on a fork warns of the threads of PyTorch; the processes do not call PyTorch.
-        warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
-        return make_vec_env(
-            env_id,
-            n_envs=n_envs,
-            seed=seed,
-            env_kwargs=env_kwargs,
-            vec_env_cls=SubprocVecEnv,
-            vec_env_kwargs=dict(start_method=start_method),
-        )
+class ProcessVecEnv(SubprocVecEnv):
+    """
+    SB3's ``SubprocVecEnv``, whose processes neither end by Ctrl-C nor outlive it, and which names what it refuses.
+
+    :param env_fns: What makes each environment, called in its process.
+    """
+
+    def __init__(self, env_fns: list[Callable[[], gym.Env]]) -> None:
+        # A forked process goes on where this one is. Any other start method imports the user's script once more, which
+        # must then guard what it does by `if __name__ == "__main__"`.
+        start_method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
+        with warnings.catch_warnings():
+            # From Python 3.12 on a fork warns of the threads of PyTorch; the processes do not call PyTorch.
+            warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
+            super().__init__(env_fns, start_method)
+        # They would not notice: a forked process holds the pipes of those before it open.
+        weakref.finalize(self, _terminate, self.processes)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Hand the actions over, ``(N, U)``."""
+        if not np.all(np.isfinite(actions)):
+            # Here and not in the process, whose error would arrive as an EOFError that says nothing.
+            raise ValueError(
+                f"an action is not finite: {actions[~np.isfinite(actions).all(-1)][0]}; "
+                "the policy that produced it has probably diverged"
+            )
+        super().step_async(actions)
+
+
+def _terminate(processes: Sequence[Any]) -> None:
+    for process in processes:
+        process.terminate()
+
+
+def _make_deaf(env_id: str, **env_kwargs: Any) -> gym.Env:
+    """Make an environment in a process that does not hear Ctrl-C: the one that it serves decides what is to be done."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return gym.make(env_id, **env_kwargs)

@@ -187,6 +187,18 @@ def test_an_mp4_is_written_without_an_ffmpeg_on_the_path(lava, tmp_path, monkeyp
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
 
 
+def test_a_grasp_is_shown_from_beginning_to_end(tmp_path):
+    env = gym.make("PandaGrasp-v0")
+    tiny_tdpg(env).save(tmp_path / "model.zip")
+    (episode,) = enjoy(tmp_path / "model.zip", "PandaGrasp-v0", record=tmp_path / "film.gif")
+    frames, _ = frames_of(tmp_path / "film.gif")
+    assert len(episode.between[0]) > 5
+    assert len(frames) == len(episode.pictures) + len(episode.between[0])
+    times = [time for time, _ in episode.film()]
+    assert times == sorted(times)
+    assert (times[0], times[-1]) == (0.0, 1.0)
+
+
 # -- bad input ------------------------------------------------------------------------------------------------
 
 

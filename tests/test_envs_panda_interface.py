@@ -1,6 +1,8 @@
 """The grasping problem as Gymnasium, Stable-Baselines3 and a reader of pictures see it, and what it refuses."""
 
+import gc
 import os
+import signal
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +16,7 @@ from sb3_tdpg import BatchedVecEnv, make_episodes_env, vec_env
 from sb3_tdpg.envs.panda_bullet import MOTIONS
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP
+from sb3_tdpg.vec_env import ProcessVecEnv
 
 
 @pytest.fixture
@@ -104,13 +107,13 @@ def test_every_kind_of_vectorised_environment_gives_the_same_outcomes_and_detail
 
 
 @pytest.mark.parametrize(("cores", "n_episodes", "n_envs", "kind", "expected"), [
-    (2, 10, None, SubprocVecEnv, 2),
-    (4, 10, None, SubprocVecEnv, 2),
-    (5, 10, None, SubprocVecEnv, 5),
+    (2, 10, None, ProcessVecEnv, 2),
+    (4, 10, None, ProcessVecEnv, 2),
+    (5, 10, None, ProcessVecEnv, 5),
     (1, 10, None, BatchedVecEnv, 10),
     (2, 7, None, BatchedVecEnv, 7),
     (2, 10, 1, BatchedVecEnv, 1),
-    (1, 9, 3, SubprocVecEnv, 3),
+    (1, 9, 3, ProcessVecEnv, 3),
 ])  # fmt: skip
 def test_an_id_gets_a_process_for_each_core_that_divides_the_episodes(
     monkeypatch, cores, n_episodes, n_envs, kind, expected
@@ -136,7 +139,37 @@ def test_a_script_without_a_main_guard_may_use_processes(tmp_path):
         "print(type(env).__name__, env.step(np.zeros((2, 4), np.float32))[2])\n"
         "env.close()\n"
     )
-    assert run_python("-W", "error::DeprecationWarning", str(script)).splitlines()[-1] == "SubprocVecEnv [ True  True]"
+    assert run_python("-W", "error::DeprecationWarning", str(script)).splitlines()[-1] == "ProcessVecEnv [ True  True]"
+
+
+def test_the_processes_neither_end_by_ctrl_c_nor_outlive_their_environment():
+    made = make_episodes_env("PandaGrasp-v0", 2, seed=0)
+    made.reset()
+    processes = made.processes
+    for process in processes:
+        os.kill(process.pid, signal.SIGINT)  # as a terminal does to all processes of a command
+    assert made.step(np.zeros((2, 4), np.float32))[2].all()
+    del made
+    gc.collect()
+    for process in processes:
+        process.join(timeout=10)
+        assert not process.is_alive()
+
+
+def test_an_action_that_is_not_finite_is_refused_by_name_also_with_processes():
+    made = make_episodes_env("PandaGrasp-v0", 2)
+    made.reset()
+    with pytest.raises(ValueError, match=r"not finite: \[nan  0\.  0\.  0\.\]; .* diverged"):
+        made.step(np.array([[0.0] * 4, [np.nan, 0, 0, 0]]))
+    assert made.step(np.zeros((2, 4), np.float32))[2].all(), "the environment is whole"
+    made.close()
+
+
+def test_where_the_number_of_cores_must_not_matter_there_are_no_processes(monkeypatch):
+    monkeypatch.setattr(vec_env, "usable_cores", lambda: 2)
+    made = make_episodes_env("PandaGrasp-v0", n_episodes=10, use_processes=False)
+    assert type(made) is BatchedVecEnv
+    made.close()
 
 
 def test_a_bad_keyword_is_told_before_any_process_is_started():

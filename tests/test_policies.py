@@ -7,6 +7,7 @@ from gymnasium import spaces
 from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs
 
 from sb3_tdpg import TDPG, TRVPolicy
+from sb3_tdpg.features import observation_kind
 from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
 
 T, N = 4, 6
@@ -248,17 +249,44 @@ def test_depth_images_have_the_network_of_the_papers_grasping_problem():
     assert isinstance(policy.action_head.mlp.activation, th.nn.ELU)
 
 
-def test_images_of_floats_are_brought_from_their_bounds_to_plus_and_minus_one():
-    extractor = make_policy(DEPTH).features_extractor
+@pytest.mark.parametrize(("low", "high", "expected"), [
+    (0.2, 0.7, (-1.0, 0.0, 1.0)),
+    (0.0, 2.0, (-1.0, 0.0, 1.0)),
+    (-1.0, 1.0, (-1.0, 0.0, 1.0)),
+    (0.5, 0.5, (0.5, 0.5, 0.5)),  # nothing to be brought anywhere
+    (0.0, np.inf, (0.0, 1.0, 2.0)),
+])  # fmt: skip
+def test_images_of_floats_are_brought_from_their_bounds_to_plus_and_minus_one(low, high, expected):
+    extractor = make_policy(spaces.Box(low, high, DEPTH.shape, np.float32)).features_extractor
     seen = []
     extractor.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    for depth in (0.2, 0.45, 0.7):
-        extractor(th.full((1, *DEPTH.shape), depth))
-    assert [float(image.mean()) for image in seen] == pytest.approx([-1.0, 0.0, 1.0], abs=1e-6)
-    unbounded = make_policy(spaces.Box(-np.inf, np.inf, DEPTH.shape, np.float32)).features_extractor
-    unbounded.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    unbounded(th.full((1, *DEPTH.shape), 0.45))
-    assert float(seen[-1].mean()) == pytest.approx(0.45)
+    for share in (0.0, 0.5, 1.0):
+        extractor(th.full((1, *DEPTH.shape), low + share * (min(high, low + 2.0) - low)))
+    assert [float(image.mean()) for image in seen] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("space", "kind"), [
+    (DEPTH, "depth"),
+    (CHW, "image"),
+    (HWC, "image"),
+    (VECTOR, "vector"),
+    (spaces.Box(0, 1, (24, 20, 1), np.float32), "vector"),  # channels last
+    (spaces.Box(0, 1, (1, 5, 5), np.float32), "vector"),  # too small for the convolutions
+    (spaces.Box(0, 1, (3, 24, 20), np.float32), "vector"),
+    (spaces.Discrete(3), "vector"),
+    (None, "vector"),
+], ids=str)  # fmt: skip
+def test_the_kind_of_an_observation_is_that_of_its_space(space, kind):
+    assert observation_kind(space) == kind
+
+
+def test_the_log_variance_of_the_trvs_may_be_squashed_as_in_the_paper():
+    parameters = th.tensor([[0.0, 0.0, 50.0, -50.0]])
+    policy = make_policy(trv_dim=2, squash_trv_log_var=True, encoder_var_floor=0.0)
+    _, std = policy._encoder_density(parameters)
+    assert std.tolist()[0] == pytest.approx([np.exp(0.5), np.exp(-0.5)], rel=0.03)
+    _, std = make_policy(trv_dim=2, encoder_var_floor=0.0)._encoder_density(parameters)
+    assert std[0, 1] < 1e-6
 
 
 def test_a_saved_policy_predicts_the_same(tmp_path):

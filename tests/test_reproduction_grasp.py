@@ -12,7 +12,7 @@ from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP
-from sb3_tdpg.evaluation import encode_mugs, failures_by_yaw, grasp_knowledge
+from sb3_tdpg.evaluation import draw_mugs, encode_mugs, failures_by_yaw, grasp_knowledge, knowledge
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.reproduction import common, grasp
@@ -26,7 +26,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 8, "batch_size": 8}))
     for module, name in ((grasp, "aggregate_seeds"), (common, "probability_of_improvement")):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
-    monkeypatch.setattr(grasp, "encode_mugs", partial(grasp.encode_mugs, n_episodes=100))
+    monkeypatch.setattr(grasp, "N_MUGS", 100)
 
     monkeypatch.setattr(grasp, "FITTED_MUGS", 60)
     monkeypatch.setattr(grasp, "CRITICS", {k: dict(v, warmup_gradient_steps=5) for k, v in grasp.CRITICS.items()})
@@ -85,23 +85,30 @@ def test_the_failures_are_drawn_in_the_sector_of_their_yaw():
     assert angles[5] == pytest.approx(5.5 * 2 * np.pi / 24)
 
 
-def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other():
-    poses = th.rand(1, 400, 4, generator=th.Generator().manual_seed(0), dtype=th.float32) * th.tensor(
-        [0.1, 0.1, 0, 6.3]
-    )
-    told = th.stack([poses[..., 0], th.cos(poses[..., 3])], dim=-1)
+@pytest.mark.parametrize("half_width", [np.pi, np.pi / 4])
+def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_width):
+    poses = th.tensor(np.random.default_rng(0).uniform(-1, 1, (1, 20_000, 4)) * [0.1, 0.1, 0, half_width])
+    noise = th.tensor(np.random.default_rng(1).standard_normal((1, 20_000, 16)))
+    x, sine = poses[..., 0], th.sin(poses[..., 3])
+    # Three parts of noise on one of the sine, in variance.
+    weak = sine / sine.std() + 3**0.5 * noise[..., 1]
+    told = th.cat([x[..., None], weak[..., None], noise[..., 2:]], dim=-1)
     known = grasp_knowledge(InformationBatch(poses, told, told, th.ones_like(told)))
     assert known["x"] > 0.99
-    assert known["y"] < 0.1
-    assert known["yaw"] == pytest.approx(0.5, abs=0.1), "the cosine, not the sine"
+    assert known["y"] < 0.02
+    share = (sine.var() / (sine.var() + th.cos(poses[..., 3]).var())).item()
+    assert known["yaw"] == pytest.approx(0.25 * share, abs=0.08)
+    assert known["yaw"] > 0.05
 
 
-def test_the_mugs_that_a_policy_is_shown_are_those_of_the_environment():
+def test_the_mugs_that_a_policy_is_shown_are_those_of_the_environment(monkeypatch):
+    monkeypatch.setattr(knowledge, "MUGS_AT_A_TIME", 8)
     model = TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), n_episodes=4, batch_size=4, device="cpu")
-    batch = encode_mugs(model, dict(yaw_range=(2.0, 2.5)), n_episodes=20)
-    assert batch.states.shape == (1, 20, 4)
-    assert ((batch.states[..., 3] >= 2.0) & (batch.states[..., 3] <= 2.5)).all()
+    mugs = draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20)
+    assert ((mugs.poses[:, 3] >= 2.0) & (mugs.poses[:, 3] <= 2.5)).all()
+    batch = encode_mugs(model, mugs)
+    np.testing.assert_allclose(batch.states[0].numpy(), mugs.poses, rtol=1e-6)
     assert batch.trvs.shape == batch.means.shape == batch.stds.shape == (1, 20, 16)
     assert (batch.trvs != batch.means).all()
-    again = encode_mugs(model, dict(yaw_range=(2.0, 2.5)), n_episodes=20)
+    again = encode_mugs(model, draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20))
     assert all(th.equal(a, b) for a, b in zip(batch[:4], again[:4], strict=True))

@@ -241,6 +241,19 @@ def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
     assert_same_parameters(*(parameters(model.policy) for model in models))
 
 
+def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_path):
+    run = replace(tiny_run(), start=tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="nowhere, and there is none: train it first"):
+        complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=4)
+    assert not list(tmp_path.iterdir())
+
+
+def test_runs_that_wait_for_each_other_are_refused(tmp_path):
+    run = replace(tiny_run(), start=tmp_path / "run")
+    with pytest.raises(ValueError, match="wait for each other"):
+        complete_runs([(run, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
+
+
 @pytest.mark.slow
 def test_the_reproduction_runs_in_worker_processes(tmp_path):
     arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]

@@ -9,7 +9,7 @@ from sb3_tdpg.evaluation.figures import (
     save_figure,
     training_curves,
 )
-from sb3_tdpg.evaluation.knowledge import encode_mugs, grasp_knowledge, trv_knowledge
+from sb3_tdpg.evaluation.knowledge import draw_mugs, encode_mugs, grasp_knowledge, trv_knowledge
 from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.records import evaluate_scenarios
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, probability_of_improvement
@@ -23,6 +23,7 @@ __all__ = [
     "comparison_markdown",
     "cost_histograms",
     "diagnosis_bars",
+    "draw_mugs",
     "encode_mugs",
     "evaluate_scenarios",
     "failures_by_yaw",

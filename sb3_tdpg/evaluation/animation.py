@@ -35,6 +35,15 @@ class Episode(NamedTuple):
     pictures: Sequence[np.ndarray]  # T + 1 of (H, W, 3) uint8, of x_0 ... x_T
     trvs: np.ndarray  # (T, Z)
     costs: np.ndarray  # (T,), the last one with the terminal cost
+    between: Sequence[Sequence[np.ndarray]] = ()  # T times what is seen on the way from x_t to x_{t+1}, or nothing
+
+    def film(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield what is seen, with its time in steps."""
+        for t, picture in enumerate(self.pictures):
+            yield float(t), picture
+            between = self.between[t] if t < len(self.between) else ()
+            for i, seen in enumerate(between, start=1):
+                yield t + i / (len(between) + 1), seen
 
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
@@ -58,9 +67,11 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
 
 
 def _ffmpeg() -> str | None:
-    """Return the ffmpeg on the PATH, or else the one that the package imageio-ffmpeg brings."""
-    if (on_path := shutil.which("ffmpeg")) is not None:
-        return on_path
+    """Return the ffmpeg of Matplotlib's settings (by default, on the PATH), or else that of imageio-ffmpeg."""
+    import matplotlib as mpl
+
+    if (found := shutil.which(mpl.rcParams["animation.ffmpeg_path"])) is not None:
+        return found
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -143,15 +154,16 @@ class _Film:
         """Set the figure to one frame after the other; tell whether it is the last one of its episode."""
         for number, episode in enumerate(self.episodes, start=1):
             cost_so_far = np.concatenate([[0.0], episode.costs.cumsum()])
-            for t, picture in enumerate(episode.pictures):
+            for time, picture in episode.film():
+                t = int(time)
                 self._picture.set_data(self._enlarged(picture))
-                self._now.set_xdata([t, t])
+                self._now.set_xdata([time, time])
                 for line, values in zip(self._lines, episode.trvs.T, strict=True):
                     line.set_data(np.arange(len(values))[: t + 1], values[: t + 1])
                 self._axes.set_title(
                     f"episode {number}, step {t}: cost so far {cost_so_far[t]:.2f}", loc="left", fontsize=9, color=INK
                 )
-                yield t == len(episode.pictures) - 1
+                yield time == len(episode.costs)
 
     def image(self) -> Image.Image:
         """Draw the figure as it is set."""

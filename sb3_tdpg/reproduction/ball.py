@@ -40,7 +40,7 @@ from sb3_tdpg.reproduction.common import (
     markdown_table,
     publish_files,
 )
-from sb3_tdpg.runs import read_progress
+from sb3_tdpg.runs import read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 
 # Fixed before any policy was evaluated on the test rows. Seeds below 100 were seen while the blocks were made.
@@ -209,15 +209,16 @@ def reproduce_ball(
     if is_fixed:
         sections += ["## Goals", goals_table(aggregated, GOALS)]
     sections += ["## What the penalty is worth", COMPARISON, comparisons_table(table, COMPARISONS, KINDS)]
-    knowledge = pd.DataFrame(
-        dict(
-            model=m.label,
-            train_seed=seed,
-            **trv_knowledge(TDPG.load(trained.folders[m.label, seed] / "model.zip", device="cpu"), launch_kwargs),
+    with torch_threads(1):  # sums come out the same on any number of cores
+        knowledge = pd.DataFrame(
+            dict(
+                model=m.label,
+                train_seed=seed,
+                **trv_knowledge(TDPG.load(trained.folders[m.label, seed] / "model.zip", device="cpu"), launch_kwargs),
+            )
+            for m in methods
+            for seed in seeds
         )
-        for m in methods
-        for seed in seeds
-    )
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby("model", sort=False).mean().reset_index()
     sections += ["## What the TRVs know", KNOWLEDGE, markdown_table(means, digits=2)]

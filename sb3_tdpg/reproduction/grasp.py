@@ -14,6 +14,7 @@ from sb3_tdpg.envs.scenarios import PANDA_GRASP
 from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
+    draw_mugs,
     encode_mugs,
     failures_by_yaw,
     grasp_knowledge,
@@ -35,7 +36,7 @@ from sb3_tdpg.reproduction.common import (
     markdown_table,
     publish_files,
 )
-from sb3_tdpg.runs import read_progress
+from sb3_tdpg.runs import read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 
 # Seeds below 100 were seen while the blocks were made.
@@ -74,7 +75,9 @@ ESTIMATES = (
     "Of the first PG policy, in nats. A fitted critic's estimate bounds the information from below on fresh mugs; on "
     "those that it was fitted to it does not bound it at all."
 )
-FITTED_MUGS = 400  # as in an epoch
+N_MUGS = 10_000  # for the regression
+N_BOUND = 2_000  # for the bounds, which compare every mug with every other
+FITTED_MUGS = 400  # for MINE, as in an epoch
 CRITICS: Mapping[str, Mapping[str, Any]] = {
     # Without guards, and with one optimiser from beginning to end.
     "MINE, as the paper prints it": dict(
@@ -117,12 +120,12 @@ def reproduce_grasp(
     trained.complete(lambda _: PANDA_GRASP, n_eval_episodes=n_eval_episodes, jobs=jobs)
     folders = trained.folders
 
-    # Where the mug stood, and how it was grasped: enough to carry out each grasp once more.
+    # Where the mug stood, and how it was grasped.
     poses = {f"final_mug_{i}": name for i, name in ((0, "x"), (1, "y"), (3, "yaw"))}
     poses.update({f"final_grasp_{i}": f"grasp_{name}" for i, name in enumerate(("x", "y", "z", "yaw"))})
     records = trained.records().rename(columns=poses)
     columns = ["model", "train_seed", "scenario", "episode", "cost", *poses.values(), "seed", "deterministic"]
-    write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 4)), out / "episodes.csv.xz")
+    write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 6)), out / "episodes.csv.xz")
     rotated = records[records["scenario"] == ROTATION]
     save_figure(failures_by_yaw(rotated), out / "yaw.png")
     first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in METHODS}
@@ -132,19 +135,12 @@ def reproduce_grasp(
     how = provenance()
     write_run_config(out / "config.json", dict(runs=trained.configs, provenance=how))
 
-    rows = []
-    for (label, seed), folder in folders.items():
-        model = TDPG.load(folder / "model.zip", device="cpu")
-        for row in PANDA_GRASP[:2]:
-            mugs = encode_mugs(model, row.env_kwargs)
-            rows.append(
-                dict(model=label, train_seed=seed, poses=row.name.lower(), **grasp_knowledge(mugs), **_bounds(mugs))
-            )
-    knowledge = pd.DataFrame(rows)
+    models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
+    with torch_threads(1):  # sums come out the same on any number of cores
+        knowledge = _knowledge(models)
+        estimates = _estimates(models["PG", FIRST_SEED])
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby(["model", "poses"], sort=False).mean().reset_index()
-
-    estimates = _estimates(TDPG.load(folders["PG", FIRST_SEED] / "model.zip", device="cpu"))
 
     aggregated = aggregate_seeds(records)
     sections = [
@@ -170,6 +166,20 @@ def reproduce_grasp(
     return summary
 
 
+def _knowledge(models: Mapping[tuple[str, int], TDPG]) -> pd.DataFrame:
+    """Tell what every model's TRVs know of the mugs in training and of mugs with any yaw."""
+    rows = []
+    for row in PANDA_GRASP[:2]:
+        mugs = draw_mugs(row.env_kwargs, n_mugs=N_MUGS)
+        for (label, seed), model in models.items():
+            batch = encode_mugs(model, mugs)
+            few = batch.select(th.arange(min(N_MUGS, N_BOUND)))
+            rows.append(
+                dict(model=label, train_seed=seed, poses=row.name.lower(), **grasp_knowledge(batch), **_bounds(few))
+            )
+    return pd.DataFrame(rows)
+
+
 def _bounds(batch: InformationBatch) -> dict[str, float]:
     """Bound the information from below and from above; of two upper bounds the smaller one holds, too."""
     sizes = (batch.states.shape[2], batch.trvs.shape[2])
@@ -179,18 +189,15 @@ def _bounds(batch: InformationBatch) -> dict[str, float]:
 
 def _estimates(model: TDPG) -> pd.DataFrame:
     """Hold what MINE makes of the information against the bounds."""
-    few, fresh = encode_mugs(model, n_episodes=FITTED_MUGS), encode_mugs(model, seed=1)
-    columns = (f"{FITTED_MUGS} mugs", f"{fresh.states.shape[1]} fresh mugs")
-    rows = [
-        dict(zip(("estimate", *columns), (name, _bounds(few)[name], _bounds(fresh)[name]), strict=True))
-        for name in ("lower bound", "upper bound")
-    ]
+    few, fresh = (
+        encode_mugs(model, draw_mugs(n_mugs=n, seed=seed)) for n, seed in ((FITTED_MUGS, 1), (min(N_MUGS, N_BOUND), 2))
+    )
+    rows: list[tuple[str, float, float]] = [(name, _bounds(few)[name], _bounds(fresh)[name]) for name in _bounds(few)]
     for name, settings in CRITICS.items():
         with th.random.fork_rng(devices=[]):
             th.manual_seed(0)
             critic = Mine(1, few.states.shape[2], few.trvs.shape[2], **settings)
             critic.fit(few)
             with th.no_grad():
-                values = (name, critic(few).item(), critic(fresh).item())
-        rows.append(dict(zip(("estimate", *columns), values, strict=True)))
-    return pd.DataFrame(rows)
+                rows.append((name, critic(few).item(), critic(fresh).item()))
+    return pd.DataFrame(rows, columns=["estimate", f"{FITTED_MUGS} mugs", f"{fresh.states.shape[1]} fresh mugs"])
