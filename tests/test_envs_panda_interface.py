@@ -289,7 +289,7 @@ def test_bullet_clients_are_given_back():
 
 
 def test_the_registered_threshold_is_five_failures_in_a_hundred():
-    assert gym.spec("PandaGrasp-v0").reward_threshold == -0.05
+    assert gym.spec("PandaGrasp-v0").reward_threshold == -0.03
 
 
 @pytest.mark.parametrize(("keywords", "message"), [
