@@ -109,7 +109,7 @@ def panda_depth(path: Path) -> None:
     env = grasp("fast")
     env._view.place(env._film[0])
     scene = env._view.scene_picture(768, 1152)
-    seen = enlarge(depth_picture(env._camera.images(np.array([MUG]))[0]), 3)
+    seen = enlarge(depth_picture(env._world.camera.images(np.array([MUG]))[0]), 3)
     env.close()
     small = np.array(Image.fromarray(scene).resize((576, 384), Image.Resampling.LANCZOS))
     Image.fromarray(side_by_side([small, seen])).save(path, optimize=True)

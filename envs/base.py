@@ -45,8 +45,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
-    #: Whether a batch takes as long as its episodes one by one, so that several processes are worth their while.
-    wants_processes: bool = False
+    #: Whether the constructor has a keyword ``n_processes``: how many share the work of a batch.
+    shares_work: bool = False
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
         if not (isinstance(horizon, (int, np.integer)) and horizon >= 1):

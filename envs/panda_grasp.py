@@ -11,8 +11,9 @@ import numpy as np
 from gymnasium import spaces
 
 from .base import POMDPEnv
-from .panda_bullet import LIFTED, MOTIONS, Configuration, GraspSimulation
-from .panda_camera import IMAGE_SIZE, DepthCamera
+from .panda_bullet import LIFTED, MOTIONS, Configuration, Motion
+from .panda_camera import IMAGE_SIZE
+from .panda_pool import GraspPool, GraspWorld
 from .panda_scene import PandaScene
 from .panda_view import PandaView
 
@@ -54,11 +55,12 @@ class PandaGraspEnv(POMDPEnv):
         reference.
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
+    :param n_processes: Processes that share the grasps and the images of a batch; the results are the same.
     :param render_mode: ``None``, ``"rgb_array"`` (the scene beside the depth image) or ``"human"`` (PyBullet's window).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
-    wants_processes = True
+    shares_work = True
 
     def __init__(
         self,
@@ -71,6 +73,7 @@ class PandaGraspEnv(POMDPEnv):
         solver_iterations: int | None = None,
         motion: str = "fast",
         depth_noise_std: float = 0.0,
+        n_processes: int = 1,
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=1, render_mode=render_mode)
@@ -93,12 +96,15 @@ class PandaGraspEnv(POMDPEnv):
             raise ValueError(f"motion={motion!r} must be one of {list(MOTIONS)}")
         if not (np.isfinite(depth_noise_std) and depth_noise_std >= 0):
             raise ValueError(f"depth_noise_std={depth_noise_std} must be finite and not negative (it is sigma, in m)")
+        if not (isinstance(n_processes, (int, np.integer)) and n_processes >= 1):
+            raise ValueError(f"n_processes={n_processes!r} must be an integer of at least 1")
         self.xy_half_width = float(xy_half_width)
         self.yaw_range = low_high
         self.scene = PandaScene(float(mug_scale), float(frame_offset), float(friction))
         self.solver_iterations = solver_iterations
         self.motion = motion
         self.depth_noise_std = float(depth_noise_std)
+        self.n_processes = n_processes
         self.state_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
@@ -109,14 +115,22 @@ class PandaGraspEnv(POMDPEnv):
     # -- Bullet worlds, each made when it is needed, and so in the process that uses it ------------------------------
 
     @cached_property
-    def _simulation(self) -> GraspSimulation:
+    def _world(self) -> GraspWorld:
         self._check_open()
-        return GraspSimulation(self.scene, MOTIONS[self.motion], self.solver_iterations)
+        return GraspWorld(*self._world_arguments)
 
     @cached_property
-    def _camera(self) -> DepthCamera:
+    def _pool(self) -> GraspPool:
         self._check_open()
-        return DepthCamera(self.scene)
+        return GraspPool(self.n_processes, *self._world_arguments)
+
+    @property
+    def _world_arguments(self) -> tuple[PandaScene, Motion, int | None]:
+        return self.scene, MOTIONS[self.motion], self.solver_iterations
+
+    def _workers(self, n: int) -> GraspWorld | GraspPool:
+        """Return what a batch of n mugs is left to."""
+        return self._pool if self.n_processes > 1 and n > 1 else self._world
 
     @cached_property
     def _view(self) -> PandaView:
@@ -133,24 +147,30 @@ class PandaGraspEnv(POMDPEnv):
 
     def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         poses = NOMINAL_GRASP + ACTION_SCALE * action
-        next_state = np.empty_like(state)
-        self._last_details = []
-        for i, (mug, pose) in enumerate(zip(state, poses, strict=True)):
+        if self.render_mode is not None and len(state) == 1:
             self._film = []
-            watch = None if self.render_mode is None else self._film.append
-            next_state[i], contacts = self._simulation.grasp(mug, pose, watch)
-            height = float(next_state[i, 2])
-            success = height > LIFTED
-            self._last_details.append(
-                dict(success=success, is_success=success, mug=mug, mug_height=height, grasp=pose, contacts=contacts)
+            outcomes = self._world.grasps(state, poses, self._film.append)
+        else:
+            outcomes = self._workers(len(state)).grasps(state, poses)
+        next_state = np.array([outcome.state for outcome in outcomes])
+        self._last_details = [
+            dict(
+                success=bool(after[2] > LIFTED),
+                is_success=bool(after[2] > LIFTED),
+                mug=mug,
+                mug_height=float(after[2]),
+                grasp=pose,
+                contacts=outcome.contacts,
             )
+            for mug, pose, after, outcome in zip(state, poses, next_state, outcomes, strict=True)
+        ]
         return next_state
 
     def _details(self) -> Sequence[Mapping[str, Any]]:
         return self._last_details
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
-        return self._with_noise(self._camera.images(state), self.np_random)
+        return self._with_noise(self._workers(len(state)).images(state), self.np_random)
 
     def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return np.zeros(len(state))
@@ -214,13 +234,13 @@ class PandaGraspEnv(POMDPEnv):
         return [PandaView.at_rest((x, y, z), yaw)]
 
     def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
-        (depth,) = self._with_noise(self._camera.images(np.array([state])), np.random.default_rng(0))
+        (depth,) = self._with_noise(self._world.images(np.array([state])), np.random.default_rng(0))
         return depth
 
     def close(self) -> None:
         """Close the Bullet worlds and the window; closing twice is fine."""
         self._is_closed = True
-        for name in ("_simulation", "_camera", "_view"):
+        for name in ("_world", "_pool", "_view"):
             if name in self.__dict__:
                 getattr(self, name).close()
 

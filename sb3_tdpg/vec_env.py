@@ -7,14 +7,9 @@ Dimension key: N environments side by side, X state, U action.
 from __future__ import annotations
 
 import contextlib
-import functools
-import multiprocessing
 import os
-import signal
 import time
-import warnings
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any, cast
 
@@ -23,7 +18,7 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_tdpg.defaults import defaults_for
@@ -141,10 +136,6 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _largest_divisor(n: int, limit: int) -> int:
-    return max(divisor for divisor in range(1, min(n, limit) + 1) if n % divisor == 0)
-
-
 def make_episodes_env(
     env_id: str,
     n_envs: int | None = None,
@@ -157,24 +148,15 @@ def make_episodes_env(
     """
     Vectorise a registered id in the fastest way that this plugin knows.
 
-    ==================================================  ==========================  ===================================
-    environment                                         becomes                     number of environments by default
-    ==================================================  ==========================  ===================================
-    of this plugin                                      :class:`BatchedVecEnv`      ``n_episodes``
-    of this plugin, simulated one by one (PandaGrasp),  :class:`ProcessVecEnv`      the largest divisor of
-    on several cores                                                                ``n_episodes`` up to the cores
-    any other                                           SB3's ``DummyVecEnv``       the largest divisor of
-                                                                                    ``n_episodes`` up to 50
-    ==================================================  ==========================  ===================================
-
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    :param n_envs: Number of environments. One that is simulated one by one has a process for each; with 1, there is
-        none beside this one.
+    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, otherwise its largest
+        divisor up to 50.
     :param n_episodes: Episodes that are to be run at a time; default: as many as TDPG runs in an epoch by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether what is simulated one by one may have processes of its own. Which episodes a seed
-        gives depends on their number, and so on the cores; without them it gives the same on every machine.
+    :param use_processes: Whether an environment that simulates one episode after the other (PandaGrasp) shares this
+        among as many processes as there are cores. It gives the same numbers without them.
+    :return: a :class:`BatchedVecEnv` for an environment of this plugin, SB3's ``DummyVecEnv`` for any other
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
@@ -184,61 +166,18 @@ def make_episodes_env(
     spec = gym.spec(bare_id)
     creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
     if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
-        env = cast(POMDPEnv, creator(**{**spec.kwargs, **env_kwargs}))
-        n_episodes = n_episodes or defaults_for(env.observation_space).n_episodes
-        wants_processes = use_processes and env.wants_processes
-        if wants_processes and (n_processes := n_envs or _largest_divisor(n_episodes, usable_cores())) > 1:
-            env.close()
-            # With a module, so that a process that does not know of the registration comes to know it.
-            make = functools.partial(_make_deaf, f"{module or creator.__module__}:{bare_id}")
-            return make_vec_env(make, n_processes, seed=seed, env_kwargs=env_kwargs, vec_env_cls=ProcessVecEnv)
+        env_class = cast(type[POMDPEnv], creator)
+        if use_processes and env_class.shares_work:
+            env_kwargs.setdefault("n_processes", usable_cores())
+        env = env_class(**{**spec.kwargs, **env_kwargs})
         env.spec = spec
-        vec_env: VecEnv = BatchedVecEnv(env, n_envs or n_episodes)
+        n_envs = n_envs or n_episodes or defaults_for(env.observation_space).n_episodes
+        vec_env: VecEnv = BatchedVecEnv(env, n_envs)
         vec_env.seed(seed)
         return vec_env
     if n_envs is None:
         if n_episodes is None:
             with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
                 n_episodes = defaults_for(probe.observation_space).n_episodes
-        n_envs = _largest_divisor(n_episodes, 50)
+        n_envs = max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
-
-
-class ProcessVecEnv(SubprocVecEnv):
-    """
-    SB3's ``SubprocVecEnv``, whose processes neither end by Ctrl-C nor outlive it, and which names what it refuses.
-
-    :param env_fns: What makes each environment, called in its process.
-    """
-
-    def __init__(self, env_fns: list[Callable[[], gym.Env]]) -> None:
-        # A forked process goes on where this one is. Any other start method imports the user's script once more, which
-        # must then guard what it does by `if __name__ == "__main__"`.
-        start_method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
-        with warnings.catch_warnings():
-            # From Python 3.12 on a fork warns of the threads of PyTorch; the processes do not call PyTorch.
-            warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
-            super().__init__(env_fns, start_method)
-        # They would not notice: a forked process holds the pipes of those before it open.
-        weakref.finalize(self, _terminate, self.processes)
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """Hand the actions over, ``(N, U)``."""
-        if not np.all(np.isfinite(actions)):
-            # Here and not in the process, whose error would arrive as an EOFError that says nothing.
-            raise ValueError(
-                f"an action is not finite: {actions[~np.isfinite(actions).all(-1)][0]}; "
-                "the policy that produced it has probably diverged"
-            )
-        super().step_async(actions)
-
-
-def _terminate(processes: Sequence[Any]) -> None:
-    for process in processes:
-        process.terminate()
-
-
-def _make_deaf(env_id: str, **env_kwargs: Any) -> gym.Env:
-    """Make an environment in a process that does not hear Ctrl-C: the one that it serves decides what is to be done."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return gym.make(env_id, **env_kwargs)

@@ -92,7 +92,7 @@ def test_the_paper_s_slow_motion_lifts_the_mug_too_and_has_the_fast_one_s_result
 
 def hit_from_above(env, state, point):
     """Height of what a ray straight down meets at a point (x, y) of the cup's frame: (0, 0) is its axis."""
-    simulation = env._simulation
+    simulation = env._world.simulation
     simulation._restore(np.asarray(state))
     cos, sin = np.cos(state[3]), np.sin(state[3])
     x, y = point[0], point[1] - env.scene.frame_offset
@@ -120,7 +120,7 @@ def test_the_mug_is_hollow_has_a_wall_all_around_and_a_handle(scale):
 
 
 def test_a_finger_fits_between_handle_and_mug(shared):
-    simulation = shared._simulation
+    simulation = shared._world.simulation
     simulation._restore(np.array([0.5, 0.012, 0.0, 0.0]))  # the axis through (0.5, 0), the handle along +y
 
     def through_the_hole(y):
@@ -149,16 +149,16 @@ def test_the_handle_can_block_a_grasp(shared):
 
 
 def test_all_shapes_of_the_mug_arrive_in_bullet(shared):
-    assert len(shared._simulation.client.getCollisionShapeData(shared._simulation._mug, -1)) == 16
+    assert len(shared._world.simulation.client.getCollisionShapeData(shared._world.simulation._mug, -1)) == 16
     assert len(shared.scene.collision_shapes()) == 16
 
 
 def test_the_mug_stands_still_when_nothing_touches_it(shared):
     state = np.array([0.5, 0.02, 0.0, 0.4])
-    shared._simulation._restore(state)
+    shared._world.simulation._restore(state)
     for _ in range(240):
-        shared._simulation.client.stepSimulation()
-    np.testing.assert_allclose(shared._simulation._mug_state(0.4), state, atol=5e-4)
+        shared._world.simulation.client.stepSimulation()
+    np.testing.assert_allclose(shared._world.simulation._mug_state(0.4), state, atol=5e-4)
 
 
 # -- actions ---------------------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ def test_an_action_is_a_tenth_around_the_nominal_grasp_and_is_clipped_to_the_bou
 
 
 def test_the_hand_gets_to_where_the_action_says_all_over_the_action_space(shared):
-    simulation, empty = shared._simulation, np.array([0.5, 0.5, 0.0, 0.0])
+    simulation, empty = shared._world.simulation, np.array([0.5, 0.5, 0.0, 0.0])
     low, high = shared.action_space.low.astype(float), shared.action_space.high.astype(float)
     for corner in np.ndindex(3, 3, 2, 3):
         pose = NOMINAL_GRASP + 0.1 * (low + np.array(corner) / [2, 2, 1, 2] * (high - low))
@@ -263,7 +263,7 @@ def leaked(n):
             env.step_batch(states, mixed_actions(states, seed=start), is_last=True)
 
     def bodies():
-        return env._simulation.client.getNumBodies(), env._camera.client.getNumBodies()
+        return env._world.simulation.client.getNumBodies(), env._world.camera.client.getNumBodies()
 
     trials(100)
     before, bodies_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, bodies()

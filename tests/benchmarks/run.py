@@ -326,7 +326,7 @@ class GraspTrials:
     def restore(self) -> None:
         """What brings the world back to its beginning."""
         for state in self.states:
-            self.env._simulation._restore(state)
+            self.env._world.simulation._restore(state)
 
     def rebuild(self) -> None:
         """Make the world anew."""
@@ -340,8 +340,8 @@ class GraspTrials:
 
         self.run()
         whole, restore = median(self.run), median(self.restore)
-        depth = median(lambda: self.env._camera.images(self.states))
-        simulation = median(lambda: self.grasp(self.env._simulation)) - restore
+        depth = median(lambda: self.env._world.camera.images(self.states))
+        simulation = median(lambda: self.grasp(self.env._world.simulation)) - restore
         return (
             f"PandaGrasp-v0, fast motion: {1 / whole:.0f} trials a second of CPU time. A trial takes "
             f"{format_time(whole)}: reset of the world {format_time(restore)}, two depth images "
@@ -357,7 +357,7 @@ def bench_grasp(sizes: Sizes) -> Iterable[Row]:
     slow = GraspSimulation(trials.env.scene, MOTIONS["reference"])
     yield compare(
         "grasp: the fast motion against the paper's",
-        lambda: seconds(lambda: trials.grasp(trials.env._simulation), trials.n),
+        lambda: seconds(lambda: trials.grasp(trials.env._world.simulation), trials.n),
         lambda: seconds(lambda: few.grasp(slow), some),
         sizes.loop_repetitions,
     )
@@ -371,7 +371,7 @@ def bench_grasp(sizes: Sizes) -> Iterable[Row]:
     with_table.client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
     yield compare(
         "depth image: the mug drawn before a known table against mug and table",
-        lambda: seconds(lambda: trials.env._camera.images(trials.states), trials.n),
+        lambda: seconds(lambda: trials.env._world.camera.images(trials.states), trials.n),
         lambda: seconds(lambda: with_table.images(trials.states), trials.n),
         sizes.repetitions,
     )
