@@ -55,8 +55,8 @@ def test_every_block_trains_for_an_epoch(block):
         cheap = {}
     if "batch_size" in settings:
         cheap["batch_size"] = 20
-    training = make_training(env_id_of(block), settings, n_timesteps=100, n_episodes=20, seed=0, **cheap)
-    training.model.learn(training.n_timesteps, training.callbacks)
+    training = make_training(env_id_of(block), settings, n_episodes=20, seed=0, **cheap)
+    training.model.learn(20 * training.model.horizon, training.callbacks)
     assert training.model.epoch == 1
 
 

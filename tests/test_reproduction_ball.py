@@ -11,7 +11,7 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.envs.ball_catch import RENDERERS
 from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.reproduction import ball
+from sb3_tdpg.reproduction import ball, common
 from sb3_tdpg.runs import Run, complete_run
 
 
@@ -27,8 +27,8 @@ def tiny(monkeypatch):
         ),
     )
     monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
-    for name in ("aggregate_seeds", "probability_of_improvement"):
-        monkeypatch.setattr(ball, name, partial(getattr(ball, name), n_bootstrap=10))
+    for module, name in ((ball, "aggregate_seeds"), (common, "probability_of_improvement")):
+        monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     asked = []
 
     def complete_runs(tasks, *, n_eval_episodes, jobs):

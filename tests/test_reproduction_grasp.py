@@ -1,5 +1,6 @@
 """The reproduction of grasping with tiny settings, from nothing to tables, figures and records."""
 
+import math
 from functools import partial
 
 import numpy as np
@@ -103,7 +104,7 @@ def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_widt
 
 def test_the_mugs_that_a_policy_is_shown_are_those_of_the_environment(monkeypatch):
     monkeypatch.setattr(knowledge, "MUGS_AT_A_TIME", 8)
-    model = TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), n_episodes=4, batch_size=4, device="cpu")
+    model = TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), beta=math.inf, n_episodes=4, device="cpu")
     mugs = draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20)
     assert ((mugs.poses[:, 3] >= 2.0) & (mugs.poses[:, 3] <= 2.5)).all()
     batch = encode_mugs(model, mugs)
