@@ -126,7 +126,7 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
         axes.set_xlabel("policy epoch", fontsize=9)
         axes.grid(alpha=0.25)
         _tidy(axes)
-    cost.legend(frameon=False)
+    _legend_above(figure, cost)
     return figure
 
 
