@@ -295,3 +295,14 @@ def test_the_one_line_training_in_miniature():
     assert model.epoch == 2
     records = evaluate_scenarios(model, BALL_CATCH[:2], 4)
     assert np.isfinite(records["cost"]).all()
+
+
+def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping_network():
+    """Two epochs of real grasps, from the line that the documentation shows."""
+    model = TDPG("TRVPolicy", "PandaGrasp-v0", n_episodes=16, device="cpu").learn(2 * 16)
+    assert model.epoch == 2
+    assert (model.beta, model.cost_limit, model.mi_estimator) == ("auto", 0.03, "logdet")
+    assert (model.n_epochs, model.batch_size, model.clip_range, model.policy.trv_dim) == (4, 16, 0.2, 16)
+    model.env.close()
+    model = TDPG("TRVPolicy", "PandaGrasp-v0", device="cpu")
+    assert (model.n_episodes, model.batch_size, model.env.num_envs) == (400, 200, 400)
