@@ -188,22 +188,6 @@ class BallCatchEnv(POMDPEnv):
 
     # -- pictures -----------------------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; see :class:`gymnasium.Env`."""
-        result = super().reset(seed=seed, options=options)
-        if self.render_mode == "human":
-            self.render()
-        return result
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply one control; see :class:`gymnasium.Env`."""
-        result = super().step(action)
-        if self.render_mode == "human":
-            self.render()
-        return result
-
     def render(self) -> np.ndarray | None:
         """
         Draw the scene from the side, beside the camera's image: ``(256, 772, 3)`` uint8; or move it in the window.

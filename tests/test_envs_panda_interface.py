@@ -268,9 +268,18 @@ def test_a_window_without_a_display_is_refused_with_the_mend(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     window = PandaGraspEnv(render_mode="human")
-    window.reset(seed=0)
     with pytest.raises(RuntimeError, match=r"DISPLAY is not set.*render_mode='rgb_array'"):
-        window.render()
+        window.reset(seed=0)  # which draws, as Gymnasium has it
+
+
+def test_the_window_is_drawn_by_reset_and_by_each_step(env, monkeypatch):
+    calls = []
+    monkeypatch.setattr(env, "render", lambda: calls.append(env._time))
+    for mode, expected in ((None, []), ("rgb_array", []), ("human", [0, 1])):
+        monkeypatch.setattr(env, "render_mode", mode)
+        env.reset(seed=0)
+        env.step(np.zeros(4, np.float32))
+        assert calls == expected
 
 
 # -- opening and closing ---------------------------------------------------------------------------------------------
