@@ -312,6 +312,15 @@ def test_the_provenance_is_complete_and_plain_json():
     assert {"platform", "cpu_count", "utc_time", "command"} <= set(found)
 
 
+def test_the_command_is_told_without_the_folders_of_the_machine(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "results" / "a b"
+    monkeypatch.setattr(
+        sys, "orig_argv", [str(tmp_path / "bin" / "python3"), "-m", "sb3_tdpg", "--out", str(out), "./x"]
+    )
+    assert provenance()["command"] == "python3 -m sb3_tdpg --out 'results/a b' ./x"
+
+
 @pytest.mark.parametrize("in_checkout_of_something_else", [False, True])
 def test_the_provenance_knows_no_commit_of_an_installed_package(in_checkout_of_something_else, monkeypatch, tmp_path):
     if in_checkout_of_something_else:

@@ -44,7 +44,7 @@ def provenance() -> dict[str, Any]:
         torch_threads=th.get_num_threads(),
         cuda_device=th.cuda.get_device_name() if th.cuda.is_available() else None,
         utc_time=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        command=shlex.join(sys.orig_argv),
+        command=_command(),
     )
 
 
@@ -89,6 +89,14 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+def _command() -> str:
+    """Return the command line without the folders of this machine: relative to where it was run."""
+    interpreter, *arguments = sys.orig_argv
+    here = Path.cwd()
+    relative = [str(Path(a).relative_to(here)) if Path(a).is_relative_to(here) else a for a in arguments]
+    return shlex.join([Path(interpreter).name, *relative])
 
 
 def _git() -> dict[str, Any] | None:
