@@ -1,4 +1,4 @@
-"""The depth camera of the grasping scene: PyBullet draws the mug alone, the table behind it is known."""
+"""The depth camera of the grasping scene: PyBullet draws the mug alone; the table and what is in the mug are known."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ class DepthCamera:
     A Bullet world of its own with nothing in it but the mug's mesh.
 
     Drawing table and mug takes 5 ms an image. The table's depth is the same in every image and follows from geometry,
-    so that the mug alone is drawn, in 1.4 ms, and of the two the nearer one is seen: the same to 3e-6 m.
+    so that the mug alone is drawn, in 1.4 ms, and of the two the nearer one is seen: the same to 3e-6 m. So it is
+    with the surface of a drink, a disc.
 
     :param scene: Size and frame of the mug.
     """
@@ -28,6 +29,7 @@ class DepthCamera:
     def __init__(self, scene: PandaScene) -> None:
         self.client = client = BulletClient()
         self._mug = add_mug_picture(client, scene)
+        self._scene = scene
         view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
         projection = client.computeProjectionMatrix(*EDGES, NEAR, FAR)
         self._camera = dict(
@@ -44,17 +46,29 @@ class DepthCamera:
         turn_and_shift = np.array(view).reshape(4, 4).T
         self.rotation = turn_and_shift[:3, :3]  # from the world's axes to right, up and backward
         self.eye = -self.rotation.T @ turn_and_shift[:3, 3]
+        self._rays = self._rays_of_pixels()
         self.table_depth = self._depth_of_plane(0.0)
 
-    def _depth_of_plane(self, z: float) -> np.ndarray:
-        """Depth of a level plane without end, ``(128, 128)``, along the axis of view as every depth here."""
+    def _rays_of_pixels(self) -> np.ndarray:
+        """Return what is seen at a depth of 1 m, from the eye: ``(128, 128, 3)``."""
         left, right, bottom, top = EDGES
         # TinyRenderer samples a pixel at its lower left corner. The first row is the uppermost.
         corner = np.arange(IMAGE_SIZE) / IMAGE_SIZE
         to_right = (left + (right - left) * corner) / NEAR
         upward = (bottom + (top - bottom) * corner[::-1]) / NEAR
-        rays = np.stack(np.broadcast_arrays(to_right[None, :], upward[:, None], -1.0), axis=-1) @ self.rotation
-        return (z - self.eye[2]) / rays[..., 2]
+        rays: np.ndarray = np.stack(np.broadcast_arrays(to_right[None, :], upward[:, None], -1.0), axis=-1)
+        return rays @ self.rotation
+
+    def _depth_of_plane(self, z: float) -> np.ndarray:
+        """Depth of a level plane without end, ``(128, 128)``, along the axis of view as every depth here."""
+        return (z - self.eye[2]) / self._rays[..., 2]
+
+    def _depth_of_drink(self, x: float, y: float, z: float, yaw: float, level: float) -> np.ndarray:
+        """Depth of the surface of a drink, ``(128, 128)``; infinite beside it."""
+        depth = self._depth_of_plane(z + level)
+        axis = np.array([x, y]) + self._scene.frame_offset * np.array([np.sin(yaw), -np.cos(yaw)])
+        from_axis = self.eye[:2] + depth[..., None] * self._rays[..., :2] - axis
+        return np.where(np.hypot(from_axis[..., 0], from_axis[..., 1]) < self._scene.drink_radius, depth, np.inf)
 
     def pixel(self, point: np.ndarray) -> tuple[float, float, float]:
         """Return row, column and depth of a point, ``(3,)``, of the world."""
@@ -66,13 +80,20 @@ class DepthCamera:
         return float(row), float(column), float(depth)
 
     def images(self, state: np.ndarray) -> np.ndarray:
-        """Return one depth image for each state of the mug: ``(N, 1, 128, 128)`` float32 in m from ``(N, 4)``."""
+        """
+        Return one depth image for each state of the mug.
+
+        :param state: ``(N, 4)``, or ``(N, 5)`` with the level of what is in it.
+        :return: ``(N, 1, 128, 128)`` float32 in m
+        """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client
-        for image, (x, y, z, yaw) in zip(images, state.tolist(), strict=True):
+        for image, (x, y, z, yaw, *level) in zip(images, state.tolist(), strict=True):
             client.resetBasePositionAndOrientation(self._mug, (x, y, z), client.getQuaternionFromEuler((0, 0, yaw)))
             buffer = np.asarray(client.getCameraImage(**self._camera)[3], np.float64).reshape(IMAGE_SIZE, IMAGE_SIZE)
             image[0] = np.minimum(self._far * NEAR / (self._far - (self._far - NEAR) * buffer), self.table_depth)
+            if level:
+                np.minimum(image[0], self._depth_of_drink(x, y, z, yaw, *level), out=image[0])
         return images
 
     def close(self) -> None:

@@ -53,7 +53,7 @@ class GraspWorld:
         return [self.simulation.grasp(mug, pose, watch) for mug, pose in zip(states, poses, strict=True)]
 
     def images(self, states: np.ndarray) -> np.ndarray:
-        """Draw one depth image for each mug: ``(N, 1, 128, 128)`` from ``(N, 4)``."""
+        """See :meth:`~sb3_tdpg.envs.panda_camera.DepthCamera.images`."""
         return self.camera.images(states)
 
     def close(self) -> None:

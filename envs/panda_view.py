@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cached_property
 
 import numpy as np
 
@@ -10,7 +11,16 @@ from .ball_view import enlarge
 from .bullet import BulletClient
 from .panda_bullet import ARM_JOINTS, FINGER_JOINTS, FINGER_OPEN, HOME, Configuration
 from .panda_camera import IMAGE_SIZE
-from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, UNTURNED, PandaScene, add_mug_picture
+from .panda_scene import (
+    ASSETS,
+    ROBOT_FILE,
+    TABLE_FILE,
+    TABLE_POSITION,
+    UNTURNED,
+    PandaScene,
+    add_drink_picture,
+    add_mug_picture,
+)
 
 HEIGHT, WIDTH = 256, 384  # pixels of the view
 MIDDLE = (0.38, 0.0, 0.2)  # m, what it looks at
@@ -39,12 +49,16 @@ class PandaView:
         client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
         self._robot = int(client.loadURDF(ROBOT_FILE, useFixedBase=True))
         self._mug = add_mug_picture(client, scene)
-        self._cup_origin = scene.cup_origin.tolist()
+        self._scene = scene
         # TinyRenderer throws no shadow on the table, and without one a picture does not tell whether the mug is lifted.
         shadow = client.createVisualShape(
             client.GEOM_CYLINDER, radius=scene.mug_radius, length=0.001, rgbaColor=SHADOW_COLOR, specularColor=[0, 0, 0]
         )
         self._shadow = int(client.createMultiBody(baseVisualShapeIndex=shadow))
+
+    @cached_property
+    def _drink(self) -> int:
+        return add_drink_picture(self.client, self._scene)
 
     @staticmethod
     def at_rest(position: tuple[float, float, float], yaw: float) -> Configuration:
@@ -53,17 +67,30 @@ class PandaView:
         orientation = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
         return Configuration((*HOME, FINGER_OPEN, FINGER_OPEN), position, orientation)
 
-    def place(self, configuration: Configuration) -> None:
-        """Put everything where it is at one instant."""
+    def place(self, configuration: Configuration, level: float | None = None) -> None:
+        """
+        Put everything where it is at one instant.
+
+        :param configuration: Of robot and mug.
+        :param level: Of what is in the mug, in m; ``None``: it is empty.
+        """
         for joint, value in zip((*ARM_JOINTS, *FINGER_JOINTS), configuration.joints, strict=True):
             self.client.resetJointState(self._robot, joint, value)
         self.client.resetBasePositionAndOrientation(
             self._mug, configuration.mug_position, configuration.mug_orientation
         )
-        (x, y, _), _ = self.client.multiplyTransforms(
-            configuration.mug_position, configuration.mug_orientation, self._cup_origin, UNTURNED
-        )
+        (x, y, _), _ = self._in_cup(configuration, 0.0)
         self.client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
+        if level is not None:
+            self.client.resetBasePositionAndOrientation(self._drink, *self._in_cup(configuration, level))
+
+    def _in_cup(self, configuration: Configuration, height: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Position and orientation of a level surface in the cup."""
+        right, ahead, _ = self._scene.cup_origin.tolist()
+        position, orientation = self.client.multiplyTransforms(
+            configuration.mug_position, configuration.mug_orientation, (right, ahead, height), UNTURNED
+        )
+        return position, orientation
 
     def picture(self, depth: np.ndarray) -> np.ndarray:
         """

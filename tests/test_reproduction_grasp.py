@@ -12,8 +12,15 @@ from small_problems import complete_runs_here
 from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
-from sb3_tdpg.envs.scenarios import PANDA_GRASP
-from sb3_tdpg.evaluation import draw_mugs, encode_mugs, failures_by_yaw, grasp_knowledge, knowledge
+from sb3_tdpg.envs.scenarios import PANDA_DRINK, PANDA_GRASP
+from sb3_tdpg.evaluation import (
+    draw_mugs,
+    encode_mugs,
+    failures_by_level,
+    failures_by_yaw,
+    grasp_knowledge,
+    knowledge,
+)
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.reproduction import common, grasp
@@ -50,6 +57,25 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     assert set(records["cost"]) <= {0.0, 1.0}
 
 
+def test_mugs_with_a_drink_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
+    arguments = ["--n-seeds", "2", "--n-eval-episodes", "3", "--n-timesteps", "8"]
+    assert main(["reproduce", "grasp-drink", "--out", str(tmp_path), *arguments]) == 0
+    summary = (tmp_path / "summary.md").read_text()
+    for text in ("Opposite level", "Empty mug", "make reproduce-grasp-drink"):
+        assert text in summary
+    assert "Goals" not in summary
+    assert (tmp_path / "level.png").exists()
+    assert not (tmp_path / "yaw.png").exists()
+    records = pd.read_csv(tmp_path / "episodes.csv.xz")
+    assert len(records) == 3 * 2 * 4 * 3
+    low, high = PANDA_DRINK["level_range"]
+    assert records["level"].dropna().between(low, high).all()
+    assert set(records["scenario"][records["level"].isna()]) == {"Empty mug"}
+    knowledge = pd.read_csv(tmp_path / "knowledge.csv")
+    assert set(knowledge["mugs"]) == {"training", "any level"}
+    assert knowledge["level"].between(0, 1).all()
+
+
 def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
     run = Run("PG", "PandaGrasp-v0", "PandaGrasp-v0-pg", 0, {"n_timesteps": 8})
     complete_run(run, tmp_path, PANDA_GRASP[:1], n_eval_episodes=6)
@@ -62,16 +88,23 @@ def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
     np.testing.assert_array_equal(outcomes, records["cost"])
 
 
-def test_the_control_differs_from_tdpg_in_nothing_but_the_penalty():
-    methods = {method.label: method for method in grasp.METHODS}
+@pytest.mark.parametrize("mug", grasp.EXPERIMENTS)
+def test_the_control_differs_from_tdpg_in_nothing_but_the_penalty(mug):
+    methods = {method.label: method for method in grasp.EXPERIMENTS[mug].methods}
     tdpg, control = ({**load_hyperparams(m.block), **m.overrides} for m in (methods["TDPG"], methods["its control"]))
     assert methods["TDPG"].start == methods["its control"].start == "PG"
     assert {key for key in tdpg if tdpg[key] != control.get(key)} == {"beta", "cost_limit"}
     assert set(tdpg) == set(control)
 
 
+def test_the_training_row_of_a_drink_is_what_the_blocks_train_on():
+    for method in grasp.EXPERIMENTS["drink"].methods:
+        kwargs = load_hyperparams(method.block)["env_kwargs"]
+        assert {name: kwargs[name] for name in PANDA_DRINK} == {k: pytest.approx(v) for k, v in PANDA_DRINK.items()}
+
+
 def test_every_goal_is_of_a_row_and_a_method():
-    assert set(grasp.GOALS) <= {method.label for method in grasp.METHODS}
+    assert set(grasp.GOALS) <= {method.label for method in grasp.EXPERIMENTS["empty"].methods}
     for goals in grasp.GOALS.values():
         assert set(goals) == {row.name for row in PANDA_GRASP}
 
@@ -86,6 +119,27 @@ def test_the_failures_are_drawn_in_the_sector_of_their_yaw():
     assert angles[5] == pytest.approx(5.5 * 2 * np.pi / 24)
 
 
+def test_the_failures_are_drawn_over_what_the_level_gets_wrong():
+    error = np.repeat([-0.05, -0.01, 0.01, 0.05], 5)
+    cost = np.repeat([1.0, 0.0, 0.0, 0.4], 5)
+    figure = failures_by_level(pd.DataFrame(dict(model="PG", error=error, cost=cost)), n_bins=4)
+    (line,) = figure.axes[0].lines
+    middles, shares = line.get_data()
+    np.testing.assert_allclose(middles, [-3.75, -1.25, 1.25, 3.75])
+    np.testing.assert_allclose(shares, [1.0, 0.0, 0.0, 0.4])
+
+
+@pytest.mark.parametrize("mug", ["as the level tells", "elsewhere"])
+def test_the_level_s_error_is_nothing_where_it_tells_x(monkeypatch, mug):
+    seen = []
+    monkeypatch.setattr(grasp, "failures_by_level", seen.append)
+    shift = 0.0 if mug == "as the level tells" else 0.02
+    (low, high), x = PANDA_DRINK["level_range"], np.linspace(0.45, 0.55, 5)
+    level = low + (high - low) * (x - 0.45) / 0.1
+    grasp._draw_level(pd.DataFrame(dict(scenario="Any level", x=x - shift, level=level)))
+    np.testing.assert_allclose(seen[0]["error"], shift, atol=1e-12)
+
+
 @pytest.mark.parametrize("half_width", [np.pi, np.pi / 4])
 def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_width):
     poses = th.tensor(np.random.default_rng(0).uniform(-1, 1, (1, 20_000, 4)) * [0.1, 0.1, 0, half_width])
@@ -97,6 +151,9 @@ def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_widt
     known = grasp_knowledge(InformationBatch(poses, told, told, th.ones_like(told)))
     assert known["x"] > 0.99
     assert known["y"] < 0.02
+    assert "level" not in known
+    with_level = th.cat([poses, noise[..., 2:3]], dim=-1)
+    assert grasp_knowledge(InformationBatch(with_level, told, told, th.ones_like(told)))["level"] > 0.99
     share = (sine.var() / (sine.var() + th.cos(poses[..., 3]).var())).item()
     assert known["yaw"] == pytest.approx(0.25 * share, abs=0.08)
     assert known["yaw"] > 0.05

@@ -220,6 +220,30 @@ def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
     return figure
 
 
+def failures_by_level(records: pd.DataFrame, *, n_bins: int = 20) -> Figure:
+    """
+    Draw the share of failed grasps over how far the level of a drink is from telling where the mug stands.
+
+    :param records: Episodes with the columns ``model``, ``error`` (where the level would have the mug minus where it
+        is, along x, in m) and ``cost`` (1 for a failure).
+    :param n_bins: Parts of the range of the error.
+    """
+    figure = _new_figure(WIDTH * 0.7, 3.2)
+    axes = figure.add_subplot()
+    _tidy(axes)
+    centimetres = 100 * records["error"]
+    edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
+    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
+        part = np.digitize(centimetres[group.index], edges) - 1
+        share = group["cost"].groupby(part).mean().reindex(range(n_bins))
+        axes.plot((edges[:-1] + edges[1:]) / 2, share, color=color, label=str(label), marker=".")
+    axes.set_xlabel("x as the level tells it, minus the mug's x, in cm", fontsize=9)
+    axes.set_ylabel("share of failed grasps", fontsize=9)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> None:
     """
     Write a figure so that at no time a half-written file is there.

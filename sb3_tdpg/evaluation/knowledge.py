@@ -74,7 +74,7 @@ def trv_knowledge(
 class Mugs(NamedTuple):
     """N mugs of the grasping problem, and what the camera shows of them."""
 
-    poses: np.ndarray  # (N, 4): x, y, z, yaw
+    poses: np.ndarray  # (N, 4): x, y, z, yaw; with a drink (N, 5), the last its level
     images: np.ndarray  # (N, 1, 128, 128)
 
 
@@ -101,7 +101,7 @@ def encode_mugs(model: Any, mugs: Mugs, *, seed: int = 0) -> InformationBatch:
     :param model: A model of ``PandaGrasp-v0``.
     :param mugs: N of them.
     :param seed: Seed of the policy's sampling.
-    :return: poses ``(1, N, 4)`` as states, TRVs, means and standard deviations ``(1, N, Z)``
+    :return: what is in :class:`Mugs` as states, ``(1, N, 4 or 5)``; TRVs, means and standard deviations ``(1, N, Z)``
     """
     steps = []
     with isolated_randomness(evaluation_seeds(seed).policy, model), th.no_grad():
@@ -121,13 +121,16 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     It is too low by about the number of these (152 for 16 TRVs) over half the number of mugs.
 
     :param batch: From :func:`encode_mugs`, with an even number of mugs.
-    :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (of its sine and cosine together)
+    :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (of its sine and cosine together), and of the
+        ``"level"`` of a drink
     """
-    x, y, _, yaw = batch.states[0].numpy().astype(np.float64).T
+    x, y, _, yaw, *level = batch.states[0].numpy().astype(np.float64).T
     trvs = batch.trvs[0].numpy().astype(np.float64)
     row, column = np.triu_indices(trvs.shape[1])
     known = np.concatenate([trvs, trvs[:, row] * trvs[:, column]], axis=1)[None]
     targets = dict(x=x[:, None], y=y[:, None], yaw=np.stack([np.sin(yaw), np.cos(yaw)], axis=1))
+    if level:
+        targets["level"] = level[0][:, None]
     return {name: _r2(known, target[None], pooled=True) for name, target in targets.items()}
 
 

@@ -1,21 +1,23 @@
-"""Grasping from training to Table III: policy gradient, TDPG, and the control of the penalty."""
+"""Grasping from training to tables: policy gradient, TDPG, and the control of the penalty."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import torch as th
 
-from sb3_tdpg.envs.scenarios import PANDA_GRASP
+from sb3_tdpg.envs.scenarios import PANDA_DRINK, PANDA_GRASP, PANDA_GRASP_DRINK, Scenario
 from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
     draw_mugs,
     encode_mugs,
+    failures_by_level,
     failures_by_yaw,
     grasp_knowledge,
     provenance,
@@ -39,10 +41,15 @@ from sb3_tdpg.reproduction.common import (
 from sb3_tdpg.runs import read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 # Seeds below 100 were seen while the blocks were made.
 FIRST_SEED = 100
 
 TRAINING, ROTATION, TRANSLATION = (row.name for row in PANDA_GRASP)
+
+TRAINING_X = (0.45, 0.55)  # m
 
 # The largest interquartile mean over seeds of the share of failures, by method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
@@ -50,15 +57,76 @@ GOALS: Mapping[str, Mapping[str, float]] = {
     "TDPG": {TRAINING: 0.03, ROTATION: 0.08, TRANSLATION: 0.15},
 }
 
-# The control differs from TDPG in nothing but the penalty.
-SECOND_STAGE = dict(n_timesteps=8_000)
-METHODS: tuple[Method, ...] = (
-    Method("PG", "PandaGrasp-v0-pg"),
-    Method("TDPG", "PandaGrasp-v0", "PG", overrides=SECOND_STAGE),
-    Method("its control", "PandaGrasp-v0-pg", "PG", overrides=SECOND_STAGE),
-)
 COMPARISONS = (("TDPG", "its control"), ("TDPG", "PG"))
-KINDS = {name.lower(): (name,) for name in (TRAINING, ROTATION, TRANSLATION)}
+SECOND_STAGE = dict(n_timesteps=8_000)
+
+
+def _methods(block: str) -> tuple[Method, ...]:
+    """Return PG, and TDPG and its control from there, which differ in nothing but the penalty."""
+    return (
+        Method("PG", f"{block}-pg"),
+        Method("TDPG", block, "PG", overrides=SECOND_STAGE),
+        Method("its control", f"{block}-pg", "PG", overrides=SECOND_STAGE),
+    )
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """
+    What is trained on which mugs, and shown how.
+
+    :param title: Of the summary.
+    :param command: What makes it.
+    :param methods: The columns of the table.
+    :param rows: Its rows. Of the mugs of the first two is told what the TRVs know.
+    :param figure: File name of a figure of failures.
+    :param draw: What draws it, from the records.
+    :param goals: Largest share of failures by method and row.
+    :param compares_estimates: Whether MINE's estimates are held against the bounds.
+    """
+
+    title: str
+    command: str
+    methods: tuple[Method, ...]
+    rows: Sequence[Scenario]
+    figure: str
+    draw: Callable[[pd.DataFrame], Figure]
+    goals: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    compares_estimates: bool = False
+
+
+def _draw_yaw(records: pd.DataFrame) -> Figure:
+    return failures_by_yaw(records[records["scenario"] == ROTATION])
+
+
+def _draw_level(records: pd.DataFrame) -> Figure:
+    first, last = PANDA_DRINK["level_range"]
+    of_row = records[records["scenario"] == PANDA_GRASP_DRINK[1].name]
+    low, high = TRAINING_X
+    told = low + (high - low) * (of_row["level"] - first) / (last - first)
+    return failures_by_level(of_row.assign(error=told - of_row["x"]))
+
+
+EXPERIMENTS = {
+    "empty": Experiment(
+        "Grasping (Table III)",
+        "make reproduce-grasp",
+        _methods("PandaGrasp-v0"),
+        PANDA_GRASP,
+        "yaw.png",
+        _draw_yaw,
+        GOALS,
+        compares_estimates=True,
+    ),
+    "drink": Experiment(
+        "Grasping (mugs with a drink)",
+        "make reproduce-grasp-drink",
+        _methods("PandaGrasp-v0-drink"),
+        PANDA_GRASP_DRINK,
+        "level.png",
+        _draw_level,
+    ),
+}
 
 QUANTITY = "share of failed grasps"
 COMPARISON = (
@@ -66,10 +134,10 @@ COMPARISON = (
     "is no difference."
 )
 KNOWLEDGE = (
-    "Share of the variance (R^2 on mugs left out of the regression, mean over seeds) of the mug's position and of the "
-    "sine and cosine of its yaw that TRVs, their squares and products explain; in training, and with all yaws. And "
-    "bounds on the information in nats: I[x; x~] itself lies between them, since the image is a function of the mug's "
-    "pose and there is no memory. The lower one cannot exceed ln 2000 = 7.6."
+    "Share of the variance (R^2 on mugs left out of the regression, mean over seeds) of what makes a mug's image (of "
+    "its yaw: of sine and cosine) that TRVs, their squares and products explain, on mugs of two rows of the table. And "
+    "bounds on the information in nats: I[x; x~] itself lies between them, since the image is a function of the state "
+    "and there is no memory. The lower one cannot exceed ln 2000 = 7.6."
 )
 ESTIMATES = (
     "Of the first PG policy, in nats. A fitted critic's estimate bounds the information from below on fresh mugs; on "
@@ -95,6 +163,7 @@ CRITICS: Mapping[str, Mapping[str, Any]] = {
 def reproduce_grasp(
     out: Path,
     *,
+    mug: str = "empty",
     n_seeds: int = 5,
     n_eval_episodes: int = 1000,
     n_timesteps: int | None = None,
@@ -102,11 +171,12 @@ def reproduce_grasp(
     publish: Path | None = None,
 ) -> str:
     """
-    Train every method with several seeds, evaluate it on the rows of Table III; write tables, figures and records.
+    Train every method with several seeds, evaluate it on every row; write tables, figures and records.
 
     Finished runs are kept: the same call goes on where an interrupted one stopped.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
+    :param mug: ``"empty"``, Table III; or ``"drink"``, a scenario of our own.
     :param n_seeds: Training seeds of each method.
     :param n_eval_episodes: Episodes of each row.
     :param n_timesteps: Environment steps of each training; default: as in the blocks.
@@ -114,21 +184,25 @@ def reproduce_grasp(
     :param publish: Folder that gets a copy of everything but ``runs/``.
     :return: the summary, as Markdown
     """
+    experiment = EXPERIMENTS[mug]
+    methods, rows = experiment.methods, experiment.rows
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
-    trained = Trained("PandaGrasp-v0", out, [(m, seed) for m in METHODS for seed in seeds], overrides)
-    trained.complete(lambda _: PANDA_GRASP, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    trained = Trained("PandaGrasp-v0", out, [(m, seed) for m in methods for seed in seeds], overrides)
+    trained.complete(lambda _: rows, n_eval_episodes=n_eval_episodes, jobs=jobs)
     folders = trained.folders
 
     # Where the mug stood, and how it was grasped.
     poses = {f"final_mug_{i}": name for i, name in ((0, "x"), (1, "y"), (3, "yaw"))}
     poses.update({f"final_grasp_{i}": f"grasp_{name}" for i, name in enumerate(("x", "y", "z", "yaw"))})
-    records = trained.records().rename(columns=poses)
+    records = trained.records()
+    if "final_state_4" in records:
+        poses["final_state_4"] = "level"
+    records = records.rename(columns=poses)
     columns = ["model", "train_seed", "scenario", "episode", "cost", *poses.values(), "seed", "deterministic"]
     write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 6)), out / "episodes.csv.xz")
-    rotated = records[records["scenario"] == ROTATION]
-    save_figure(failures_by_yaw(rotated), out / "yaw.png")
-    first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in METHODS}
+    save_figure(experiment.draw(records), out / experiment.figure)
+    first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in methods}
     save_figure(training_curves(first), out / "training.png")
     by_seed = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
     write_frame_atomically(by_seed, out / "seeds.csv")
@@ -137,28 +211,30 @@ def reproduce_grasp(
 
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
     with torch_threads(1):  # sums come out the same on any number of cores
-        knowledge = _knowledge(models)
-        estimates = _estimates(models["PG", FIRST_SEED])
+        knowledge = _knowledge(models, rows[:2])
+        estimates = _estimates(models["PG", FIRST_SEED]) if experiment.compares_estimates else None
     write_frame_atomically(knowledge, out / "knowledge.csv")
-    means = knowledge.drop(columns="train_seed").groupby(["model", "poses"], sort=False).mean().reset_index()
+    means = knowledge.drop(columns="train_seed").groupby(["model", "mugs"], sort=False).mean().reset_index()
 
     aggregated = aggregate_seeds(records)
     sections = [
-        "# Grasping (Table III)",
-        comparison_markdown(aggregated, PANDA_GRASP, quantity=QUANTITY, digits=3),
-        "## Goals",
-        goals_table(aggregated, GOALS),
+        f"# {experiment.title}",
+        comparison_markdown(aggregated, rows, quantity=QUANTITY, digits=3),
+    ]
+    if experiment.goals:
+        sections += ["## Goals", goals_table(aggregated, experiment.goals)]
+    kinds = {row.name.lower(): (row.name,) for row in rows}
+    sections += [
         "## What the penalty is worth",
         COMPARISON,
-        comparisons_table(records, COMPARISONS, KINDS),
+        comparisons_table(records, COMPARISONS, kinds),
         "## What the TRVs know",
         KNOWLEDGE,
         markdown_table(means, digits=2),
-        "## How much information is it?",
-        ESTIMATES,
-        markdown_table(estimates, digits=2),
-        how_made("make reproduce-grasp", how, commits_of(list(folders.values()))),
     ]
+    if estimates is not None:
+        sections += ["## How much information is it?", ESTIMATES, markdown_table(estimates, digits=2)]
+    sections.append(how_made(experiment.command, how, commits_of(list(folders.values()))))
     summary = "\n\n".join(sections) + "\n"
     write_atomically(out / "summary.md", summary)
     if publish is not None:
@@ -166,16 +242,16 @@ def reproduce_grasp(
     return summary
 
 
-def _knowledge(models: Mapping[tuple[str, int], TDPG]) -> pd.DataFrame:
-    """Tell what every model's TRVs know of the mugs in training and of mugs with any yaw."""
+def _knowledge(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[Scenario]) -> pd.DataFrame:
+    """Tell what every model's TRVs know of mugs."""
     rows = []
-    for row in PANDA_GRASP[:2]:
+    for row in scenarios:
         mugs = draw_mugs(row.env_kwargs, n_mugs=N_MUGS)
         for (label, seed), model in models.items():
             batch = encode_mugs(model, mugs)
             few = batch.select(th.arange(min(N_MUGS, N_BOUND)))
             rows.append(
-                dict(model=label, train_seed=seed, poses=row.name.lower(), **grasp_knowledge(batch), **_bounds(few))
+                dict(model=label, train_seed=seed, mugs=row.name.lower(), **grasp_knowledge(batch), **_bounds(few))
             )
     return pd.DataFrame(rows)
 
