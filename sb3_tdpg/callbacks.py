@@ -203,7 +203,7 @@ class TrainingCheckpointCallback(_TDPGCallback):
 
 
 class TDPGProgressBar(ProgressBarCallback):
-    """SB3's progress bar, with the epoch's cost and information beside it."""
+    """SB3's progress bar, with the epoch's cost and information, and where episodes can succeed the failures."""
 
     _open: ClassVar[TDPGProgressBar | None] = None
 
@@ -221,6 +221,8 @@ class TDPGProgressBar(ProgressBarCallback):
     def _on_rollout_end(self) -> None:
         model = cast("TDPG", self.model)
         shown = f"cost {model.rollout_buffer.episode_costs.mean():.2f}"
+        if successes := model.ep_success_buffer:  # of the last 100 episodes, unless stats_window_size is another
+            shown += f", {1 - sum(successes) / len(successes):.0%} failures"
         if model.information is not None:
             shown += f", {model.information.sum():.2f} nat"
         self.pbar.set_description(shown, refresh=False)  # tqdm.rich shows no postfix

@@ -25,6 +25,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
+from sb3_tdpg.callbacks import TDPGProgressBar
 from sb3_tdpg.envs.lava import LavaEnv
 
 
@@ -214,6 +215,20 @@ def test_the_progress_bar_runs(capsys):
     pytest.importorskip("rich")
     train_epochs(tiny_tdpg(), 2, progress_bar=True)
     assert "200/200" in (output := capsys.readouterr()).out + output.err
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+def test_the_progress_bar_shows_the_share_of_failures_where_an_episode_can_succeed(monkeypatch):
+    pytest.importorskip("rich")
+    shown = []
+    draw = TDPGProgressBar._on_rollout_end
+    monkeypatch.setattr(TDPGProgressBar, "_on_rollout_end", lambda bar: (draw(bar), shown.append(bar.pbar.desc)))
+    model = tiny_tdpg()
+    train_epochs(model, 1, progress_bar=True)
+    model.ep_success_buffer.extend([True, True, True, False])
+    train_epochs(model, 1, progress_bar=True, reset_num_timesteps=False)
+    assert "failures" not in shown[0]
+    assert ", 25% failures" in shown[1]
 
 
 def test_the_log_has_what_the_paper_plots_and_the_single_steps_go_to_tensorboard_only(tmp_path):
