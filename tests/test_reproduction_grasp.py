@@ -37,7 +37,9 @@ def tiny(monkeypatch):
     monkeypatch.setattr(grasp, "N_MUGS", 100)
 
     monkeypatch.setattr(grasp, "FITTED_MUGS", 60)
-    monkeypatch.setattr(grasp, "CRITICS", {k: dict(v, warmup_gradient_steps=5) for k, v in grasp.CRITICS.items()})
+    monkeypatch.setattr(
+        grasp, "CRITICS", {k: dict(v, warmup_gradient_steps=5, gradient_steps=2) for k, v in grasp.CRITICS.items()}
+    )
     monkeypatch.setattr(common, "complete_runs", complete_runs_here)
 
 
@@ -50,6 +52,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     for heading in ("Goals", "What the penalty is worth", "What the TRVs know", "How much information is it?"):
         assert f"## {heading}" in summary
     assert "0.107" in summary, "the paper's"
+    assert "| estimate | PG, 60 mugs | PG, fresh mugs | TDPG, 60 mugs | TDPG, fresh mugs |" in summary
     files = {"summary.md", "seeds.csv", "episodes.csv.xz", "knowledge.csv", "config.json", "yaw.png", "training.png"}
     assert {path.name for path in published.iterdir()} == files
     records = pd.read_csv(out / "episodes.csv.xz")
