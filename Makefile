@@ -76,7 +76,7 @@ reproduce-grasp: $(STAMP) ## reproduce Table III: policy gradient, TDPG and its 
 	$(PY) -m sb3_tdpg reproduce grasp --out results/panda_grasp --publish docs/results/panda_grasp
 
 reproduce-grasp-drink: $(STAMP) ## the same where a drink's level tells where the mug stands, a scenario of our own
-	$(PY) -m sb3_tdpg reproduce grasp-drink --out results/panda_grasp_drink --publish docs/results/panda_grasp_drink
+	$(PY) -m sb3_tdpg reproduce grasp-drink --out results/panda_grasp_drink
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

@@ -133,7 +133,7 @@ def panda_drink(path: Path) -> None:
 
 
 def panda_grasp(path: Path) -> None:
-    """The paper's slow motion, at twice its speed: down, close, up."""
+    """The paper's slow motion, faster while it comes down: down, close, up."""
     env = grasp("reference")
     pictures = list(env.film())
     env.close()

@@ -41,7 +41,7 @@ class PandaGraspEnv(POMDPEnv):
         c_0 = 0, \qquad c_1 = \begin{cases} 0 & \text{if the mug's frame is more than 5 cm above the table},\\
         1 & \text{otherwise.} \end{cases}
 
-    ``info`` has, after the step, ``success``, ``mug`` (the state before the grasp), ``mug_height`` (m, after it),
+    ``info`` has, after the step, ``success``, ``mug`` (its pose before the grasp), ``mug_height`` (m, after it),
     ``grasp`` (its pose, after clipping), ``contacts`` (points in which the fingers touch the mug in the end), and
     ``is_success``, the name under which Stable-Baselines3 looks for the success.
 
@@ -54,7 +54,7 @@ class PandaGraspEnv(POMDPEnv):
         ``None``: an empty mug.
     :param level_spread: From 0, where the level tells the mug's x (``first`` where x is lowest, ``last`` where it is
         highest), to 1, where it tells nothing. Between them it is off by up to this share of the whole range. Any
-        level is as likely as any other.
+        level is as likely as any other. Without a ``level_range`` it has no effect.
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
@@ -110,13 +110,14 @@ class PandaGraspEnv(POMDPEnv):
         self.xy_half_width = float(xy_half_width)
         self.yaw_range = low_high
         self.scene = PandaScene(float(mug_scale), float(frame_offset), float(friction))
-        self.level_range = None if level_range is None else np.asarray(level_range, dtype=np.float64)
+        self.level_range = self._checked_levels(level_range)
         self.level_spread = float(level_spread)
         self.solver_iterations = solver_iterations
         self.motion = motion
         self.depth_noise_std = float(depth_noise_std)
         self.n_processes = n_processes
-        self._check_level()
+        if not 0 <= self.level_spread <= 1:
+            raise ValueError(f"level_spread={level_spread} must be between 0 (it tells x) and 1 (it tells nothing)")
         size = 4 if level_range is None else 5
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
@@ -125,16 +126,20 @@ class PandaGraspEnv(POMDPEnv):
         self._is_closed = False
         self._film: list[Configuration] = []  # of the last grasp, where something is rendered
 
-    def _check_level(self) -> None:
-        if not 0 <= self.level_spread <= 1:
-            raise ValueError(f"level_spread={self.level_spread} must be between 0 (tells x) and 1 (tells nothing)")
+    def _checked_levels(self, level_range: tuple[float, float] | None) -> np.ndarray | None:
+        if level_range is None:
+            return None
         lowest, highest = self.scene.drink_levels
-        levels = self.level_range
-        if levels is not None and not (levels.shape == (2,) and ((lowest <= levels) & (levels <= highest)).all()):
+        try:
+            levels = np.asarray(level_range, dtype=np.float64)
+        except (TypeError, ValueError):
+            levels = np.array(np.nan)
+        if not (levels.shape == (2,) and ((lowest <= levels) & (levels <= highest)).all()):
             raise ValueError(
-                f"level_range={self.level_range} must be None or (first, last) within the mug, that is between "
+                f"level_range={level_range} must be None or (first, last) within the mug, that is between "
                 f"{lowest:.3f} and {highest:.3f} m"
             )
+        return levels
 
     # -- Bullet worlds, each made when it is needed, and so in the process that uses it ------------------------------
 

@@ -138,16 +138,20 @@ PANDA_GRASP: tuple[Scenario, ...] = (
     _panda("Translation", 0.367, 0.358, xy_half_width=0.075),
 )
 
-PANDA_DRINK: Mapping[str, Any] = MappingProxyType(dict(level_range=(0.03, 0.075), level_spread=0.15))
+PANDA_DRINK: Mapping[str, Any] = MappingProxyType(
+    dict(xy_half_width=0.05, level_range=(0.03, 0.075), level_spread=0.15)
+)
 """
 Keywords of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv` for mugs with a drink, our own: its level, which does not
 matter to a grasp, tells the mug's x to within 1.5 cm.
 """
 
-# The level goes on to tell x, tells nothing, tells the opposite, or is not there. A scenario of our own.
+# The level goes on to tell x, tells nothing, tells the opposite, is the same in every mug; or there is no
+# drink, which no policy has seen. A scenario of our own.
 PANDA_GRASP_DRINK: tuple[Scenario, ...] = (
     Scenario("Training", "PandaGrasp-v0", dict(PANDA_DRINK)),
     Scenario("Any level", "PandaGrasp-v0", {**PANDA_DRINK, "level_spread": 1.0}),
     Scenario("Opposite level", "PandaGrasp-v0", {**PANDA_DRINK, "level_range": PANDA_DRINK["level_range"][::-1]}),
+    Scenario("Same level", "PandaGrasp-v0", {**PANDA_DRINK, "level_range": (0.0525, 0.0525)}),
     Scenario("Empty mug", "PandaGrasp-v0", dict(level_range=None)),
 )

@@ -73,7 +73,11 @@ def test_the_rows_train_on_levels_that_tell_x_and_test_on_others():
     assert tells["Training"] > 0.95
     assert abs(tells["Any level"]) < 0.02
     assert tells["Opposite level"] == pytest.approx(-tells["Training"], abs=1e-3)
-    assert PandaGraspEnv(**PANDA_GRASP_DRINK[3].env_kwargs).state_space.shape == (4,)
+    same, empty = (PandaGraspEnv(**row.env_kwargs) for row in PANDA_GRASP_DRINK[3:])
+    same.reset(seed=0)
+    assert np.ptp(same._initial_state(100)[:, 4]) == 0
+    assert LOW < same._initial_state(1)[0, 4] < HIGH
+    assert empty.state_space.shape == (4,)
 
 
 # -- what it looks like ----------------------------------------------------------------------------------------------
@@ -169,7 +173,8 @@ def test_processes_give_the_same_images_with_a_drink(env):
 
 
 @pytest.mark.parametrize(("keywords", "message"), [
-    (dict(level_range=(0.0, 0.05)), r"level_range=\[0. +0.05\] must be None or .* between 0.007 and 0.081 m"),
+    (dict(level_range=(0.0, 0.05)), r"level_range=\(0.0, 0.05\) must be None or .* between 0.007 and 0.081 m"),
+    (dict(level_range=("a", "b")), r"level_range=\('a', 'b'\) must be None or"),
     (dict(level_range=(0.01, 0.07), mug_scale=0.8), r"level_range=.* between 0.006 and 0.065 m"),
     (dict(level_range=0.05), "level_range=0.05 must be None or"),
     (dict(level_range=(0.01, np.nan)), "level_range=.* must be None or"),

@@ -312,7 +312,7 @@ def test_bullet_clients_are_given_back():
     assert all(client_ids() == first for _ in range(20))
 
 
-def test_the_registered_threshold_is_five_failures_in_a_hundred():
+def test_the_registered_threshold_is_three_failures_in_a_hundred():
     assert gym.spec("PandaGrasp-v0").reward_threshold == -0.03
 
 

@@ -280,6 +280,13 @@ def test_the_trajectories_have_a_panel_for_each_model_and_noise_level(tdpg, ppo,
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["trajectories.png"]
 
 
+def test_the_training_curves_show_an_epoch_that_costs_nothing():
+    pytest.importorskip("matplotlib")
+    log = pd.DataFrame({"time/iterations": [1, 2], "rollout/ep_cost_mean": [0.5, 0.0]})
+    assert training_curves({"PG": log}).axes[0].get_yscale() == "linear"
+    assert training_curves({"PG": log.assign(**{"rollout/ep_cost_mean": 0.1})}).axes[0].get_yscale() == "log"
+
+
 def test_the_training_curves_have_no_information_for_a_model_without_a_penalty():
     pytest.importorskip("matplotlib")
     pg = pd.DataFrame({"time/iterations": [1, 2], "rollout/ep_cost_mean": [100.0, 50.0]})

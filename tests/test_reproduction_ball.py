@@ -27,7 +27,11 @@ def tiny(monkeypatch):
         ),
     )
     monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
-    for module, name in ((ball, "aggregate_seeds"), (common, "probability_of_improvement")):
+    for module, name in (
+        (ball, "aggregate_seeds"),
+        (common, "probability_of_improvement"),
+        (common, "paired_difference"),
+    ):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     asked = []
 

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from information_problems import gaussian_batch, gaussian_information
 from small_problems import complete_runs_here
 
 from sb3_tdpg import TDPG, BatchedVecEnv
@@ -22,8 +23,8 @@ from sb3_tdpg.evaluation import (
     knowledge,
 )
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.information import InformationBatch
-from sb3_tdpg.reproduction import common, grasp
+from sb3_tdpg.information import InformationBatch, Mine
+from sb3_tdpg.reproduction import common, grasp, grasp_analysis
 from sb3_tdpg.runs import Run, complete_run
 
 
@@ -32,14 +33,16 @@ def tiny(monkeypatch):
     """Small epochs, in this process."""
     block = Run.settings.fget
     monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 8, "batch_size": 8}))
-    for module, name in ((grasp, "aggregate_seeds"), (common, "probability_of_improvement")):
+    for module, name in (
+        (grasp, "aggregate_seeds"),
+        (common, "probability_of_improvement"),
+        (common, "paired_difference"),
+    ):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
-    monkeypatch.setattr(grasp, "N_MUGS", 100)
-
-    monkeypatch.setattr(grasp, "FITTED_MUGS", 60)
-    monkeypatch.setattr(
-        grasp, "CRITICS", {k: dict(v, warmup_gradient_steps=5, gradient_steps=2) for k, v in grasp.CRITICS.items()}
-    )
+    monkeypatch.setattr(grasp_analysis, "N_MUGS", 100)
+    monkeypatch.setattr(grasp_analysis, "FITTED_MUGS", 60)
+    short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in grasp_analysis.CRITICS.items()}
+    monkeypatch.setattr(grasp_analysis, "CRITICS", short)
     monkeypatch.setattr(common, "complete_runs", complete_runs_here)
 
 
@@ -67,16 +70,23 @@ def test_mugs_with_a_drink_from_nothing_to_tables_figures_and_records(tmp_path, 
     for text in ("Opposite level", "Empty mug", "make reproduce-grasp-drink"):
         assert text in summary
     assert "Goals" not in summary
+    assert "| model | of the mug | of the level |" in summary
     assert (tmp_path / "level.png").exists()
     assert not (tmp_path / "yaw.png").exists()
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
-    assert len(records) == 3 * 2 * 4 * 3
-    low, high = PANDA_DRINK["level_range"]
+    assert len(records) == 3 * 2 * 5 * 3
+    low, high = 0.03, 0.075
     assert records["level"].dropna().between(low, high).all()
     assert set(records["scenario"][records["level"].isna()]) == {"Empty mug"}
     knowledge = pd.read_csv(tmp_path / "knowledge.csv")
     assert set(knowledge["mugs"]) == {"training", "any level"}
     assert knowledge["level"].between(0, 1).all()
+
+
+def test_a_mug_that_is_none_is_refused_before_anything_is_run(tmp_path):
+    with pytest.raises(ValueError, match=r"mug='tea' must be one of \['empty', 'drink'\]"):
+        grasp.reproduce_grasp(tmp_path / "out", mug="tea")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
@@ -125,22 +135,98 @@ def test_the_failures_are_drawn_in_the_sector_of_their_yaw():
 def test_the_failures_are_drawn_over_what_the_level_gets_wrong():
     error = np.repeat([-0.05, -0.01, 0.01, 0.05], 5)
     cost = np.repeat([1.0, 0.0, 0.0, 0.4], 5)
-    figure = failures_by_level(pd.DataFrame(dict(model="PG", error=error, cost=cost)), n_bins=4)
+    records = pd.DataFrame(dict(model="PG", error=error, cost=cost))
+    figure = failures_by_level(records, n_bins=4, min_episodes=5)
     (line,) = figure.axes[0].lines
     middles, shares = line.get_data()
     np.testing.assert_allclose(middles, [-3.75, -1.25, 1.25, 3.75])
     np.testing.assert_allclose(shares, [1.0, 0.0, 0.0, 0.4])
+    (few,) = failures_by_level(records, n_bins=4, min_episodes=6).axes[0].lines
+    assert np.isnan(few.get_ydata()).all()
 
 
-@pytest.mark.parametrize("mug", ["as the level tells", "elsewhere"])
-def test_the_level_s_error_is_nothing_where_it_tells_x(monkeypatch, mug):
+def test_the_level_s_error_is_nothing_where_it_tells_x(monkeypatch):
     seen = []
     monkeypatch.setattr(grasp, "failures_by_level", seen.append)
-    shift = 0.0 if mug == "as the level tells" else 0.02
-    (low, high), x = PANDA_DRINK["level_range"], np.linspace(0.45, 0.55, 5)
-    level = low + (high - low) * (x - 0.45) / 0.1
-    grasp._draw_level(pd.DataFrame(dict(scenario="Any level", x=x - shift, level=level)))
-    np.testing.assert_allclose(seen[0]["error"], shift, atol=1e-12)
+    env = PandaGraspEnv(**{**PANDA_DRINK, "level_spread": 0.0})
+    env.reset(seed=0)
+    state = env._initial_state(50)
+    for shift in (0.0, 0.02):
+        grasp._draw_level(pd.DataFrame(dict(scenario="Any level", x=state[:, 0] - shift, level=state[:, 4])))
+        np.testing.assert_allclose(seen[-1]["error"], shift, atol=1e-12)
+
+
+# -- what is told of the policies --------------------------------------------------------------------------------------
+
+
+def test_the_bounds_enclose_an_information_that_is_known():
+    rng = th.Generator().manual_seed(0)
+    batch = gaussian_batch(2000, [[2.0, 1.0]], generator=rng)
+    (truth,) = gaussian_information([[2.0, 1.0]])
+    found = grasp_analysis.bounds(batch)
+    assert truth - 0.1 < found["lower bound"] < truth + 0.03
+    assert truth - 0.03 < found["upper bound"] < truth + 0.1
+
+
+def test_the_critics_are_fitted_to_one_policy_after_the_other_and_read_on_fresh_mugs(monkeypatch, tiny):
+    fits = []
+    fit = Mine.fit
+
+    def note(critic, batch):
+        fits.append((id(critic), critic.is_warm, batch.states.shape[1]))
+        return fit(critic, batch)
+
+    monkeypatch.setattr(Mine, "fit", note)
+    models = {
+        label: TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), beta=math.inf, n_episodes=4, seed=seed)
+        for seed, label in enumerate(("PG", "TDPG"))
+    }
+    before = th.get_rng_state()
+    table = grasp_analysis.estimates_table(models).set_index("estimate")
+    assert th.equal(th.get_rng_state(), before)
+    n_critics = len(grasp_analysis.CRITICS)
+    assert [fit[1:] for fit in fits] == [(False, 60)] * n_critics + [(True, 60)] * n_critics
+    assert [fit[0] for fit in fits[:n_critics]] == [fit[0] for fit in fits[n_critics:]]
+    assert (table.loc["lower bound"] <= table.loc["upper bound"] + 0.1).all()
+    assert table.notna().all(axis=None)
+
+
+def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
+    log = pd.DataFrame({
+        "train/mi_coef": [0.0, 0.0, 0.01, 0.02, 0.03, 0.04],
+        "mi/total": [5.0, 5.0, 5.0, 4.5, 4.0, 3.5],
+        "rollout/ep_cost_mean": [0.9, 0.05, 0.01, 0.01, 0.02, 0.01],
+    })  # fmt: skip
+    with_penalty, without = grasp_analysis.penalty_table({1: log, 2: log.assign(**{"train/mi_coef": 0.0})}).to_dict(
+        "records"
+    )
+    assert with_penalty == {
+        "seed": 1,
+        "penalty from epoch": "3",
+        "weight": "0.04",
+        "nats, first": "5.00",
+        "nats, last": "3.50",
+        "failures": "0.020",
+    }
+    assert (without["penalty from epoch"], without["weight"]) == ("none", "0")
+
+
+def test_the_regression_tells_who_follows_the_mug_and_who_its_level():
+    env = PandaGraspEnv(**{**PANDA_DRINK, "level_spread": 1.0})
+    env.reset(seed=0)
+    state = env._initial_state(500)
+    x, level = pd.Series(state[:, 0]), pd.Series(state[:, 4])
+    told = grasp_analysis.told_x(level)
+    assert told.between(0.45, 0.55).all()
+    hands = {("sees", 0): x + 0.04, ("sees", 1): x + 0.03, ("is told", 0): told, ("half", 0): (x + told) / 2}
+    records = pd.concat(
+        pd.DataFrame(dict(model=label, train_seed=seed, x=x, level=level, grasp_x=hand))
+        for (label, seed), hand in hands.items()
+    )
+    table = grasp_analysis.followed_table(records).set_index("model")
+    assert table.loc["sees"].tolist() == ["1.00 [1.00, 1.00]", "0.00 [0.00, 0.00]"]
+    assert table.loc["is told", "of the level"] == "1.00 [1.00, 1.00]"
+    assert table.loc["half"].tolist() == ["0.50 [0.50, 0.50]"] * 2
 
 
 @pytest.mark.parametrize("half_width", [np.pi, np.pi / 4])
@@ -166,9 +252,9 @@ def test_the_mugs_that_a_policy_is_shown_are_those_of_the_environment(monkeypatc
     monkeypatch.setattr(knowledge, "MUGS_AT_A_TIME", 8)
     model = TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), beta=math.inf, n_episodes=4, device="cpu")
     mugs = draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20)
-    assert ((mugs.poses[:, 3] >= 2.0) & (mugs.poses[:, 3] <= 2.5)).all()
+    assert ((mugs.states[:, 3] >= 2.0) & (mugs.states[:, 3] <= 2.5)).all()
     batch = encode_mugs(model, mugs)
-    np.testing.assert_allclose(batch.states[0].numpy(), mugs.poses, rtol=1e-6)
+    np.testing.assert_allclose(batch.states[0].numpy(), mugs.states, rtol=1e-6)
     assert batch.trvs.shape == batch.means.shape == batch.stds.shape == (1, 20, 16)
     assert (batch.trvs != batch.means).all()
     again = encode_mugs(model, draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20))

@@ -9,6 +9,7 @@ from sb3_tdpg.evaluation import (
     add_ratio,
     aggregate_seeds,
     comparison_markdown,
+    paired_difference,
     probability_of_improvement,
     summary_table,
 )
@@ -82,6 +83,22 @@ def test_the_probability_of_improvement_is_that_of_a_seed_of_one_against_a_seed_
     assert probability_of_improvement(records, "A", "B") == (value, low, high)
     assert probability_of_improvement(records, "B", "A")[0] == pytest.approx(1 - value)
     assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+
+
+def test_a_paired_difference_is_taken_seed_by_seed():
+    """What the seeds have in common, here from 0 to 100, does not widen the interval."""
+    common = [0.0, 30.0, 60.0, 100.0]
+    gains = [1.0, 2.0, 1.0, 2.0]
+    records = pd.concat(
+        some_records({"A": {"x": [c - g] * 2}, "B": {"x": [c] * 2}}, train_seed=i)
+        for i, (c, g) in enumerate(zip(common, gains, strict=True))
+    )
+    value, low, high = paired_difference(records, "A", "B")
+    assert value == pytest.approx(-1.5)
+    assert -2 <= low < -1.5 < high <= -1
+    assert paired_difference(records.sample(frac=1, random_state=0), "A", "B") == (value, low, high)
+    with pytest.raises(ValueError, match=r"the seeds of 'A' are \[0, 1, 2, 3\], those of 'B' \[0, 1\]"):
+        paired_difference(records[(records["model"] == "A") | (records["train_seed"] < 2)], "A", "B")
 
 
 def test_scenarios_of_the_same_seeds_do_not_narrow_the_interval():

@@ -13,7 +13,7 @@ from sb3_tdpg.evaluation.figures import (
 from sb3_tdpg.evaluation.knowledge import draw_mugs, encode_mugs, grasp_knowledge, trv_knowledge
 from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.records import evaluate_scenarios
-from sb3_tdpg.evaluation.statistics import aggregate_seeds, probability_of_improvement
+from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table
 from sb3_tdpg.evaluation.trajectories import Trajectories, rollout_states
 
@@ -31,6 +31,7 @@ __all__ = [
     "failures_by_yaw",
     "grasp_knowledge",
     "lava_trajectories",
+    "paired_difference",
     "probability_of_improvement",
     "provenance",
     "robustness_curves",

@@ -108,7 +108,7 @@ def lava_trajectories(
 
 def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
     """
-    Draw cost and information over the policy epochs.
+    Draw cost and information over the policy epochs; the cost on a logarithmic axis unless an epoch costs nothing.
 
     :param progress: By label, what SB3's CSV logger wrote: ``pandas.read_csv("progress.csv")``.
     """
@@ -119,7 +119,8 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
         cost.plot(epochs, frame["rollout/ep_cost_mean"], color=color, label=label)
         if "mi/total" in frame:
             information.plot(epochs, frame["mi/total"], color=color, label=label)
-    _log_axis(cost, "y", subs=(1, 2, 5))
+    if all((frame["rollout/ep_cost_mean"] > 0).all() for frame in progress.values()):
+        _log_axis(cost, "y", subs=(1, 2, 5))
     cost.set_ylabel("mean episode cost", fontsize=9)
     information.set_ylabel(r"$I[x_t; \tilde{x}_t]$, summed over $t$ (nat)", fontsize=9)
     for axes in (cost, information):
@@ -220,13 +221,14 @@ def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
     return figure
 
 
-def failures_by_level(records: pd.DataFrame, *, n_bins: int = 20) -> Figure:
+def failures_by_level(records: pd.DataFrame, *, n_bins: int = 15, min_episodes: int = 50) -> Figure:
     """
     Draw the share of failed grasps over how far the level of a drink is from telling where the mug stands.
 
     :param records: Episodes with the columns ``model``, ``error`` (where the level would have the mug minus where it
         is, along x, in m) and ``cost`` (1 for a failure).
     :param n_bins: Parts of the range of the error.
+    :param min_episodes: Parts with fewer episodes of a model are left out.
     """
     figure = _new_figure(WIDTH * 0.7, 3.2)
     axes = figure.add_subplot()
@@ -235,7 +237,8 @@ def failures_by_level(records: pd.DataFrame, *, n_bins: int = 20) -> Figure:
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
     for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
         part = np.digitize(centimetres[group.index], edges) - 1
-        share = group["cost"].groupby(part).mean().reindex(range(n_bins))
+        of_part = group["cost"].groupby(part)
+        share = of_part.mean().where(of_part.count() >= min_episodes).reindex(range(n_bins))
         axes.plot((edges[:-1] + edges[1:]) / 2, share, color=color, label=str(label), marker=".")
     axes.set_xlabel("x as the level tells it, minus the mug's x, in cm", fontsize=9)
     axes.set_ylabel("share of failed grasps", fontsize=9)

@@ -74,7 +74,7 @@ def trv_knowledge(
 class Mugs(NamedTuple):
     """N mugs of the grasping problem, and what the camera shows of them."""
 
-    poses: np.ndarray  # (N, 4): x, y, z, yaw; with a drink (N, 5), the last its level
+    states: np.ndarray  # (N, 4): x, y, z, yaw; with a drink (N, 5), the last its level
     images: np.ndarray  # (N, 1, 128, 128)
 
 
@@ -89,9 +89,9 @@ def draw_mugs(env_kwargs: Mapping[str, Any] | None = None, *, n_mugs: int = 10_0
     env = make_episodes_env("PandaGrasp-v0", n_episodes=n_mugs, env_kwargs=env_kwargs, use_processes=False)
     env.seed(evaluation_seeds(seed).env)
     images = cast(np.ndarray, env.reset())
-    poses = np.stack([info["state"] for info in env.unwrapped.reset_infos])
+    states = np.stack([info["state"] for info in env.unwrapped.reset_infos])
     env.close()
-    return Mugs(poses, images)
+    return Mugs(states, images)
 
 
 def encode_mugs(model: Any, mugs: Mugs, *, seed: int = 0) -> InformationBatch:
@@ -110,12 +110,12 @@ def encode_mugs(model: Any, mugs: Mugs, *, seed: int = 0) -> InformationBatch:
             observations = th.as_tensor(images, device=model.device)
             steps.append(model.policy.step(observations, no_memory, np.zeros(len(images), np.int64)))
     known = (th.cat([getattr(step, name) for step in steps]).cpu()[None] for name in ("trvs", "means", "stds"))
-    return InformationBatch(th.as_tensor(mugs.poses, dtype=th.float32)[None], *known)
+    return InformationBatch(th.as_tensor(mugs.states, dtype=th.float32)[None], *known)
 
 
 def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     """
-    Tell how much of the mug's pose can be read from the TRVs of the grasping problem.
+    Probe how much of the mug's pose can be read from the TRVs of the grasping problem.
 
     Each is regressed on the TRVs and their squares and products for half of the mugs; R^2 is that for the other half.
     It is too low by about the number of these (152 for 16 TRVs) over half the number of mugs.

@@ -101,6 +101,43 @@ def probability_of_improvement(
     return float(value), float(low), float(high)
 
 
+def paired_difference(
+    records_by_seed: pd.DataFrame,
+    model: str,
+    control: str,
+    *,
+    level: float = 0.95,
+    n_bootstrap: int = 2000,
+    seed: int = 0,
+) -> tuple[float, float, float]:
+    """
+    By how much the mean cost of a method exceeds that of another, seed by seed.
+
+    Where the two of a seed have the same start and meet the same episodes, what the start is worth cancels.
+
+    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to take the mean over.
+    :param model: Label of the method.
+    :param control: Label of the method that it is compared with; it must have the same seeds.
+    :param level: Coverage of the interval.
+    :param n_bootstrap: Resamples of the seeds.
+    :param seed: Seed of the resampling.
+    :return: the mean over seeds of the difference, and the interval's ends; below 0 the method is better
+    :raises ValueError: if the seeds are not the same.
+    """
+    rliable, _ = _import_rliable()
+    means = records_by_seed.groupby(["model", "train_seed"])["cost"].mean()
+    if sorted(means[model].index) != sorted(means[control].index):
+        raise ValueError(
+            f"the seeds of {model!r} are {sorted(means[model].index)}, those of {control!r} "
+            f"{sorted(means[control].index)}: a paired difference needs the same of both"
+        )
+    differences = (means[model] - means[control]).to_numpy()
+    (value,), (low, high) = _interval(
+        rliable, differences[:, None], lambda x: np.array([x.mean()]), level, n_bootstrap, seed
+    )
+    return float(value), float(low), float(high)
+
+
 def _interval(
     rliable: Any, scores: Any, statistic: Callable[..., np.ndarray], level: float, n_bootstrap: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:

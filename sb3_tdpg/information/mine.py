@@ -20,8 +20,8 @@ class Mine(CriticEstimator):
     r"""
     The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (eq:kl mine).
 
-    A lower bound for a fixed critic on *fresh* samples. On the samples that it was fitted to it is neither, and tends
-    to be too high.
+    A lower bound for a fixed critic on *fresh* samples, but for the bias of the logarithm of a mean: it is upward, and
+    small with many samples. On the samples that the critic was fitted to it is neither, and tends to be too high.
 
     :param ema_decay: With it the denominator of the critic's gradient (eq:grad mine) is an exponential moving average
         over the gradient steps, to lessen the bias of minibatches. It is the weight **on the past**: 0.99 averages over

@@ -88,8 +88,8 @@ KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "backgrounds": B
 
 COMPARISON = (
     "Probability that a seed of the method has a lower mean cost over these rows than a seed of what it is compared "
-    "with: 0.5 is no difference. The images of each are those of its table above; policies score the same in both "
-    "kinds of images."
+    "with: 0.5 is no difference. And the difference of the mean costs, seed by seed. The images of each are those "
+    "of its table above; policies score the same in both kinds of images."
 )
 KNOWLEDGE = (
     "In front of random walls, with every episode darkened by a factor of its own: share of the variance (R^2 before "

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import probability_of_improvement
+from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
 from sb3_tdpg.runs import Run, complete_runs
 
 
@@ -127,7 +127,7 @@ def comparisons_table(
     table: pd.DataFrame, comparisons: Sequence[tuple[str, str]], kinds: Mapping[str, Sequence[str]]
 ) -> str:
     """
-    Say how likely a seed of one method beats a seed of another.
+    Say how likely a seed of one method beats a seed of another, and by how much, seed by seed.
 
     :param table: Records with a column ``train_seed``.
     :param comparisons: Labels of a method and of what it is compared with; left out if one is not there.
@@ -140,16 +140,17 @@ def comparisons_table(
             continue
         for name, members in kinds.items():
             part = table[table["scenario"].isin(members)]
-            value, low, high = probability_of_improvement(part, model, control)
+            better, difference = (f(part, model, control) for f in (probability_of_improvement, paired_difference))
             cost = part.groupby("model")["cost"].mean()
             rows.append(
                 {
                     "method": model,
                     "against": control,
                     "rows": name,
-                    "P(improvement) [95 %]": f"{value:.2f} [{low:.2f}, {high:.2f}]",
+                    "P(improvement) [95 %]": "{:.2f} [{:.2f}, {:.2f}]".format(*better),
                     "mean cost": f"{cost[model]:.3g}",
                     "of the other": f"{cost[control]:.3g}",
+                    "difference [95 %]": "{:+.3g} [{:+.3g}, {:+.3g}]".format(*difference),
                 }
             )
     return markdown_table(pd.DataFrame(rows))

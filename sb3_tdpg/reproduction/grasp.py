@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pandas as pd
-import torch as th
 
-from sb3_tdpg.envs.scenarios import PANDA_DRINK, PANDA_GRASP, PANDA_GRASP_DRINK, Scenario
+from sb3_tdpg.envs.scenarios import PANDA_GRASP, PANDA_GRASP_DRINK, Scenario
 from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
-    draw_mugs,
-    encode_mugs,
     failures_by_level,
     failures_by_yaw,
-    grasp_knowledge,
     provenance,
     save_figure,
     training_curves,
@@ -27,7 +22,6 @@ from sb3_tdpg.evaluation import (
     write_run_config,
 )
 from sb3_tdpg.files import write_atomically
-from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet, Mine, own_sample_bound
 from sb3_tdpg.reproduction.common import (
     Method,
     Trained,
@@ -37,6 +31,17 @@ from sb3_tdpg.reproduction.common import (
     how_made,
     markdown_table,
     publish_files,
+)
+from sb3_tdpg.reproduction.grasp_analysis import (
+    ESTIMATES,
+    FOLLOWED,
+    KNOWLEDGE,
+    PENALTY,
+    estimates_table,
+    followed_table,
+    knowledge_table,
+    penalty_table,
+    told_x,
 )
 from sb3_tdpg.runs import read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
@@ -48,8 +53,6 @@ if TYPE_CHECKING:
 FIRST_SEED = 100
 
 TRAINING, ROTATION, TRANSLATION = (row.name for row in PANDA_GRASP)
-
-TRAINING_X = (0.45, 0.55)  # m
 
 # The largest interquartile mean over seeds of the share of failures, by method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
@@ -95,16 +98,18 @@ class Experiment:
     compares_estimates: bool = False
 
 
+def of_row(records: pd.DataFrame, row: Scenario) -> pd.DataFrame:
+    """Return the records of one row of a table."""
+    return records[records["scenario"] == row.name]
+
+
 def _draw_yaw(records: pd.DataFrame) -> Figure:
-    return failures_by_yaw(records[records["scenario"] == ROTATION])
+    return failures_by_yaw(of_row(records, PANDA_GRASP[1]))
 
 
 def _draw_level(records: pd.DataFrame) -> Figure:
-    first, last = PANDA_DRINK["level_range"]
-    of_row = records[records["scenario"] == PANDA_GRASP_DRINK[1].name]
-    low, high = TRAINING_X
-    told = low + (high - low) * (of_row["level"] - first) / (last - first)
-    return failures_by_level(of_row.assign(error=told - of_row["x"]))
+    of_any_level = of_row(records, PANDA_GRASP_DRINK[1])
+    return failures_by_level(of_any_level.assign(error=told_x(of_any_level["level"]) - of_any_level["x"]))
 
 
 EXPERIMENTS = {
@@ -131,35 +136,8 @@ EXPERIMENTS = {
 QUANTITY = "share of failed grasps"
 COMPARISON = (
     "Probability that a seed of the method fails less often in these rows than a seed of what it is compared with: 0.5 "
-    "is no difference."
+    "is no difference. And the difference of the shares, seed by seed: the two of a seed start from the same policy."
 )
-KNOWLEDGE = (
-    "Share of the variance (R^2 on mugs left out of the regression, mean over seeds) of what makes a mug's image (of "
-    "its yaw: of sine and cosine) that TRVs, their squares and products explain, on mugs of two rows of the table. And "
-    "bounds on the information in nats: I[x; x~] itself lies between them, since the image is a function of the state "
-    "and there is no memory. The lower one cannot exceed ln 2000 = 7.6."
-)
-ESTIMATES = (
-    "Of the first seed's policies, in nats. A fitted critic's estimate bounds the information from below on fresh "
-    "mugs; on those that it was fitted to it does not bound it at all. Critics are fitted to PG first (the paper's in "
-    "500,000 steps, ours in 2,000), and then go on with TDPG (for 100,000 and 1,000)."
-)
-N_MUGS = 10_000  # for the regression
-N_BOUND = 2_000  # for the bounds, which compare every mug with every other
-FITTED_MUGS = 400  # for MINE, as in an epoch
-CRITICS: Mapping[str, Mapping[str, Any]] = {
-    # Without guards, and with one optimiser from beginning to end.
-    "MINE, as the paper prints it": dict(
-        learning_rate=5e-5,
-        warmup_gradient_steps=500_000,
-        gradient_steps=100_000,
-        refit_below=-math.inf,
-        refit_above=math.inf,
-        reset_moments=False,
-    ),
-    "MINE at 1e-3": dict(gradient_steps=1000),
-    "MINE at 1e-3, standardised state": dict(gradient_steps=1000, standardize=True),
-}
 
 
 def reproduce_grasp(
@@ -185,7 +163,10 @@ def reproduce_grasp(
     :param jobs: Runs at a time; default: the number of cores.
     :param publish: Folder that gets a copy of everything but ``runs/``.
     :return: the summary, as Markdown
+    :raises ValueError: if there is no such ``mug``; nothing has been run by then.
     """
+    if mug not in EXPERIMENTS:
+        raise ValueError(f"mug={mug!r} must be one of {list(EXPERIMENTS)}")
     experiment = EXPERIMENTS[mug]
     methods, rows = experiment.methods, experiment.rows
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
@@ -204,8 +185,8 @@ def reproduce_grasp(
     columns = ["model", "train_seed", "scenario", "episode", "cost", *poses.values(), "seed", "deterministic"]
     write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 6)), out / "episodes.csv.xz")
     save_figure(experiment.draw(records), out / experiment.figure)
-    first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in methods}
-    save_figure(training_curves(first), out / "training.png")
+    second_stage = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in methods if m.start is not None}
+    save_figure(training_curves(second_stage), out / "training.png")
     by_seed = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
     write_frame_atomically(by_seed, out / "seeds.csv")
     how = provenance()
@@ -213,9 +194,9 @@ def reproduce_grasp(
 
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
     with torch_threads(1):  # sums come out the same on any number of cores
-        knowledge = _knowledge(models, rows[:2])
+        knowledge = knowledge_table(models, rows[:2])
         of_first = {label: models[label, FIRST_SEED] for label in ("PG", "TDPG")}
-        estimates = _estimates(of_first) if experiment.compares_estimates else None
+        estimates = estimates_table(of_first) if experiment.compares_estimates else None
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby(["model", "mugs"], sort=False).mean().reset_index()
 
@@ -231,10 +212,14 @@ def reproduce_grasp(
         "## What the penalty is worth",
         COMPARISON,
         comparisons_table(records, COMPARISONS, kinds),
+        PENALTY,
+        markdown_table(penalty_table({seed: read_progress(folders["TDPG", seed]) for seed in seeds})),
         "## What the TRVs know",
         KNOWLEDGE,
         markdown_table(means, digits=2),
     ]
+    if "level" in records:
+        sections += ["## Mug or level?", FOLLOWED, markdown_table(followed_table(of_row(records, rows[1])))]
     if estimates is not None:
         sections += ["## How much information is it?", ESTIMATES, markdown_table(estimates, digits=2)]
     sections.append(how_made(experiment.command, how, commits_of(list(folders.values()))))
@@ -243,46 +228,3 @@ def reproduce_grasp(
     if publish is not None:
         publish_files(out, publish)
     return summary
-
-
-def _knowledge(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[Scenario]) -> pd.DataFrame:
-    """Tell what every model's TRVs know of mugs."""
-    rows = []
-    for row in scenarios:
-        mugs = draw_mugs(row.env_kwargs, n_mugs=N_MUGS)
-        for (label, seed), model in models.items():
-            batch = encode_mugs(model, mugs)
-            few = batch.select(th.arange(min(N_MUGS, N_BOUND)))
-            rows.append(
-                dict(model=label, train_seed=seed, mugs=row.name.lower(), **grasp_knowledge(batch), **_bounds(few))
-            )
-    return pd.DataFrame(rows)
-
-
-def _bounds(batch: InformationBatch) -> dict[str, float]:
-    """Bound the information from below and from above; of two upper bounds the smaller one holds, too."""
-    sizes = (batch.states.shape[2], batch.trvs.shape[2])
-    upper = min(cls(1, *sizes)(batch).item() for cls in (LeaveOneOut, LogDet))
-    return {"lower bound": own_sample_bound(batch).item(), "upper bound": upper}
-
-
-def _estimates(models: Mapping[str, TDPG]) -> pd.DataFrame:
-    """Hold what MINE makes of the information in several policies, one after the other, against the bounds."""
-    mugs = {
-        f"{FITTED_MUGS} mugs": draw_mugs(n_mugs=FITTED_MUGS, seed=1),
-        "fresh mugs": draw_mugs(n_mugs=min(N_MUGS, N_BOUND), seed=2),
-    }
-    columns = {}
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        critics: dict[str, Mine] = {}
-        for label, model in models.items():
-            batches = [encode_mugs(model, each) for each in mugs.values()]
-            fitted = batches[0]
-            for name, settings in CRITICS.items():
-                critics.setdefault(name, Mine(1, fitted.states.shape[2], fitted.trvs.shape[2], **settings)).fit(fitted)
-            for name, batch in zip(mugs, batches, strict=True):
-                with th.no_grad():
-                    estimates = {critic: critics[critic](batch).item() for critic in critics}
-                columns[f"{label}, {name}"] = {**_bounds(batch), **estimates}
-    return pd.DataFrame(columns).rename_axis("estimate").reset_index()
