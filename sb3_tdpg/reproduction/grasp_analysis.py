@@ -121,14 +121,15 @@ def penalty_table(progress: Mapping[int, pd.DataFrame]) -> pd.DataFrame:
     """
     rows = []
     for seed, log in progress.items():
-        weights = log["train/mi_coef"].to_numpy()
+        # What an epoch was trained with stands in the row after it, so that the first row has no weight.
+        weights = log["train/mi_coef"].fillna(0.0).to_numpy() if "train/mi_coef" in log else np.zeros(1)
         with_penalty = np.flatnonzero(weights > 0)
         information = log["mi/total"].dropna()
         failures = log["rollout/ep_cost_mean"].iloc[-LAST_EPOCHS:].mean()
         rows.append(
             {
                 "seed": seed,
-                "penalty from epoch": str(with_penalty[0] + 1) if len(with_penalty) else "none",
+                "penalty from epoch": str(with_penalty[0]) if len(with_penalty) else "none",
                 "weight": f"{weights[-1]:.2g}",
                 "nats, first": f"{information.iloc[0]:.2f}",
                 "nats, last": f"{information.iloc[-1]:.2f}",
