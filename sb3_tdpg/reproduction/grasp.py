@@ -61,8 +61,8 @@ GOALS: Mapping[str, Mapping[str, float]] = {
 }
 
 COMPARISONS = (("TDPG", "its control"), ("TDPG", "PG"))
-# At the rate of a training from scratch the first epoch of a second stage undoes the first stage: where next to nothing
-# fails, Adam takes full steps along noise.
+# At the rate of a training from scratch the first epoch of a second stage undoes the first stage, with the penalty and
+# without: where next to nothing fails, the gradient is mostly noise.
 SECOND_STAGE = dict(n_timesteps=8_000, learning_rate=2e-4)
 
 

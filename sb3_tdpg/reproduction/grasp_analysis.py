@@ -51,7 +51,7 @@ ESTIMATES = (
 )
 PENALTY = (
     "Of each TDPG: the first epoch with a penalty (none if no epoch met the limit on the failures: then TDPG is its "
-    "control), the weight 1/beta in the end in failures per nat, the bound on the information in the first epoch "
+    "control), the last weight 1/beta in the log in failures per nat, the bound on the information in the first epoch "
     f"and in the last, and the share of failures in the last {LAST_EPOCHS} epochs of training."
 )
 FOLLOWED = (
