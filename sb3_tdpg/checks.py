@@ -44,7 +44,10 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
             "the memory of an episode cannot be cut"
         )
     for clip_range in _values(settings["clip_range"]):
-        if not (isinstance(clip_range, (int, float, np.number)) and clip_range > 0):
+        # A schedule may fall to 0, and a policy that is only to be watched is loaded with one that is 0 by rl-zoo3.
+        lowest_is_allowed = callable(settings["clip_range"])
+        is_number = isinstance(clip_range, (int, float, np.number))
+        if not (is_number and (clip_range > 0 or (clip_range == 0 and lowest_is_allowed))):
             raise ValueError(
                 f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
                 "returns one; float('inf') turns the clipping off"

@@ -16,8 +16,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: What stands behind the program's name; default: ``sys.argv``.
     :return: exit code: 0 done, 2 bad input, 130 interrupted
     """
-    options = vars(_make_parser().parse_args(arguments))
-    command = COMMANDS[options.pop("command")]
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if _is_for_the_zoo(arguments):
+        command, options = _zoo, dict(program=arguments[0], arguments=arguments[1:])
+    else:
+        options = vars(_make_parser().parse_args(arguments))
+        command = COMMANDS[options.pop("command")]
     try:
         command(**options)
     except KeyboardInterrupt:
@@ -69,6 +73,31 @@ def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> 
     enjoy(model, env, parse_keywords(env_kwargs), **options)
 
 
+def _zoo(program: str, arguments: Sequence[str]) -> None:
+    try:
+        from sb3_tdpg.zoo.programs import run
+    except ImportError as e:
+        raise ValueError(f"{program} needs rl-zoo3 ({e}): pip install 'sb3_tdpg[zoo]'") from e
+
+    run(program, arguments)
+
+
+# rl-zoo3's programs read their flags themselves.
+ZOO_PROGRAMS = {
+    "train": "train an agent from a block of hyperparameters",
+    "tune": "tune hyperparameters with Optuna",
+    "record-video": "record a trained agent as a film",
+    "plot": "plot what trainings have logged",
+}
+
+
+def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
+    """Whether a program of rl-zoo3 is asked for; its ``enjoy`` is the one that is given no file."""
+    if not arguments:
+        return False
+    return arguments[0] in ZOO_PROGRAMS or (arguments[0] == "enjoy" and not any(a.endswith(".zip") for a in arguments))
+
+
 COMMANDS: dict[str, Callable[..., None]] = {"demo": _demo, "reproduce": _reproduce, "enjoy": _enjoy}
 
 
@@ -101,7 +130,14 @@ def _make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores)")
     _add_sizes(reproduce)
 
-    enjoy = commands.add_parser("enjoy", help="run a saved model, print what its episodes cost, record them as a film")
+    for program, text in ZOO_PROGRAMS.items():
+        commands.add_parser(program, help=f"rl-zoo3: {text}", add_help=False)
+
+    enjoy = commands.add_parser(
+        "enjoy",
+        help="run a saved model, print what its episodes cost, record them as a film; without a file: rl-zoo3's, of a "
+        "model that train has left",
+    )
     enjoy.add_argument("model", type=Path, help="the .zip file that model.save() wrote")
     enjoy.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
     enjoy.add_argument(

@@ -136,6 +136,31 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def _bare_id(env_id: str) -> str:
+    module, _, bare_id = env_id.rpartition(":")
+    if module:  # gymnasium.make takes this form, gymnasium.spec does not
+        import_module(module)
+    return bare_id
+
+
+def batched_class(env_id: str) -> type[POMDPEnv] | None:
+    """
+    Return the class behind a registered id whose episodes can be stepped as one batch; ``None`` for any other id.
+
+    :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
+    :raises gymnasium.error.Error: if the id is not registered.
+    """
+    spec = gym.spec(_bare_id(env_id))
+    creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
+    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers
+    return cast(type[POMDPEnv], creator) if is_batched else None
+
+
+def default_n_envs(n_episodes: int) -> int:
+    """Return how many environments run that many episodes where they are not one batch: the largest divisor up to 50."""
+    return max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
+
+
 def make_episodes_env(
     env_id: str,
     n_envs: int | None = None,
@@ -160,13 +185,9 @@ def make_episodes_env(
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
-    module, _, bare_id = env_id.rpartition(":")
-    if module:  # gymnasium.make takes this form, gymnasium.spec does not
-        import_module(module)
-    spec = gym.spec(bare_id)
-    creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
-    if isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers:
-        env_class = cast(type[POMDPEnv], creator)
+    env_class = batched_class(env_id)
+    if env_class is not None:
+        spec = gym.spec(_bare_id(env_id))
         if use_processes and env_class.shares_work:
             env_kwargs.setdefault("n_processes", usable_cores())
         env = env_class(**{**spec.kwargs, **env_kwargs})
@@ -179,5 +200,5 @@ def make_episodes_env(
         if n_episodes is None:
             with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
                 n_episodes = defaults_for(probe.observation_space).n_episodes
-        n_envs = max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
+        n_envs = default_n_envs(n_episodes)
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)

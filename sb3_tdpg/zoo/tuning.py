@@ -1,0 +1,238 @@
+"""
+Tuning with Optuna through the zoo, for what a bottleneck is for.
+
+Reward alone would tune the bottleneck away: the penalty costs reward on the environment that is trained on. Hence there
+are two objectives. ``information`` is the least information under a limit on the expected cost (the paper's rule for
+choosing a policy), and ``shift`` the least expected cost in an environment that differs from the one trained on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import optuna
+import yaml
+from rl_zoo3.utils import get_callback_list
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdpg.callbacks import SelectionCallback
+from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
+from sb3_tdpg.evaluation.information import encode_episodes
+from sb3_tdpg.files import write_atomically
+from sb3_tdpg.studies import open_storage, open_study, work
+from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.zoo.manager import TDPGExperimentManager
+from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
+
+OBJECTIVES = ("information", "shift")
+N_EVALUATIONS = 10
+# What a trial keeps beside its value, and what the sampler takes for a constraint: not above 0.
+COST, INFORMATION, EXCESS = "cost", "information", "excess_cost"
+
+
+class TuningManager(TDPGExperimentManager):
+    """Tunes TDPG; any other algorithm is tuned as the zoo does it."""
+
+    # Set by the program, as the zoo has no flags for them.
+    objective_kind: str | None = None
+    cost_limit: float | None = None
+    space_path: Path | None = None
+
+    def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
+        super().__init__(args, algo, env_id, *rest, **kwargs)
+        if algo != "tdpg":
+            return
+        if self.objective_kind is None:
+            self.objective_kind = "information" if self._eval_env_kwargs_args is None else "shift"
+        if self.objective_kind == "shift" and self._eval_env_kwargs_args is None:
+            raise ValueError("--objective shift needs --eval-env-kwargs: what is other there than in training")
+        self.n_evaluations = self.n_evaluations or N_EVALUATIONS
+        self.study_name = self.study_name or f"{self.block or env_id}-{self.objective_kind}"
+        self.save_path = self.params_path = str(Path(self.log_path, f"study-{self.study_name}"))
+        self.storage = self.storage or str(Path(self.save_path, "study.log"))
+        self.settings: dict[str, Any] = {}
+        self.space: Space = read_space(self.space_path)
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """See the zoo."""
+        block, saved = super().read_hyperparameters()
+        if self.algo == "tdpg":
+            self.settings = copy.deepcopy(dict(saved))
+            self.space = relevant(self.space, block)
+            self.cost_limit = self._find_limit(block)
+            if block.get("beta") == "auto":
+                block["cost_limit"] = self.settings["cost_limit"] = self.cost_limit
+        return block, saved
+
+    def _find_limit(self, block: dict[str, Any]) -> float:
+        threshold = gym.spec(self.env_name.gym_id).reward_threshold
+        for limit in (self.cost_limit, block.get("cost_limit"), None if threshold is None else -threshold):
+            if limit is not None and limit != 0 and math.isfinite(limit):
+                return float(limit)
+        raise ValueError(
+            f"tuning needs a limit on the expected cost (minus the reward) of {self.env_name.gym_id}, a finite number "
+            "other than 0: give --cost-limit"
+        )
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """Train with what the trial samples."""
+        if self.algo != "tdpg":
+            return super().objective(trial)
+        assert self.cost_limit is not None
+        values = sample(trial, self.space)
+        settings = put_in(self.settings, values, abs(self.cost_limit))
+        sampled = {key: value for key, value in settings.items() if value != self.settings.get(key)}
+        hyperparams = {**self._hyperparams, **self._preprocess_schedules(sampled)}
+        with (
+            contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env,
+            contextlib.closing(self.create_envs(self.n_eval_episodes, eval_env=True)) as eval_env,
+        ):
+            model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
+            callbacks = get_callback_list({"callback": self.specified_callbacks})
+            measuring = _Measuring(trial, eval_env, self.cost_limit, self.n_timesteps // self.n_evaluations)
+            measuring.is_constrained = self.objective_kind == "information"
+            # What is judged is the last policy.
+            others = [callback for callback in callbacks if not isinstance(callback, SelectionCallback)]
+            model.learn(self.n_timesteps, [*others, measuring])
+            if measuring.is_pruned:
+                raise optuna.TrialPruned
+            return measuring.measure()
+
+    def hyperparameters_optimization(self) -> None:
+        """Run trials, beside any number of other workers, until the study has as many as were asked for."""
+        if self.algo != "tdpg":
+            super().hyperparameters_optimization()
+            return
+        assert self.storage is not None and self.study_name is not None
+        description = dict(
+            env_id=self.env_name.gym_id,
+            objective=self.objective_kind,
+            cost_limit=self.cost_limit,
+            space=self.space,
+            block=self.settings,
+            n_timesteps=self.n_timesteps,
+            eval_env_kwargs=self.eval_env_kwargs,
+            n_evaluations=self.n_evaluations,
+            n_eval_episodes=self.n_eval_episodes,
+        )
+        study = open_study(
+            open_storage(self.storage),
+            self.study_name,
+            sampler=self._create_sampler(self.sampler),
+            pruner=self._create_pruner(self.pruner),
+            space=description,
+        )
+        work(study, self.objective, self.max_total_trials or self.n_trials)
+        self._write_results(study, description)
+
+    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
+        if self.algo != "tdpg" or self.objective_kind != "information" or sampler_method != "tpe":
+            return super()._create_sampler(sampler_method)
+        return optuna.samplers.TPESampler(
+            n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, constraints_func=_constraints
+        )
+
+    def _write_results(self, study: optuna.Study, description: dict[str, Any]) -> None:
+        folder = Path(self.save_path)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_frame_atomically(study.trials_dataframe(), folder / "trials.csv")
+        write_run_config(folder / "study.json", dict(study=self.study_name, **description))
+        best = best_trial(study)
+        if best is None:
+            print(
+                f"none of the finished trials of {self.study_name} keeps the expected cost below "
+                f"{self.cost_limit:g}: raise --cost-limit, train longer with -n, or try more with --n-trials"
+            )
+            return
+        assert self.cost_limit is not None
+        settings = put_in(self.settings, best.params, abs(self.cost_limit))
+        settings["n_timesteps"] = self.n_timesteps
+        text = yaml.safe_dump({self.block or self.env_name.gym_id: settings}, sort_keys=False)
+        write_atomically(folder / "best.yml", f"# Trial {best.number} of {self.study_name}: {_result(best)}\n{text}")
+        print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")
+        for name, value in best.params.items():
+            print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+        print(f"results are in {folder}; to train with them: sb3-tdpg train --env {self.env_name.gym_id} --conf-file ", end="")
+        print(folder / "best.yml" if self.block is None else f"{folder / 'best.yml'} --block {self.block}")
+
+
+class _Measuring(BaseCallback):
+    """Measures cost and information on fresh episodes now and then, and has the trial pruned where it falls behind."""
+
+    def __init__(self, trial: optuna.Trial, env: VecEnv, cost_limit: float, interval: int) -> None:
+        super().__init__()
+        self.trial, self.env, self.cost_limit, self.interval = trial, env, cost_limit, interval
+        self.is_constrained = True
+        self.is_pruned = False
+        self._next = interval
+
+    def measure(self) -> float:
+        """Measure the policy as it is now, and return what is to be minimised."""
+        assert isinstance(self.model, TDPG)
+        episodes = encode_episodes(self.model, self.env, seed=self.trial.number)
+        cost, information = float(episodes.costs.mean()), episodes.information
+        self.trial.set_user_attr(COST, cost)
+        self.trial.set_user_attr(INFORMATION, information)
+        if not self.is_constrained:
+            return cost
+        self.trial.set_user_attr(EXCESS, cost - self.cost_limit)
+        return information
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps < self._next:
+            return
+        self._next += self.interval
+        value = self.measure()
+        excess = self.trial.user_attrs.get(EXCESS, 0.0)
+        # Whatever meets the limit comes before whatever does not: its rank is below 1.
+        behind = excess / (excess + abs(self.cost_limit)) + 1 if excess > 0 else value / (abs(value) + 1)
+        self.trial.report(behind if self.is_constrained else value, self.num_timesteps)
+        self.is_pruned = self.trial.should_prune()
+
+    def _on_step(self) -> bool:
+        return not self.is_pruned
+
+
+def _constraints(trial: optuna.trial.FrozenTrial) -> tuple[float, ...]:
+    # A trial that was pruned before it was measured counts as the worst.
+    return (trial.user_attrs.get(EXCESS, math.inf),)
+
+
+def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
+    """Return the complete trial with the least value, of those that meet the limit on the cost if there is one."""
+    complete = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
+    met = [trial for trial in complete if trial.user_attrs.get(EXCESS, 0.0) <= 0]
+    return min(met, key=lambda trial: trial.value, default=None)  # type: ignore[arg-type, return-value]
+
+
+def block_of_trial(storage: str, study_name: str, number: int | None = None) -> dict[str, Any]:
+    """
+    Return the hyperparameters that a trial of :class:`TuningManager` was run with.
+
+    :param storage: Of the study.
+    :param study_name: Its name.
+    :param number: Of the trial; default: the best one.
+    :raises ValueError: if there is no such study or trial.
+    """
+    try:
+        study = optuna.load_study(study_name=study_name, storage=open_storage(storage))
+    except KeyError as e:
+        raise ValueError(f"there is no study {study_name!r} in {storage}") from e
+    trials = {trial.number: trial for trial in study.get_trials()}
+    trial = best_trial(study) if number is None else trials.get(number)
+    if trial is None:
+        raise ValueError(f"study {study_name!r} has no trial {number}: it has {len(trials)}, from number 0")
+    described = study.user_attrs["space"]
+    # JSON has no infinity.
+    block = {key: math.inf if value == "inf" else value for key, value in described["block"].items()}
+    return put_in(block, trial.params, abs(described["cost_limit"]))
+
+
+def _result(trial: optuna.trial.FrozenTrial) -> str:
+    return f"expected cost {trial.user_attrs[COST]:.4g}, {trial.user_attrs[INFORMATION]:.4g} nat"
