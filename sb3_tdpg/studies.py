@@ -1,0 +1,151 @@
+"""
+One Optuna study that any number of worker processes on any number of machines work at.
+
+What is to be done follows from the trials in the storage alone, so that a worker may be killed between any two steps:
+
+- A *job* is a parameter set that is to be run to its end once. Its trials are its *attempts*: they share the
+  attribute ``job``, the number of the first one or what :func:`enqueue_once` wrote there.
+- Of several living attempts at a job the one with the lowest number counts; the others are given up before they are
+  run. Likewise a job beyond ``n_trials``, which appears when two workers begin the last one at once.
+- A worker changes the attribute ``heartbeat`` of its trial every few seconds. A running trial whose heartbeat no other
+  worker sees change for ``grace_period`` is failed, and attempted again with the same parameters.
+
+Optuna's own heartbeats are not used: there are none for journal files, a trial whose worker dies before its first
+heartbeat counts as running for ever, and one whose finder dies before it has put it into the queue again is lost.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+try:
+    import optuna
+except ImportError as e:
+    raise ImportError("studies need Optuna: pip install sb3_tdpg[zoo]") from e
+
+from sb3_tdpg.evaluation.provenance import jsonable
+from sb3_tdpg.storages import open_storage, quiet_optuna
+from sb3_tdpg.study_jobs import JOB, job_of
+from sb3_tdpg.study_worker import Objective, Worker
+
+__all__ = ["enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
+
+HEARTBEAT_INTERVAL = 20.0  # seconds
+GRACE_PERIOD = 120.0
+CREATION_TIME = 10.0  # seconds from the creation of a study to the description of its space, at most
+SPACE = "space"  # attribute of a study
+
+
+def open_study(
+    storage: optuna.storages.BaseStorage,
+    name: str,
+    *,
+    directions: Sequence[str] = ("minimize",),
+    sampler: optuna.samplers.BaseSampler | None = None,
+    pruner: optuna.pruners.BasePruner | None = None,
+    space: Mapping[str, Any],
+) -> optuna.Study:
+    """
+    Create a study, or load it if it is there; workers may do so at once.
+
+    :param storage: From :func:`open_storage`.
+    :param name: Name of the study.
+    :param directions: ``"minimize"`` or ``"maximize"`` for each objective.
+    :param sampler: As for ``optuna.create_study``. Not shared: each worker has its own.
+    :param pruner: Likewise.
+    :param space: All that makes one trial comparable with another, in JSON's types: search space, environment,
+        settings. It is kept with the study.
+    :raises ValueError: if the study was made with another space or other directions; it says what differs.
+    """
+    wanted = json.loads(json.dumps(jsonable({SPACE: space, "directions": list(directions)})))
+    kinds: list[Any] = list(directions)
+    try:
+        study = optuna.create_study(storage=storage, study_name=name, directions=kinds, sampler=sampler, pruner=pruner)
+    except optuna.exceptions.DuplicatedStudyError:
+        study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=pruner)
+        # Only the one that created the study writes, so that two with different spaces cannot both believe in theirs.
+        deadline = time.monotonic() + CREATION_TIME
+        while SPACE not in study.user_attrs and not study.get_trials(deepcopy=False) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        if SPACE not in study.user_attrs and study.get_trials(deepcopy=False):
+            raise ValueError(
+                f"study {name!r} was made by another program and does not say what its trials are: choose another name"
+            ) from None
+        if SPACE in study.user_attrs:
+            found = {SPACE: study.user_attrs[SPACE], "directions": [d.name.lower() for d in study.directions]}
+            if changed := _differences(found, wanted):
+                raise ValueError(
+                    f"study {name!r} is there with other settings, {'; '.join(changed)}: choose another name for the "
+                    "study, or the settings that it was made with"
+                ) from None
+            return study
+    study.set_user_attr(SPACE, wanted[SPACE])
+    return study
+
+
+def _differences(found: Any, wanted: Any, where: str = "") -> list[str]:
+    """Name what differs in two values of JSON's types."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        keys = sorted({*found, *wanted})
+        inside = [_differences(found.get(k), wanted.get(k), f"{where}.{k}" if where else k) for k in keys]
+        return [line for lines in inside for line in lines]
+    return (
+        [] if found == wanted else [f"{where.removeprefix(SPACE + '.')}: {_short(found)} there, {_short(wanted)} here"]
+    )
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def enqueue_once(study: optuna.Study, jobs: Sequence[Mapping[str, Any]]) -> None:
+    """
+    Put jobs into the queue, each once, however often and by however many workers at once this is called.
+
+    :param study: From :func:`open_study`.
+    :param jobs: Parameters of each, in JSON's types. An objective gets them through ``trial.suggest_*``.
+    """
+    there = {job_of(trial) for trial in study.get_trials(deepcopy=False)}
+    for job in jobs:
+        name = json.dumps(jsonable(job), sort_keys=True)
+        if name not in there:
+            study.enqueue_trial(dict(job), user_attrs={JOB: name})
+
+
+def work(
+    study: optuna.Study,
+    objective: Objective,
+    n_trials: int | None = None,
+    *,
+    max_retries: int = 3,
+    heartbeat_interval: float = HEARTBEAT_INTERVAL,
+    grace_period: float = GRACE_PERIOD,
+    report: Callable[[str], None] = print,
+) -> None:
+    """
+    Run trials of a study until it is finished, beside any number of workers that do the same.
+
+    A trial is finished when it is complete or pruned. One that raises a ``ValueError`` is pruned, and keeps the message
+    as its attribute ``reason``. Any other exception is recorded likewise, puts the trial back into the queue and ends
+    this worker. Ctrl-C puts the trial back. One whose worker was killed is run again by another, or by a later, worker.
+
+    :param study: From :func:`open_study`.
+    :param objective: Gets a trial, returns its value or values.
+    :param n_trials: Finished trials that the study is to have, all workers and earlier calls together; ``None``: all
+        that :func:`enqueue_once` put into the queue.
+    :param max_retries: How often a trial that failed, or took its worker with it, is run again. Then it is left, and
+        if ``n_trials`` is given, another one takes its place.
+    :param heartbeat_interval: Seconds.
+    :param grace_period: Seconds without a heartbeat after which a worker counts as dead.
+    :param report: Gets a line of text whenever something happens.
+    :raises ValueError: if the grace period is too short, or the storage stays away.
+    """
+    if n_trials is not None and n_trials < 1:
+        raise ValueError(f"n_trials={n_trials} must be at least 1")
+    if grace_period < 2 * heartbeat_interval:
+        raise ValueError(f"{grace_period=} must be at least twice heartbeat_interval={heartbeat_interval} (seconds)")
+    Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report).run()
