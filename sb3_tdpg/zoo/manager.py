@@ -149,7 +149,8 @@ class TDPGExperimentManager(ExperimentManager):
         with warnings.catch_warnings():
             # It tells its episodes' returns itself, but writes no file, which the zoo's plots read.
             warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Monitor`")
-            env = VecMonitor(env, None if eval_env or no_log else self._new_monitor())
+            is_logged = not (eval_env or no_log or self.optimize_hyperparameters)
+            env = VecMonitor(env, self._new_monitor() if is_logged else None)
         if self.vec_env_wrapper is not None:
             env = self.vec_env_wrapper(env)
         env = self._maybe_normalize(env, eval_env)

@@ -32,8 +32,8 @@ from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
 OBJECTIVES = ("information", "shift")
 N_EVALUATIONS = 10
-# What a trial keeps beside its value, and what the sampler takes for a constraint: not above 0.
-COST, INFORMATION, EXCESS = "cost", "information", "excess_cost"
+# What a trial keeps beside its value. The cost above the limit is a constraint, too.
+COST, INFORMATION = "cost", "information"
 
 
 class TuningManager(TDPGExperimentManager):
@@ -72,7 +72,9 @@ class TuningManager(TDPGExperimentManager):
 
     def _find_limit(self, block: dict[str, Any]) -> float:
         threshold = gym.spec(self.env_name.gym_id).reward_threshold
-        for limit in (self.cost_limit, block.get("cost_limit"), None if threshold is None else -threshold):
+        selections = [c for c in get_callback_list(block) if isinstance(c, SelectionCallback)]
+        limits = [self.cost_limit, block.get("cost_limit"), *(c.cost_limit for c in selections)]
+        for limit in (*limits, None if threshold is None else -threshold):
             if limit is not None and limit != 0 and math.isfinite(limit):
                 return float(limit)
         raise ValueError(
@@ -95,14 +97,18 @@ class TuningManager(TDPGExperimentManager):
         ):
             model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
             callbacks = get_callback_list({"callback": self.specified_callbacks})
-            measuring = _Measuring(trial, eval_env, self.cost_limit, self.n_timesteps // self.n_evaluations)
-            measuring.is_constrained = self.objective_kind == "information"
+            is_constrained = self.objective_kind == "information"
+            limit = self.cost_limit if is_constrained else math.inf
+            measuring = _Measuring(trial, eval_env, limit, self.n_timesteps // self.n_evaluations)
             # What is judged is the last policy.
             others = [callback for callback in callbacks if not isinstance(callback, SelectionCallback)]
             model.learn(self.n_timesteps, [*others, measuring])
+            cost, information = measuring.last if measuring.is_pruned else measuring.measure()
+            if is_constrained:
+                trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
                 raise optuna.TrialPruned
-            return measuring.measure()
+            return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
         """Run trials, beside any number of other workers, until the study has as many as were asked for."""
@@ -131,13 +137,6 @@ class TuningManager(TDPGExperimentManager):
         work(study, self.objective, self.max_total_trials or self.n_trials)
         self._write_results(study, description)
 
-    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
-        if self.algo != "tdpg" or self.objective_kind != "information" or sampler_method != "tpe":
-            return super()._create_sampler(sampler_method)
-        return optuna.samplers.TPESampler(
-            n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, constraints_func=_constraints
-        )
-
     def _write_results(self, study: optuna.Study, description: dict[str, Any]) -> None:
         folder = Path(self.save_path)
         folder.mkdir(parents=True, exist_ok=True)
@@ -163,51 +162,53 @@ class TuningManager(TDPGExperimentManager):
 
 
 class _Measuring(BaseCallback):
-    """Measures cost and information on fresh episodes now and then, and has the trial pruned where it falls behind."""
+    """
+    Measures cost and information on fresh episodes now and then, and has the trial pruned where it falls behind.
 
-    def __init__(self, trial: optuna.Trial, env: VecEnv, cost_limit: float, interval: int) -> None:
+    :param limit: On the cost; infinite: the cost itself is minimised.
+    :param interval: Environment steps from one measurement to the next.
+    """
+
+    def __init__(self, trial: optuna.Trial, env: VecEnv, limit: float, interval: int) -> None:
         super().__init__()
-        self.trial, self.env, self.cost_limit, self.interval = trial, env, cost_limit, interval
-        self.is_constrained = True
+        self.trial, self.env, self.limit, self.interval = trial, env, limit, interval
         self.is_pruned = False
+        self.last = (math.inf, math.inf)
         self._next = interval
 
-    def measure(self) -> float:
-        """Measure the policy as it is now, and return what is to be minimised."""
+    def measure(self) -> tuple[float, float]:
+        """Return the expected cost and the information in nats of the policy as it is now."""
         assert isinstance(self.model, TDPG)
         episodes = encode_episodes(self.model, self.env, seed=self.trial.number)
-        cost, information = float(episodes.costs.mean()), episodes.information
-        self.trial.set_user_attr(COST, cost)
-        self.trial.set_user_attr(INFORMATION, information)
-        if not self.is_constrained:
-            return cost
-        self.trial.set_user_attr(EXCESS, cost - self.cost_limit)
-        return information
+        self.last = (float(episodes.costs.mean()), episodes.information)
+        for name, value in zip((COST, INFORMATION), self.last, strict=True):
+            self.trial.set_user_attr(name, value)
+        return self.last
 
     def _on_rollout_start(self) -> None:
         if self.num_timesteps < self._next:
             return
         self._next += self.interval
-        value = self.measure()
-        excess = self.trial.user_attrs.get(EXCESS, 0.0)
-        # Whatever meets the limit comes before whatever does not: its rank is below 1.
-        behind = excess / (excess + abs(self.cost_limit)) + 1 if excess > 0 else value / (abs(value) + 1)
-        self.trial.report(behind if self.is_constrained else value, self.num_timesteps)
+        self.trial.report(_rank(*self.measure(), self.limit), self.num_timesteps)
         self.is_pruned = self.trial.should_prune()
 
     def _on_step(self) -> bool:
         return not self.is_pruned
 
 
-def _constraints(trial: optuna.trial.FrozenTrial) -> tuple[float, ...]:
-    # A trial that was pruned before it was measured counts as the worst.
-    return (trial.user_attrs.get(EXCESS, math.inf),)
+def _rank(cost: float, information: float, limit: float) -> float:
+    """Order policies: those that meet the limit come first, below 1, by their information; the others by their cost."""
+    if math.isinf(limit):
+        return cost
+    if cost <= limit:
+        return information / (information + 1)
+    return 1 + (cost - limit) / (cost - limit + abs(limit))
 
 
 def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
     """Return the complete trial with the least value, of those that meet the limit on the cost if there is one."""
     complete = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
-    met = [trial for trial in complete if trial.user_attrs.get(EXCESS, 0.0) <= 0]
+    met = [trial for trial in complete if all(value <= 0 for value in trial.constraints.values())]
     return min(met, key=lambda trial: trial.value, default=None)  # type: ignore[arg-type, return-value]
 
 
