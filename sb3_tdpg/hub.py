@@ -23,7 +23,6 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_tdpg.enjoy import enjoy
 from sb3_tdpg.evaluation import save_figure, training_curves, write_frame_atomically, write_run_config
-from sb3_tdpg.files import write_atomically
 from sb3_tdpg.model_card import (
     ALGORITHM,
     card_metadata,
@@ -54,7 +53,7 @@ def write_model_card(
     It has what people and programs look for in a Stable-Baselines3 model on the Hub: ``README.md`` with metadata,
     ``tdpg-<environment>.zip``, ``config.yml``, ``args.yml``, ``env_kwargs.yml``, ``results.json`` (of the training
     environment) and ``train_eval_metrics.zip``; and ``episodes.csv``, ``config.json`` and ``training.png``.
-    ``README.md`` is written last.
+    The folder is there only when all is written.
 
     :param source: A run's folder, a folder of rl-zoo3 (its policy is evaluated now), or a publication.
     :param out: The folder; it must not exist, or be empty.
@@ -71,22 +70,15 @@ def write_model_card(
     _check_empty(out)
     publication = source if isinstance(source, Publication) else read_publication(Path(source), **evaluation)
     results = results_with_intervals(publication.records)
-    out.mkdir(parents=True, exist_ok=True)
-    model_path = out / f"{model_name(publication.env_id)}.zip"
-    if isinstance(publication.model, TDPG):
-        publication.model.save(model_path)
-    else:
+    if not isinstance(publication.model, TDPG):
         TDPG.load(publication.model, device="cpu")  # a damaged file is refused
-        shutil.copyfile(publication.model, model_path)
-    _write_files(publication, results, out)
-    if publication.progress is not None:
-        save_figure(training_curves({publication.method: publication.progress}), out / "training.png")
-    if film_episodes:
-        film = out / "replay.mp4"
-        enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=film)
-    metadata = card_metadata(publication, results).to_yaml()
-    text = card_text(publication, results, repo_id, [path.name for path in out.iterdir()])
-    write_atomically(out / "README.md", f"---\n{metadata}\n---\n\n{text}")
+    partial = out.with_name(out.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    _write_folder(publication, results, partial, repo_id, film_episodes)
+    if out.exists():
+        out.rmdir()
+    partial.rename(out)
     return out
 
 
@@ -202,6 +194,23 @@ def _only_model(repo_id: str, files: Iterable[str]) -> str:
     return models[0]
 
 
+def _write_folder(publication: Publication, results: pd.DataFrame, out: Path, repo_id: str, film_episodes: int) -> None:
+    model_path = out / f"{model_name(publication.env_id)}.zip"
+    if isinstance(publication.model, TDPG):
+        publication.model.save(model_path)
+    else:
+        shutil.copyfile(publication.model, model_path)
+    _write_files(publication, results, out)
+    if publication.progress is not None:
+        save_figure(training_curves({publication.method: publication.progress}), out / "training.png")
+    if film_episodes:
+        film = out / "replay.mp4"
+        enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=film)
+    metadata = card_metadata(publication, results).to_yaml()
+    text = card_text(publication, results, repo_id, [path.name for path in out.iterdir()])
+    (out / "README.md").write_text(f"---\n{metadata}\n---\n\n{text}", encoding="utf-8")
+
+
 def _write_files(publication: Publication, results: pd.DataFrame, out: Path) -> None:
     """Write what programs read."""
     for name, path in publication.files.items():
@@ -211,7 +220,7 @@ def _write_files(publication: Publication, results: pd.DataFrame, out: Path) -> 
     args = dict(algo=ALGORITHM, env=publication.env_id, env_kwargs=env_kwargs, seed=publication.seed)
     for name, content in (("config.yml", settings), ("args.yml", args), ("env_kwargs.yml", env_kwargs)):
         if name not in publication.files:
-            write_atomically(out / name, yaml.safe_dump(content, sort_keys=False))
+            (out / name).write_text(yaml.safe_dump(content, sort_keys=False))
     training = results.iloc[0]
     zoo_results = dict(
         mean_reward=-float(training["mean"]),
@@ -220,7 +229,7 @@ def _write_files(publication: Publication, results: pd.DataFrame, out: Path) -> 
         n_eval_episodes=int(training["n"]),
         eval_datetime=publication.evaluated.isoformat(timespec="seconds"),
     )
-    write_atomically(out / "results.json", json.dumps(zoo_results, indent=2) + "\n")
+    (out / "results.json").write_text(json.dumps(zoo_results, indent=2) + "\n")
     with zipfile.ZipFile(out / "train_eval_metrics.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for path in publication.metrics:
             archive.write(path, path.name)

@@ -26,7 +26,7 @@ def import_hub_extra() -> tuple[Any, Any]:
     :raises ImportError: if something is missing, with the extra that has it.
     """
     try:
-        import huggingface_hub
+        import huggingface_hub.errors  # a submodule that is not there of itself
         import matplotlib  # noqa: F401
         from scipy import stats
     except ImportError as e:
@@ -57,7 +57,7 @@ def results_with_intervals(records: pd.DataFrame) -> pd.DataFrame:
     for column in ("model", "train_seed", "deterministic"):
         if column in records and records[column].nunique() > 1:
             raise ValueError(
-                f"a model card is of one policy, and the records are of {column} {sorted(records[column].unique())}: "
+                f"a model card is of one policy, and the records are of {column} {records[column].unique().tolist()}: "
                 "select the rows of one"
             )
     if records.empty or (records.groupby("scenario").size() < 2).any():

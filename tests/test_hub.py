@@ -1,4 +1,4 @@
-"""Models on the Hugging Face Hub: the folder that is pushed, read back by all who would read it. Nothing goes online."""
+"""Models on the Hugging Face Hub: the folder that is pushed, read back by all who would read it, offline."""
 
 import json
 import os
@@ -12,24 +12,28 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from small_problems import assert_same_parameters, parameters, tiny_tdpg, train_epochs
+from small_problems import assert_same_parameters, lava_env, parameters, tiny_tdpg, train_epochs
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.hub import load_from_hub, pull_from_hub, push_to_hub, write_model_card
 from sb3_tdpg.model_card import model_name, results_with_intervals
-from sb3_tdpg.publication import Publication, read_run
+from sb3_tdpg.publication import Publication, read_publication, read_run
 from sb3_tdpg.rerun import main as rerun_main
 from sb3_tdpg.rerun import rerun
 from sb3_tdpg.runs import Run, complete_run
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
+errors = pytest.importorskip("huggingface_hub.errors")
 pytest.importorskip("scipy")
 pytest.importorskip("matplotlib")
 
@@ -224,7 +228,7 @@ def test_a_model_from_the_hub_is_the_one_that_was_trained(card, runs, on_the_hub
         huggingface_hub.HfApi, "list_repo_files", lambda api, repo_id, revision: [*names, "tdpg-seed7/model.zip"]
     )
     monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
-    model = load_from_hub(REPO_ID, env="Lava-v0", revision="main", token="secret", device="cpu", beta=1 / 50)
+    model = load_from_hub(REPO_ID, env=lava_env(), revision="main", token="secret", device="cpu", beta=1 / 50)
     trained = TDPG.load(runs / "tdpg-seed0" / "model.zip", device="cpu")
     assert_same_parameters(parameters(model.policy), parameters(trained.policy))
     assert model.env is not None
@@ -299,3 +303,253 @@ def test_results_json_is_the_zoos(card):
         is_deterministic=False,
         n_eval_episodes=30,
     )
+
+
+@pytest.fixture(scope="module")
+def zoo_folder(tmp_path_factory):
+    """What the zoo's train leaves of a training on normalised observations, with the evaluations of a callback."""
+    try:
+        import rl_zoo3.train
+    except ImportError as e:
+        pytest.skip(f"rl_zoo3 does not import: {e}")
+    folder = tmp_path_factory.mktemp("zoo")
+    block = dict(
+        policy="TRVPolicy",
+        n_timesteps=500,
+        n_envs=2,
+        n_episodes=20,
+        beta=float("inf"),
+        normalize=dict(norm_obs=True, norm_reward=False),
+        env_kwargs=dict(action_cost=1.0),
+    )
+    (folder / "conf.yml").write_text(yaml.safe_dump({"Lava-v0": block}))
+    flags = f"train --algo tdpg --env Lava-v0 --seed 3 -f {folder}/logs --conf-file {folder}/conf.yml --eval-freq 100"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(rl_zoo3.ALGOS, "tdpg", TDPG)
+        patch.setattr(sys, "argv", flags.split())
+        rl_zoo3.train.train()
+    return folder / "logs" / "tdpg" / "Lava-v0_1"
+
+
+def test_a_folder_of_the_zoo_is_evaluated_and_told_of(zoo_folder, tmp_path):
+    card = write_model_card(zoo_folder, tmp_path / "card", REPO_ID, n_eval_episodes=10, seed=5, scenarios=LAVA[:2])
+    records = pd.read_csv(card / "episodes.csv")
+    assert records.groupby("scenario").size().to_dict() == {"Training": 10, "Sensor noise 1e-3": 10}
+
+    statistics = zoo_folder / "Lava-v0" / "vecnormalize.pkl"
+    assert (card / "vec_normalize.pkl").read_bytes() == statistics.read_bytes()
+    env = VecNormalize.load(str(statistics), lava_env(1))
+    model = TDPG.load(card / "tdpg-Lava-v0.zip", env=env, device="cpu")
+    by_hand = evaluate_scenarios(model, LAVA[:2], 10, seed=5, env_kwargs=dict(action_cost=1.0))
+    assert records["cost"].to_numpy() == pytest.approx(by_hand["cost"].to_numpy())
+    assert "VecNormalize.load" in text_of(card)
+
+    for name in ("args.yml", "config.yml", "command.txt"):
+        assert (card / name).read_bytes() == (zoo_folder / "Lava-v0" / name).read_bytes()
+    with zipfile.ZipFile(card / "train_eval_metrics.zip") as archive:
+        assert set(archive.namelist()) == {"0.monitor.csv", "1.monitor.csv", "evaluations.npz"}
+    text = text_of(card)
+    assert "gym.make('Lava-v0', action_cost=1.0)" in text
+    assert "training seed: 3\n" in text
+    assert re.search(r"versions: Python \d.*PyTorch \d", text)
+    assert (card / "training.png").exists()
+
+
+def test_the_training_of_the_zoo_is_drawn_by_its_monitors(zoo_folder):
+    progress = read_publication(zoo_folder, n_eval_episodes=2, scenarios=LAVA[:1]).progress
+    rewards = load_results(str(zoo_folder))["r"].to_numpy()
+    assert len(rewards) == 100
+    assert progress["time/iterations"].tolist() == [1, 2, 3, 4, 5]
+    assert progress["rollout/ep_cost_mean"].to_numpy() == pytest.approx(-rewards.reshape(5, 20).mean(axis=1))
+
+
+def test_a_folder_of_the_zoo_without_its_last_policy_gives_the_best_one(zoo_folder, tmp_path):
+    copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
+    (copy / "Lava-v0.zip").unlink()
+    publication = read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1])
+    assert publication.model == copy / "best_model.zip"
+    assert "did best" in publication.notes[0]
+    (copy / "best_model.zip").unlink()
+    with pytest.raises(ValueError, match=r"neither Lava-v0.zip nor best_model.zip: let the training end first"):
+        read_publication(copy)
+
+
+def test_a_model_in_memory_is_published_with_its_records(tmp_path):
+    model = train_epochs(tiny_tdpg(), 2)
+    rows = [Scenario("Wide", "Lava-v0", dict(sensor_noise_std=0.5)), LAVA[0]]
+    records = evaluate_scenarios({"mine": model}, rows, 5, deterministic=True)
+    settings = dict(beta=float("inf"), learning_rate=np.float64(0.5), env_kwargs=dict(sensor_noise_std=0.5))
+    publication = Publication(
+        model=model, env_id="sb3_tdpg:Lava-v0", records=records, scenarios=rows, method="mine", settings=settings
+    )
+    card = write_model_card(publication, tmp_path / "card", REPO_ID, film_episodes=0)
+    loaded = TDPG.load(card / "tdpg-Lava-v0.zip", device="cpu")
+    assert_same_parameters(parameters(loaded.policy), parameters(model.policy))
+    assert yaml.safe_load((card / "config.yml").read_text()) == dict(
+        beta=float("inf"), learning_rate=0.5, env_kwargs=dict(sensor_noise_std=0.5)
+    )
+    text = text_of(card)
+    assert "Deterministic policy" in text
+    assert "| Wide |  | 5 |" in text, "it is the training environment"
+    assert "training.png" not in text
+    assert huggingface_hub.ModelCard(text).data.eval_results[0].dataset_config == "Training"
+    with pytest.raises(ValueError, match="does not describe a run"):
+        rerun(card / "config.json", tmp_path / "again")
+
+
+def test_shares_of_failures_have_wilsons_interval():
+    records = pd.DataFrame(
+        dict(model="PG", scenario="Training", cost=[0.0] * 10, failure=[False] * 10, seed=0, deterministic=False)
+    )
+    row = results_with_intervals(records).iloc[0]
+    assert (row["failure_low"], row["failure_high"]) == (pytest.approx(0), pytest.approx(0.27753, abs=1e-5))
+    records["failure"] = [True] + [False] * 9
+    row = results_with_intervals(records).iloc[0]
+    assert (row["failure_low"], row["failure_high"]) == (
+        pytest.approx(0.01788, abs=1e-5),
+        pytest.approx(0.40415, abs=1e-5),
+    )
+
+
+def test_the_film_of_some_episodes_lies_beside_the_card(runs, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    card = write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=1)
+    assert b"ftyp" in (card / "replay.mp4").read_bytes()[:12]
+    assert "[replay.mp4](replay.mp4)" in text_of(card)
+
+
+@pytest.mark.parametrize("missing", ["config.json", "model.zip", "episodes.csv"])
+def test_what_is_not_finished_is_refused_and_nothing_is_written(missing, runs, tmp_path):
+    copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
+    (copy / missing).unlink()
+    message = "holds no training" if missing == "config.json" else f"no finished run, since {missing} is missing"
+    with pytest.raises(ValueError, match=message):
+        write_model_card(copy, tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_records_that_are_not_of_one_policy_are_refused(runs, tmp_path):
+    run = read_run(runs / "pg-seed0")
+    for records, message in (
+        (pd.concat([run.records, run.records.assign(train_seed=7)]), r"the records are of train_seed \[0, 7\]"),
+        (pd.concat([run.records, run.records.assign(model="TDPG")]), r"the records are of model \['PG', 'TDPG'\]"),
+        (run.records[:31], "at least 2 episodes of each scenario"),
+        (run.records[:0], "at least 2 episodes of each scenario"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_model_card(replace(run, records=records), tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_a_damaged_model_is_refused_and_no_card_is_written(runs, tmp_path):
+    damaged = tmp_path / "model.zip"
+    damaged.write_bytes(b"no zip")
+    with pytest.raises(ValueError, match="wasn't a zip-file"):
+        write_model_card(replace(read_run(runs / "pg-seed0"), model=damaged), tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_a_card_that_could_not_be_finished_does_not_stand_in_the_way(runs, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("sb3_tdpg.hub.card_text", Mock(side_effect=KeyboardInterrupt))
+        write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+    write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
+    assert [path.name for path in tmp_path.iterdir()] == ["card"]
+
+
+def test_a_folder_with_something_in_it_is_left_alone(card, runs, tmp_path):
+    before = {path: path.read_bytes() for path in card.rglob("*") if path.is_file()}
+    for refused in (lambda: write_model_card(runs / "pg-seed0", card, REPO_ID), lambda: pull_from_hub(REPO_ID, card)):
+        with pytest.raises(ValueError, match="exists already: choose another folder, or remove it"):
+            refused()
+    assert {path: path.read_bytes() for path in card.rglob("*") if path.is_file()} == before
+
+
+@pytest.fixture
+def api(monkeypatch):
+    """A stand-in for the client: it writes down what it is told, and fails if it is told to."""
+    api = SimpleNamespace(calls=[], error=None)
+
+    def make(**kwargs):
+        api.calls.append(("HfApi", kwargs))
+        return api
+
+    def create_repo(repo_id, **kwargs):
+        api.calls.append(("create_repo", {"repo_id": repo_id, **kwargs}))
+        if api.error is not None:
+            raise api.error
+        return "https://huggingface.co/" + repo_id
+
+    api.create_repo, api.upload_folder = create_repo, lambda **kwargs: api.calls.append(("upload_folder", kwargs))
+    monkeypatch.setattr(huggingface_hub, "HfApi", make)
+    return api
+
+
+def test_a_push_makes_the_repository_and_uploads_the_folder(card, api):
+    url = push_to_hub(card, REPO_ID, private=True, commit_message="More epochs", token="secret")
+    assert url == "https://huggingface.co/someone/tdpg-Lava-v0"
+    (_, client), (create, repository), (upload, folder) = api.calls
+    assert client["token"] == "secret"
+    assert (create, repository) == ("create_repo", dict(repo_id=REPO_ID, private=True, exist_ok=True))
+    assert upload == "upload_folder"
+    # A film of an earlier model goes, and what else someone has put there stays.
+    gone = folder.pop("delete_patterns")
+    assert {"replay.mp4", "vec_normalize.pkl"} <= set(gone)
+    assert all("*" not in name for name in gone)
+    assert folder == dict(repo_id=REPO_ID, folder_path=card, commit_message="More epochs")
+
+
+def test_a_folder_without_a_card_is_not_pushed(runs, api):
+    with pytest.raises(ValueError, match=r"has no README.md: let write_model_card write the folder first"):
+        push_to_hub(runs / "pg-seed0", REPO_ID)
+    assert not api.calls
+
+
+def http_error(status, text):
+    response = SimpleNamespace(status_code=status, headers={}, request=None)
+    return errors.HfHubHTTPError(text, response=response)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            errors.LocalTokenNotFoundError("Token is required"),
+            r"\(Token is required\): .*hf auth login",
+        ),
+        (http_error(401, "401 Unauthorized\nInvalid user token"), r"\(401 Unauthorized\): .*hf auth login"),
+        (http_error(503, "\n503 Service Unavailable"), r"\(503 Service Unavailable\): try again .* pushed again"),
+        (ConnectionError("no route"), r"\(no route\): try again when the Hub can be reached; .* pushed again"),
+        (errors.HTTPError("refused"), r"\(refused\): try again"),
+    ],
+)
+def test_what_goes_wrong_on_the_way_is_told_in_one_line(error, message, card, api):
+    api.error = error
+    with pytest.raises(ValueError, match="someone/tdpg-Lava-v0 cannot be written " + message) as told:
+        push_to_hub(card, REPO_ID)
+    assert "\n" not in str(told.value)
+    assert api.calls[-1][0] == "create_repo", "nothing is uploaded"
+
+
+def test_a_pull_downloads_the_repository(tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(
+        huggingface_hub, "snapshot_download", lambda repo_id, **kwargs: asked.update(repo_id=repo_id, **kwargs)
+    )
+    assert pull_from_hub(REPO_ID, tmp_path / "there", revision="v1", token="secret") == tmp_path / "there"
+    assert asked.pop("library_name") == "sb3_tdpg"
+    assert asked == dict(repo_id=REPO_ID, revision="v1", local_dir=tmp_path / "there", token="secret")
+
+
+@pytest.mark.parametrize("module", ["huggingface_hub", "scipy", "matplotlib"])
+def test_without_its_extra_the_error_names_it(module, card, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    for call in (
+        lambda: write_model_card(card, tmp_path / "card", REPO_ID),
+        lambda: push_to_hub(card, REPO_ID),
+        lambda: load_from_hub(REPO_ID, trust_remote_code=True),
+        lambda: pull_from_hub(REPO_ID, tmp_path / "there"),
+    ):
+        with pytest.raises(ImportError, match=rf"needs {module} here: pip install sb3_tdpg\[hub\]"):
+            call()
