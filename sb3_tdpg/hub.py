@@ -202,7 +202,10 @@ def _write_folder(publication: Publication, results: pd.DataFrame, out: Path, re
         shutil.copyfile(publication.model, model_path)
     _write_files(publication, results, out)
     if publication.progress is not None:
-        save_figure(training_curves({publication.method: publication.progress}), out / "training.png")
+        figure = training_curves({publication.method: publication.progress})
+        if "mi/total" not in publication.progress:
+            figure.axes[1].set_axis_off()  # nothing is drawn in it
+        save_figure(figure, out / "training.png")
     if film_episodes:
         film = out / "replay.mp4"
         enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=film)

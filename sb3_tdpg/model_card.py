@@ -158,7 +158,7 @@ def card_text(publication: Publication, results: pd.DataFrame, repo_id: str, pic
         results_markdown(publication, results),
         "## Training",
         " ".join(publication.notes),
-        "![Cost and information over the policy epochs](training.png)" if "training.png" in pictures else "",
+        "![The training, epoch by epoch](training.png)" if "training.png" in pictures else "",
         "Episodes of it: [replay.mp4](replay.mp4)." if "replay.mp4" in pictures else "",
         "## Use",
         _use(publication, repo_id),
