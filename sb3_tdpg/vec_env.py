@@ -157,7 +157,7 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
 
 
 def default_n_envs(n_episodes: int) -> int:
-    """Return how many environments run that many episodes where they are not one batch: the largest divisor up to 50."""
+    """Return how many environments run that many episodes where they are no batch: the largest divisor up to 50."""
     return max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
 
 

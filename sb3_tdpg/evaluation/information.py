@@ -59,7 +59,9 @@ def encode_episodes(model: TDPG, env: VecEnv, *, seed: int = 0) -> EncodedEpisod
         alive, costs = np.ones(n, dtype=bool), np.zeros(n)
         for t in range(problem.horizon):
             step = policy.step(obs_as_tensor(obs, device), trvs, np.full(n, t))
-            steps.append((th.as_tensor(states), step.trvs.cpu(), step.means.cpu(), step.stds.cpu(), th.as_tensor(alive)))
+            steps.append(
+                (th.as_tensor(states), step.trvs.cpu(), step.means.cpu(), step.stds.cpu(), th.as_tensor(alive))
+            )
             actions = step.actions.cpu().numpy().reshape((-1, *model.action_space.shape))  # type: ignore[misc]
             if isinstance(model.action_space, spaces.Box):
                 actions = np.clip(actions, model.action_space.low, model.action_space.high)

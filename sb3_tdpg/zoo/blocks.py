@@ -58,8 +58,8 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
     if unknown := sorted(set(block) - ZOO_KEYS - arguments):
         own = sorted(set(inspect.signature(cls.__init__).parameters) - {"self", "env", "_init_setup_model"})
         raise ValueError(
-            f"{where} has {', '.join(unknown)}, which is neither an argument of {cls.__name__} ({', '.join(own)}) nor a "
-            f"key of rl-zoo3 ({', '.join(sorted(ZOO_KEYS))})"
+            f"{where} has {', '.join(unknown)}, which is neither an argument of {cls.__name__} ({', '.join(own)}) nor "
+            f"a key of rl-zoo3 ({', '.join(sorted(ZOO_KEYS))})"
         )
     for key, value in block.items():
         if isinstance(value, str) and _is_number(value):

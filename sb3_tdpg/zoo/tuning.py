@@ -157,7 +157,10 @@ class TuningManager(TDPGExperimentManager):
         print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")
         for name, value in best.params.items():
             print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
-        print(f"results are in {folder}; to train with them: sb3-tdpg train --env {self.env_name.gym_id} --conf-file ", end="")
+        print(
+            f"results are in {folder}; to train with them: sb3-tdpg train --env {self.env_name.gym_id} --conf-file ",
+            end="",
+        )
         print(folder / "best.yml" if self.block is None else f"{folder / 'best.yml'} --block {self.block}")
 
 

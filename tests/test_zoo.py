@@ -1,0 +1,277 @@
+"""``sb3-tdpg train``, ``enjoy``, ``record-video`` and ``plot``: rl-zoo3's programs with TDPG among the algorithms."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from small_problems import assert_same_parameters, parameters
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import load_results
+
+from sb3_tdpg import TDPG, hyperparams
+from sb3_tdpg.cli import main
+
+pytest.importorskip("rl_zoo3")
+
+LAVA = ["--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1", "--verbose", "0"]
+# Twenty epochs of 20 episodes, with a checkpoint in the tenth.
+SHORT = [*LAVA, "-params", "n_episodes:20", "-n", "2000"]
+FILES = sorted(Path(hyperparams.__file__).parent.glob("*.yml"))
+
+
+CARTPOLE = ["-params", "n_episodes:4", "batch_size:4", "-n", "100", "--eval-freq", "-1"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Run in an empty folder, since the zoo writes to logs/ in the present one."""
+    monkeypatch.chdir(tmp_path)
+    # Its plots would open a window.
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    return tmp_path
+
+
+def folder_of(path, n=1, algo="tdpg", env="Lava-v0"):
+    return path / "logs" / algo / f"{env}_{n}"
+
+
+def test_train_leaves_a_model_and_says_how_it_was_made(here):
+    assert main(["train", *SHORT, "--seed", "3"]) == 0
+    folder = folder_of(here)
+    model = TDPG.load(folder / "Lava-v0.zip", device="cpu")
+    assert (model.num_timesteps, model.n_episodes, model.mi_estimator) == (2000, 20, "logdet")
+    record = json.loads((folder / "run.json").read_text())
+    assert (record["seed"], record["block"], record["algo"]) == (3, "Lava-v0-logdet", "tdpg")
+    assert record["hyperparams"]["n_episodes"] == 20
+    assert record["provenance"]["versions"]["sb3_tdpg"]
+    assert len(load_results(str(folder))) == 400  # every episode, though all of them are one batch
+    assert not (folder / "checkpoint.zip").exists()
+    assert not list(folder.rglob("*.partial"))
+
+
+def test_episodes_of_an_environment_of_ours_go_as_a_batch_for_any_algorithm(here, monkeypatch):
+    from sb3_tdpg.zoo.manager import TDPGExperimentManager
+
+    made = []
+    create_envs = TDPGExperimentManager.create_envs
+
+    def spy(self, *args, **kwargs):
+        made.append(create_envs(self, *args, **kwargs).unwrapped)
+        return made[-1]
+
+    monkeypatch.setattr(TDPGExperimentManager, "create_envs", spy)
+    arguments = ["train", "--algo", "ppo", "--env", "Lava-v0", "-n", "100", "--eval-freq", "-1"]
+    assert main([*arguments, "-params", "n_envs:20", "batch_size:50"]) == 0
+    assert main([*arguments, "-params", "n_envs:2", "batch_size:10", "--vec-env", "subproc"]) == 0
+    assert main(["train", "--env", "CartPole-v1", *CARTPOLE]) == 0
+    assert [(type(env).__name__, env.num_envs) for env in made] == [
+        ("BatchedVecEnv", 20),
+        ("SubprocVecEnv", 2),
+        ("DummyVecEnv", 4),
+    ]
+    PPO.load(folder_of(here, algo="ppo") / "Lava-v0.zip", device="cpu")
+
+
+def test_an_interrupted_training_goes_on_as_if_it_had_not_been(here):
+    arguments = ["train", *LAVA, "-params", "n_episodes:20", "-n", "20000", "--seed", "1"]
+    process = start(arguments, here)
+    wait_for(folder_of(here) / "checkpoint.zip", process)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert "--resume logs/tdpg/Lava-v0_1" in output
+    before = len(load_results(str(folder_of(here))))
+    assert main(["train", "--resume", "logs/tdpg/Lava-v0_1", "--seed", "2"]) == 2
+    assert main(["train", "--resume", "logs/tdpg/Lava-v0_1"]) == 0
+    assert not (folder_of(here) / "checkpoint.zip").exists()
+    assert len(load_results(str(folder_of(here)))) > before
+    assert main(["train", "--resume", "logs/tdpg/Lava-v0_1"]) == 2  # it is finished
+
+    assert main(arguments) == 0
+    resumed, whole = (TDPG.load(folder_of(here, n) / "Lava-v0.zip", device="cpu") for n in (1, 2))
+    assert_same_parameters(parameters(resumed.policy), parameters(whole.policy))
+
+
+def test_a_killed_training_with_normalised_observations_goes_on(here):
+    settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
+    process = start(["train", *LAVA, "-params", *settings, "-n", "20000"], here)
+    wait_for(folder_of(here) / "checkpoint.zip", process)
+    process.kill()
+    process.communicate()
+    assert main(["train", "--resume", "logs/tdpg/Lava-v0_1"]) == 0
+    assert TDPG.load(folder_of(here) / "Lava-v0.zip", device="cpu").num_timesteps == 20_000
+
+
+def start(arguments, folder):
+    command = [sys.executable, "-m", "sb3_tdpg", *arguments]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        # A shell that runs the tests in the background has it ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+def wait_for(path, process):
+    deadline = time.monotonic() + 120
+    while not path.exists():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_the_selected_policy_is_the_one_that_is_kept(here, capsys):
+    selection = "callback:[{'sb3_tdpg.callbacks.SelectionCallback':{'cost_limit':1e6}}]"
+    assert main(["train", *LAVA, "-params", "n_episodes:20", selection, "-n", "2000"]) == 0
+    assert "was selected" in capsys.readouterr().out
+    folder = folder_of(here)
+    chosen, kept = (TDPG.load(folder / name, device="cpu") for name in ("selected.zip", "Lava-v0.zip"))
+    assert chosen.num_timesteps < kept.num_timesteps == 2000  # it was not the last one
+    assert_same_parameters(parameters(chosen.policy), parameters(kept.policy))
+
+
+def test_enjoy_finds_what_train_has_left_and_acts_as_it_was_trained(here, capsys, monkeypatch):
+    main(["train", *SHORT])
+    drawn = []
+    predict = TDPG.predict
+    monkeypatch.setattr(TDPG, "predict", lambda *a, **k: (drawn.append(k["deterministic"]), predict(*a, **k))[1])
+    assert main(["enjoy", "--env", "Lava-v0", "--no-render", "-n", "20"]) == 0
+    assert "4 Episodes" in capsys.readouterr().out
+    assert set(drawn) == {False}
+    assert main(["enjoy", "--env", "Lava-v0", "--no-render", "-n", "20", "--deterministic"]) == 0
+    assert drawn[-1] is True
+
+
+def test_plot_and_film_of_a_training(here):
+    main(["train", *SHORT])
+    assert main(["plot", "-e", "Lava-v0", "--save", "curve.png"]) == 0
+    assert (here / "curve.png").stat().st_size > 5000
+    assert main(["record-video", "--env", "Lava-v0", "-n", "5"]) == 0
+    (film,) = here.rglob("*.mp4")
+    assert film.stat().st_size > 1000
+
+
+def test_the_evaluation_has_the_keywords_of_the_block(here, monkeypatch):
+    from sb3_tdpg.zoo.manager import TDPGExperimentManager
+
+    made = []
+    make = TDPGExperimentManager._make_batch
+    monkeypatch.setattr(
+        TDPGExperimentManager,
+        "_make_batch",
+        lambda self, kwargs, **k: (made.append(kwargs), make(self, kwargs, **k))[1],
+    )
+    arguments = [
+        "train",
+        "--env",
+        "Lava-v0",
+        "--block",
+        "Lava-v0-logdet-table",
+        "-n",
+        "100",
+        "-params",
+        "n_episodes:20",
+    ]
+    assert main(arguments) == 0
+    assert all(kwargs["lava_stage_cost"] == 3.0 for kwargs in made)
+    made.clear()
+    assert main([*arguments, "--eval-env-kwargs", "sensor_noise_std:2.0"]) == 0
+    assert {kwargs.get("sensor_noise_std") for kwargs in made} == {None, 2.0}
+
+
+BAD = {
+    "algorithm": (["--algo", "foo", "--env", "Lava-v0"], "invalid choice: 'foo'"),
+    "environment": (["--env", "Lava-v9"], "Lava-v9 not found .* Lava-v0"),
+    "key": ([*LAVA, "-params", "foo:3"], "foo, which is neither an argument of TDPG .* nor a key of rl-zoo3"),
+    "number as text": (["--env", "Lava-v0", "--conf-file", "text.yml"], "learning_rate: 1e-3.*write 1.0e-3"),
+    "no such file": (["--env", "Lava-v0", "--conf-file", "none.yml"], "none.yml cannot be read: .*No such file"),
+    "no YAML": (["--env", "Lava-v0", "--conf-file", "broken.yml"], "broken.yml cannot be read"),
+    "no such block": (["--env", "Acrobot-v1"], "no block 'Acrobot-v1' for tdpg: give --block"),
+    "keyword": (["--env", "Lava-v0", "--env-kwargs", "bar:1"], "cannot be made with env_kwargs={'bar': 1}"),
+    "unquoted text": (["--env", "Lava-v0", "--env-kwargs", "a:violet"], "a:violet must be .* a:\"'violet'\""),
+    "setting": ([*LAVA, "-params", "n_episodes:0"], "n_episodes=0 must be an integer of at least 1"),
+    "agent": ([*LAVA, "-i", "none.zip"], "must be a valid path"),
+    "resume": (["--resume", "nothing"], "nothing is no folder of a training"),
+}
+
+
+@pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
+def test_bad_input_is_told_in_a_line_and_leaves_nothing(arguments, message, here, capfd):
+    (here / "text.yml").write_text("Lava-v0: {policy: TRVPolicy, n_timesteps: 100, learning_rate: 1e-3}\n")
+    (here / "broken.yml").write_text("Lava-v0: {policy\n")
+    try:
+        code = main(["train", *arguments])
+    except SystemExit as e:  # argparse
+        code = e.code
+    assert code == 2
+    error = capfd.readouterr().err
+    assert "Traceback" not in error
+    assert re.search(message, error), error
+    assert not list(here.glob("logs/*/*"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_no_number_of_our_files_is_read_as_text(path):
+    def texts(value):
+        if isinstance(value, (dict, list)):
+            items = value.values() if isinstance(value, dict) else value
+            return [text for item in items for text in texts(item)]
+        return [value] if isinstance(value, str) else []
+
+    for text in texts(yaml.safe_load(path.read_text())):
+        with pytest.raises(ValueError):
+            float(text)
+
+
+OTHERS = [
+    (algo, env_id)
+    for algo in ("a2c", "ppo", "ppo_lstm", "trpo")
+    for env_id in ("Lava-v0", "BallCatch-v0", "PandaGrasp-v0")
+]
+
+
+@pytest.mark.parametrize("algo, env_id", OTHERS)
+def test_blocks_of_other_algorithms_train(algo, env_id, here):
+    few = ["n_envs:4", *([] if algo == "a2c" else ["batch_size:20" if env_id != "PandaGrasp-v0" else "batch_size:4"])]
+    assert main(["train", "--algo", algo, "--env", env_id, "-params", *few, "-n", "8", "--eval-freq", "-1"]) == 0
+    (model,) = here.glob(f"logs/{algo}/{env_id}_1/{env_id}.zip")
+    assert model.stat().st_size > 1000
+
+
+def test_the_zoos_own_program_takes_tdpg_as_its_documentation_says(here):
+    """A script that adds the algorithm and calls the zoo's train()."""
+    (here / "train.py").write_text(
+        "import rl_zoo3\nimport rl_zoo3.train\nfrom rl_zoo3.train import train\nfrom sb3_tdpg import TDPG\n"
+        'rl_zoo3.ALGOS["tdpg"] = TDPG\nrl_zoo3.train.ALGOS = rl_zoo3.ALGOS\nrl_zoo3.exp_manager.ALGOS = rl_zoo3.ALGOS\n'
+        'if __name__ == "__main__":\n    train()\n'
+    )
+    path = Path(hyperparams.__file__).with_name("tdpg.yml")
+    command = [sys.executable, "train.py", "--algo", "tdpg", *SHORT[:2], "--conf-file", str(path), "-n", "200"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run(
+        [*command, "-params", "n_episodes:20", "--eval-freq", "-1"],
+        cwd=here, env=environment, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert folder_of(here).joinpath("Lava-v0.zip").exists()
+
+
+def test_help_lists_our_flags_and_the_zoos(capsys):
+    for program, flag in (("train", "--resume"), ("tune", "--objective"), ("plot", "--save")):
+        with pytest.raises(SystemExit) as stop:
+            main([program, "--help"])
+        assert stop.value.code == 0
+        text = capsys.readouterr().out
+        assert flag in text and ("--n-timesteps" in text or "--exp-folder" in text)
