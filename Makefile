@@ -8,7 +8,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-drink wheel clean
+.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -58,7 +58,7 @@ docs: $(STAMP) ## build the documentation into docs/_build/html
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py
 
-reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-drink ## reproduce every experiment
+reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera ## reproduce every experiment
 
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
@@ -75,8 +75,8 @@ reproduce-ball-varying: $(STAMP) ## the same where the launch varies, a scenario
 reproduce-grasp: $(STAMP) ## reproduce Table III: policy gradient, TDPG and its control on grasping
 	$(PY) -m sb3_tdpg reproduce grasp --out results/panda_grasp --publish docs/results/panda_grasp
 
-reproduce-grasp-drink: $(STAMP) ## the same where a drink's level tells where the mug stands, a scenario of our own
-	$(PY) -m sb3_tdpg reproduce grasp-drink --out results/panda_grasp_drink
+reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a scenario of our own
+	$(PY) -m sb3_tdpg reproduce grasp-camera --out results/panda_grasp_camera --publish docs/results/panda_grasp_camera
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

@@ -10,7 +10,7 @@ from sb3_tdpg.envs.ball_view import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture
-from sb3_tdpg.envs.scenarios import PANDA_DRINK
+from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
@@ -116,20 +116,14 @@ def panda_depth(path: Path) -> None:
     Image.fromarray(side_by_side([small, seen])).save(path, optimize=True)
 
 
-def panda_drink(path: Path) -> None:
-    """Two mugs as they stand in training, and two that tell the wrong place: from a third person, and in depth."""
-    columns = []
-    for x, level in ((0.46, 0.03), (0.54, 0.075), (0.46, 0.075), (0.54, 0.03)):
-        env = PandaGraspEnv(render_mode="rgb_array", **PANDA_DRINK)
-        env.reset(seed=0)
-        env._state = np.array([[x, MUG[1], 0.0, MUG[3], level]])
-        # The part of the scene with the mug.
-        env.render()
-        scene = env._view.scene_picture(768, 1152)[420:676, 345:601]
-        columns.append(np.concatenate([scene, np.full((6, 256, 3), 255, np.uint8), enlarge(
-            depth_picture(env._world.images(env._state)[0]), 2)]))  # fmt: skip
-        env.close()
-    Image.fromarray(side_by_side(columns)).save(path, optimize=True)
+def panda_camera(path: Path) -> None:
+    """The same mug from the lowest and the highest camera of the training and of the test, and from the usual one."""
+    (test, train) = (PANDA_GRASP_CAMERA[i].env_kwargs["camera_range"] for i in (1, 0))
+    env = PandaGraspEnv()
+    heights = [test[0], train[0], 0.0, train[1], test[1]]
+    images = env._sensor(np.array([[*MUG, height] for height in heights]))
+    env.close()
+    Image.fromarray(side_by_side([enlarge(depth_picture(image), 2) for image in images])).save(path, optimize=True)
 
 
 def panda_grasp(path: Path) -> None:
@@ -153,5 +147,5 @@ if __name__ == "__main__":
     ball_camera(folder / "ball_camera.png")
     ball_catch(folder / "ball_catch.gif")
     panda_depth(folder / "panda_depth.png")
-    panda_drink(folder / "panda_drink.png")
+    panda_camera(folder / "panda_camera.png")
     panda_grasp(folder / "panda_grasp.gif")

@@ -1,4 +1,4 @@
-"""The depth camera of the grasping scene: PyBullet draws the mug alone; the table and what is in the mug are known."""
+"""The depth camera of the grasping scene: PyBullet draws the mug alone; the depth of the table is known."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ class DepthCamera:
     A Bullet world of its own with nothing in it but the mug's mesh.
 
     Drawing table and mug takes 5 ms an image. The table's depth is the same in every image and follows from geometry,
-    so that the mug alone is drawn, in 1.4 ms, and of the two the nearer one is seen: the same to 3e-6 m. So it is
-    with the surface of a drink, a disc.
+    so that the mug alone is drawn, in 1.4 ms, and of the two the nearer one is seen: the same to 3e-6 m.
 
     :param scene: Size and frame of the mug.
     """
@@ -29,7 +28,6 @@ class DepthCamera:
     def __init__(self, scene: PandaScene) -> None:
         self.client = client = BulletClient()
         self._mug = add_mug_picture(client, scene)
-        self._scene = scene
         view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
         projection = client.computeProjectionMatrix(*EDGES, NEAR, FAR)
         self._camera = dict(
@@ -63,13 +61,6 @@ class DepthCamera:
         """Depth of a level plane without end, ``(128, 128)``, along the axis of view as every depth here."""
         return (z - self.eye[2]) / self._rays[..., 2]
 
-    def _depth_of_drink(self, x: float, y: float, z: float, yaw: float, level: float) -> np.ndarray:
-        """Depth of the surface of a drink, ``(128, 128)``; infinite beside it."""
-        depth = self._depth_of_plane(z + level)
-        axis = np.array([x, y]) + self._scene.frame_offset * np.array([np.sin(yaw), -np.cos(yaw)])
-        from_axis = self.eye[:2] + depth[..., None] * self._rays[..., :2] - axis
-        return np.where(np.hypot(from_axis[..., 0], from_axis[..., 1]) < self._scene.drink_radius, depth, np.inf)
-
     def pixel(self, point: np.ndarray) -> tuple[float, float, float]:
         """Return row, column and depth of a point, ``(3,)``, of the world."""
         left, right, bottom, top = EDGES
@@ -83,17 +74,19 @@ class DepthCamera:
         """
         Return one depth image for each state of the mug.
 
-        :param state: ``(N, 4)``, or ``(N, 5)`` with the level of what is in it.
+        :param state: ``(N, 4)``, or ``(N, 5)`` with how much higher than usual the camera is, in m.
         :return: ``(N, 1, 128, 128)`` float32 in m
         """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client
-        for image, (x, y, z, yaw, *level) in zip(images, state.tolist(), strict=True):
-            client.resetBasePositionAndOrientation(self._mug, (x, y, z), client.getQuaternionFromEuler((0, 0, yaw)))
+        for image, (x, y, z, yaw, *raised) in zip(images, state.tolist(), strict=True):
+            # A camera that is higher sees what this one sees of a lower scene.
+            below = sum(raised)
+            orientation = client.getQuaternionFromEuler((0, 0, yaw))
+            client.resetBasePositionAndOrientation(self._mug, (x, y, z - below), orientation)
             buffer = np.asarray(client.getCameraImage(**self._camera)[3], np.float64).reshape(IMAGE_SIZE, IMAGE_SIZE)
-            image[0] = np.minimum(self._far * NEAR / (self._far - (self._far - NEAR) * buffer), self.table_depth)
-            if level:
-                np.minimum(image[0], self._depth_of_drink(x, y, z, yaw, *level), out=image[0])
+            table = self._depth_of_plane(-below) if raised else self.table_depth
+            image[0] = np.minimum(self._far * NEAR / (self._far - (self._far - NEAR) * buffer), table)
         return images
 
     def close(self) -> None:

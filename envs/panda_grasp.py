@@ -25,6 +25,7 @@ LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
 HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
 # m; what the sensor tells apart. Table and mug are 0.31 to 0.61 m away.
 MIN_DEPTH, MAX_DEPTH = 0.2, 0.7
+MAX_CAMERA_SHIFT = 0.1  # m
 WORKSPACE = np.array([0.5, 0.0])  # m, its middle
 
 
@@ -32,7 +33,7 @@ class PandaGraspEnv(POMDPEnv):
     r"""
     Grasp a mug that stands anywhere on a table, and lift it.
 
-    State ``x = (x, y, z, yaw)`` of the mug's frame, in m and rad, and of a drink its level above that frame, in m.
+    State ``x = (x, y, z, yaw)`` of the mug's frame, in m and rad; with a ``camera_range`` also its height.
     Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``. Action ``u``: where the hand grasps,
     ``(0.5, 0, 0.06, pi/6) + 0.1 u`` for its position in m and its yaw in rad. There is one control, ``T = 1``, and
     PyBullet simulates what comes of it:
@@ -49,12 +50,8 @@ class PandaGraspEnv(POMDPEnv):
 
     :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
     :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
-    :param level_range: ``(first, last)``: there is a drink in the mug whose surface stands between these heights above
-        the mug's bottom, in m. It is seen and has no weight, and fingers go into it: to the grasp it does not matter.
-        ``None``: an empty mug.
-    :param level_spread: From 0, where the level tells the mug's x (``first`` where x is lowest, ``last`` where it is
-        highest), to 1, where it tells nothing. Between them it is off by up to this share of the whole range. Any
-        level is as likely as any other. Without a ``level_range`` it has no effect.
+    :param camera_range: ``(low, high)``: the camera is higher than usual by another distance between these two in every
+        trial, uniformly, in m. The distance is the fifth component of the state. ``None``: it is where it is.
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
@@ -74,8 +71,7 @@ class PandaGraspEnv(POMDPEnv):
         *,
         xy_half_width: float = 0.05,
         yaw_range: tuple[float, float] = (-np.pi / 4, np.pi / 4),
-        level_range: tuple[float, float] | None = None,
-        level_spread: float = 1.0,
+        camera_range: tuple[float, float] | None = None,
         mug_scale: float = 1.0,
         frame_offset: float = 0.012,
         friction: float = 0.5,
@@ -110,36 +106,18 @@ class PandaGraspEnv(POMDPEnv):
         self.xy_half_width = float(xy_half_width)
         self.yaw_range = low_high
         self.scene = PandaScene(float(mug_scale), float(frame_offset), float(friction))
-        self.level_range = self._checked_levels(level_range)
-        self.level_spread = float(level_spread)
+        self.camera_range = None if camera_range is None else _checked_camera(camera_range)
         self.solver_iterations = solver_iterations
         self.motion = motion
         self.depth_noise_std = float(depth_noise_std)
         self.n_processes = n_processes
-        if not 0 <= self.level_spread <= 1:
-            raise ValueError(f"level_spread={level_spread} must be between 0 (it tells x) and 1 (it tells nothing)")
-        size = 4 if level_range is None else 5
+        size = 4 if camera_range is None else 5
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
         self._last_details: list[dict[str, Any]] = []
         self._is_closed = False
         self._film: list[Configuration] = []  # of the last grasp, where something is rendered
-
-    def _checked_levels(self, level_range: tuple[float, float] | None) -> np.ndarray | None:
-        if level_range is None:
-            return None
-        lowest, highest = self.scene.drink_levels
-        try:
-            levels = np.asarray(level_range, dtype=np.float64)
-        except (TypeError, ValueError):
-            levels = np.array(np.nan)
-        if not (levels.shape == (2,) and ((lowest <= levels) & (levels <= highest)).all()):
-            raise ValueError(
-                f"level_range={level_range} must be None or (first, last) within the mug, that is between "
-                f"{lowest:.3f} and {highest:.3f} m"
-            )
-        return levels
 
     # -- Bullet worlds, each made when it is needed, and so in the process that uses it ------------------------------
 
@@ -172,29 +150,19 @@ class PandaGraspEnv(POMDPEnv):
         state = np.zeros((n, self.state_space.shape[0]))
         state[:, :2] = WORKSPACE + self.np_random.uniform(-self.xy_half_width, self.xy_half_width, (n, 2))
         state[:, 3] = self.np_random.uniform(self.yaw_range[0], self.yaw_range[1], n)
-        if self.level_range is not None:
-            state[:, 4] = self._levels(state[:, 0])
+        if self.camera_range is not None:
+            state[:, 4] = self.np_random.uniform(*self.camera_range, n)
         return state
-
-    def _levels(self, x: np.ndarray) -> np.ndarray:
-        """Draw the level of each drink, ``(N,)``."""
-        place = (x - WORKSPACE[0]) / self.xy_half_width if self.xy_half_width > 0 else np.zeros_like(x)
-        place += 2 * self.level_spread * self.np_random.uniform(-1, 1, len(x))
-        # Reflected at -1 and 1, so that all levels are equally likely; with a spread of 1, whatever x is.
-        place = 1 - np.abs((place + 1) % 4 - 2)
-        assert self.level_range is not None
-        first, last = self.level_range
-        return first + (last - first) * (place + 1) / 2
 
     def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         poses = NOMINAL_GRASP + ACTION_SCALE * action
-        mugs, levels = state[:, :4], state[:, 4:]
+        mugs, camera = state[:, :4], state[:, 4:]
         if self.render_mode is not None and len(state) == 1:
             self._film = []
             outcomes = self._world.grasps(mugs, poses, self._film.append)
         else:
             outcomes = self._workers(len(state)).grasps(mugs, poses)
-        next_state = np.concatenate([np.array([outcome.state for outcome in outcomes]), levels], axis=1)
+        next_state = np.concatenate([np.array([outcome.state for outcome in outcomes]), camera], axis=1)
         self._last_details = [
             dict(
                 success=bool(after[2] > LIFTED),
@@ -243,10 +211,10 @@ class PandaGraspEnv(POMDPEnv):
             raise ValueError("there is nothing to render before the first reset()")
         if self.render_mode == "human":
             for configuration in self._shown():
-                self._view.place(configuration, *self._level)
+                self._view.place(configuration)
                 time.sleep(1 / self.metadata["render_fps"])
             return None
-        self._view.place(self._shown()[-1], *self._level)
+        self._view.place(self._shown()[-1])
         return self._view.picture(self._depth_of(self._state[0]))
 
     def film(self) -> Iterator[np.ndarray]:
@@ -261,10 +229,12 @@ class PandaGraspEnv(POMDPEnv):
             raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a film")
         if self._time == 0:
             raise ValueError("there is no grasp to show before step()")
+        assert self._state is not None
         _, _, to_z, to_w = self._film[0].mug_orientation
-        depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w), *self._level])
+        camera = self._state[0, 4:].tolist()
+        depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w), *camera])
         for configuration in self._film:
-            self._view.place(configuration, *self._level)
+            self._view.place(configuration)
             yield self._view.picture(depth)
 
     def _shown(self) -> list[Configuration]:
@@ -274,12 +244,6 @@ class PandaGraspEnv(POMDPEnv):
             return self._film
         x, y, z, yaw = self._state[0, :4].tolist()
         return [PandaView.at_rest((x, y, z), yaw)]
-
-    @property
-    def _level(self) -> list[float]:
-        """The level of the drink, or nothing."""
-        assert self._state is not None
-        return self._state[0, 4:].tolist()
 
     def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
         (depth,) = self._with_noise(self._world.images(np.array([state])), np.random.default_rng(0))
@@ -296,3 +260,16 @@ class PandaGraspEnv(POMDPEnv):
         # BulletClient says the same of a world that has been closed, but here there may have been none yet.
         if self._is_closed:
             raise RuntimeError("this environment has been closed: make a new one")
+
+
+def _checked_camera(camera_range: tuple[float, float]) -> tuple[float, float]:
+    try:
+        low, high = (float(height) for height in camera_range)
+    except (TypeError, ValueError):
+        low, high = np.nan, np.nan
+    if not -MAX_CAMERA_SHIFT <= low <= high <= MAX_CAMERA_SHIFT:
+        raise ValueError(
+            f"camera_range={camera_range} must be None or (low, high) in m, {-MAX_CAMERA_SHIFT} <= low <= high <= "
+            f"{MAX_CAMERA_SHIFT}: from further away the mug is out of sight"
+        )
+    return low, high

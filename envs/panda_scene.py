@@ -23,14 +23,12 @@ MUG_FILE = os.path.join(ASSETS, "objects", "mug.obj")
 
 TABLE_POSITION = (0.4, 0.0, -0.625)  # puts the table's top at z = 0
 MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
-DRINK_COLOR = (0.25, 0.14, 0.08, 1.0)
 UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
 
 # The mug of PyBullet, made wider and lower: 93 mm across and 81 mm high as the paper's. It is wider than the gripper
 # opens, so that it can be grasped by its rim only, one finger inside.
 MESH_SCALE = np.array([1.134, 1.134, 0.81])
 MESH_RADIUS, MESH_HEIGHT = 0.041, 0.1  # of the cup in the file
-MESH_INNER_RADIUS, MESH_BOTTOM = 0.0326, 0.0086  # of the room in it
 N_STAVES = 12
 WALL_THICKNESS = 0.0075
 BASE_HEIGHT = 0.006
@@ -80,16 +78,6 @@ class PandaScene:
         return float(self.mesh_scale[2] * MESH_HEIGHT)
 
     @property
-    def drink_radius(self) -> float:
-        """Radius of the room in the cup."""
-        return float(self.mesh_scale[0] * MESH_INNER_RADIUS)
-
-    @property
-    def drink_levels(self) -> tuple[float, float]:
-        """The lowest and the highest level that a drink can have in the cup."""
-        return float(self.mesh_scale[2] * MESH_BOTTOM), self.mug_height
-
-    @property
     def cup_origin(self) -> np.ndarray:
         """Origin of the cup's frame in the mug's, ``(3,)``."""
         return np.array([0.0, -self.frame_offset, 0.0])
@@ -132,20 +120,6 @@ def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
         meshScale=scene.mesh_scale.tolist(),
         visualFramePosition=scene.cup_origin.tolist(),
         rgbaColor=MUG_COLOR,
-        specularColor=(0.3, 0.3, 0.3),
-    )
-    return int(client.createMultiBody(baseVisualShapeIndex=shape))
-
-
-def add_drink_picture(client: BulletClient, scene: PandaScene) -> int:
-    """Add the surface of a drink as it looks; return its body's id. Its base position is the surface's middle."""
-    thickness = 0.001
-    shape = client.createVisualShape(
-        client.GEOM_CYLINDER,
-        radius=scene.drink_radius,
-        length=thickness,
-        visualFramePosition=(0.0, 0.0, -thickness / 2),
-        rgbaColor=DRINK_COLOR,
         specularColor=(0.3, 0.3, 0.3),
     )
     return int(client.createMultiBody(baseVisualShapeIndex=shape))

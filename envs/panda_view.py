@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from .panda_scene import (
     TABLE_POSITION,
     UNTURNED,
     PandaScene,
-    add_drink_picture,
     add_mug_picture,
 )
 
@@ -56,10 +54,6 @@ class PandaView:
         )
         self._shadow = int(client.createMultiBody(baseVisualShapeIndex=shadow))
 
-    @cached_property
-    def _drink(self) -> int:
-        return add_drink_picture(self.client, self._scene)
-
     @staticmethod
     def at_rest(position: tuple[float, float, float], yaw: float) -> Configuration:
         """Return the robot in its home position, and the mug upright."""
@@ -67,30 +61,18 @@ class PandaView:
         orientation = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
         return Configuration((*HOME, FINGER_OPEN, FINGER_OPEN), position, orientation)
 
-    def place(self, configuration: Configuration, level: float | None = None) -> None:
-        """
-        Put everything where it is at one instant.
-
-        :param configuration: Of robot and mug.
-        :param level: Of what is in the mug, in m; ``None``: it is empty.
-        """
+    def place(self, configuration: Configuration) -> None:
+        """Put everything where it is at one instant."""
         for joint, value in zip((*ARM_JOINTS, *FINGER_JOINTS), configuration.joints, strict=True):
             self.client.resetJointState(self._robot, joint, value)
         self.client.resetBasePositionAndOrientation(
             self._mug, configuration.mug_position, configuration.mug_orientation
         )
-        (x, y, _), _ = self._in_cup(configuration, 0.0)
-        self.client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
-        if level is not None:
-            self.client.resetBasePositionAndOrientation(self._drink, *self._in_cup(configuration, level))
-
-    def _in_cup(self, configuration: Configuration, height: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Position and orientation of a level surface in the cup."""
         right, ahead, _ = self._scene.cup_origin.tolist()
-        position, orientation = self.client.multiplyTransforms(
-            configuration.mug_position, configuration.mug_orientation, (right, ahead, height), UNTURNED
+        (x, y, _), _ = self.client.multiplyTransforms(
+            configuration.mug_position, configuration.mug_orientation, (right, ahead, 0.0), UNTURNED
         )
-        return position, orientation
+        self.client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
 
     def picture(self, depth: np.ndarray) -> np.ndarray:
         """

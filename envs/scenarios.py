@@ -138,20 +138,15 @@ PANDA_GRASP: tuple[Scenario, ...] = (
     _panda("Translation", 0.367, 0.358, xy_half_width=0.075),
 )
 
-PANDA_DRINK: Mapping[str, Any] = MappingProxyType(
-    dict(xy_half_width=0.05, level_range=(0.03, 0.075), level_spread=0.15)
-)
+PANDA_CAMERA: Mapping[str, Any] = MappingProxyType(dict(camera_range=(-0.03, 0.03)))
 """
-Keywords of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv` for mugs with a drink, our own: its level, which does not
-matter to a grasp, tells the mug's x to within 1.5 cm.
+Keywords of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv` for a camera whose height varies from trial to trial, our
+own: every depth in the image tells of it, and to the grasp it does not matter.
 """
 
-# The level goes on to tell x, tells nothing, tells the opposite, is the same in every mug; or there is no
-# drink, which no policy has seen. A scenario of our own.
-PANDA_GRASP_DRINK: tuple[Scenario, ...] = (
-    Scenario("Training", "PandaGrasp-v0", dict(PANDA_DRINK)),
-    Scenario("Any level", "PandaGrasp-v0", {**PANDA_DRINK, "level_spread": 1.0}),
-    Scenario("Opposite level", "PandaGrasp-v0", {**PANDA_DRINK, "level_range": PANDA_DRINK["level_range"][::-1]}),
-    Scenario("Same level", "PandaGrasp-v0", {**PANDA_DRINK, "level_range": (0.0525, 0.0525)}),
-    Scenario("Empty mug", "PandaGrasp-v0", dict(level_range=None)),
+# Within the heights of the training, twice as far up and down, and where the camera of Table III is.
+PANDA_GRASP_CAMERA: tuple[Scenario, ...] = (
+    Scenario("Training", "PandaGrasp-v0", dict(PANDA_CAMERA)),
+    Scenario("Twice the range", "PandaGrasp-v0", dict(camera_range=(-0.06, 0.06))),
+    Scenario("Usual height", "PandaGrasp-v0", dict(camera_range=(0.0, 0.0))),
 )

@@ -60,7 +60,7 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
         if "n_paper_seeds" in given:
             raise ValueError("--n-paper-seeds is for lava and ball: the paper's own settings of grasp are not trained")
         out = out or Path("results", experiment.replace("-", "_").replace("grasp", "panda_grasp"))
-        text = reproduce_grasp(out, mug="drink" if experiment == "grasp-drink" else "empty", **given)
+        text = reproduce_grasp(out, camera="varying" if experiment == "grasp-camera" else "fixed", **given)
     else:
         out = out or Path("results", experiment.replace("-", "_").replace("ball", "ball_catch"))
         text = reproduce_ball(out, launch="varying" if experiment == "ball-varying" else "fixed", **given)
@@ -112,7 +112,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_sizes(demo)
 
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
-    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-drink"))
+    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-camera"))
     reproduce.add_argument(
         "--out", type=Path, default=None, help="folder for the results (default: one in results/ for each experiment)"
     )

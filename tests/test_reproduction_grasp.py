@@ -13,11 +13,11 @@ from small_problems import complete_runs_here
 from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
-from sb3_tdpg.envs.scenarios import PANDA_DRINK, PANDA_GRASP
+from sb3_tdpg.envs.scenarios import PANDA_CAMERA, PANDA_GRASP
 from sb3_tdpg.evaluation import (
     draw_mugs,
     encode_mugs,
-    failures_by_level,
+    failures_by_camera,
     failures_by_yaw,
     grasp_knowledge,
     knowledge,
@@ -63,29 +63,28 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     assert set(records["cost"]) <= {0.0, 1.0}
 
 
-def test_mugs_with_a_drink_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
+def test_a_varying_camera_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     arguments = ["--n-seeds", "2", "--n-eval-episodes", "3", "--n-timesteps", "8"]
-    assert main(["reproduce", "grasp-drink", "--out", str(tmp_path), *arguments]) == 0
+    assert main(["reproduce", "grasp-camera", "--out", str(tmp_path), *arguments]) == 0
     summary = (tmp_path / "summary.md").read_text()
-    for text in ("Opposite level", "Empty mug", "make reproduce-grasp-drink"):
+    for text in ("Twice the range", "Usual height", "make reproduce-grasp-camera"):
         assert text in summary
     assert "Goals" not in summary
-    assert "| model | of the mug | of the level |" in summary
-    assert (tmp_path / "level.png").exists()
+    assert (tmp_path / "camera.png").exists()
     assert not (tmp_path / "yaw.png").exists()
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
-    assert len(records) == 3 * 2 * 5 * 3
-    low, high = 0.03, 0.075
-    assert records["level"].dropna().between(low, high).all()
-    assert set(records["scenario"][records["level"].isna()]) == {"Empty mug"}
+    assert len(records) == 3 * 2 * 3 * 3
+    heights = records.groupby("scenario")["camera"]
+    assert heights.max()["Training"] <= 0.03 and heights.min()["Training"] >= -0.03
+    assert heights.nunique()["Usual height"] == 1
     knowledge = pd.read_csv(tmp_path / "knowledge.csv")
-    assert set(knowledge["mugs"]) == {"training", "any level"}
-    assert knowledge["level"].between(0, 1).all()
+    assert set(knowledge["mugs"]) == {"training", "twice the range"}
+    assert knowledge["camera"].between(0, 1).all()
 
 
-def test_a_mug_that_is_none_is_refused_before_anything_is_run(tmp_path):
-    with pytest.raises(ValueError, match=r"mug='tea' must be one of \['empty', 'drink'\]"):
-        grasp.reproduce_grasp(tmp_path / "out", mug="tea")
+def test_a_camera_that_is_none_is_refused_before_anything_is_run(tmp_path):
+    with pytest.raises(ValueError, match=r"camera='film' must be one of \['fixed', 'varying'\]"):
+        grasp.reproduce_grasp(tmp_path / "out", camera="film")
     assert not (tmp_path / "out").exists()
 
 
@@ -101,23 +100,22 @@ def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
     np.testing.assert_array_equal(outcomes, records["cost"])
 
 
-@pytest.mark.parametrize("mug", grasp.EXPERIMENTS)
-def test_the_control_differs_from_tdpg_in_nothing_but_the_penalty(mug):
-    methods = {method.label: method for method in grasp.EXPERIMENTS[mug].methods}
+@pytest.mark.parametrize("camera", grasp.EXPERIMENTS)
+def test_the_control_differs_from_tdpg_in_nothing_but_the_penalty(camera):
+    methods = {method.label: method for method in grasp.EXPERIMENTS[camera].methods}
     tdpg, control = ({**load_hyperparams(m.block), **m.overrides} for m in (methods["TDPG"], methods["its control"]))
     assert methods["TDPG"].start == methods["its control"].start == "PG"
     assert {key for key in tdpg if tdpg[key] != control.get(key)} == {"beta", "cost_limit"}
     assert set(tdpg) == set(control)
 
 
-def test_the_training_row_of_a_drink_is_what_the_blocks_train_on():
-    for method in grasp.EXPERIMENTS["drink"].methods:
-        kwargs = load_hyperparams(method.block)["env_kwargs"]
-        assert {name: kwargs[name] for name in PANDA_DRINK} == {k: pytest.approx(v) for k, v in PANDA_DRINK.items()}
+def test_the_training_row_of_a_varying_camera_is_what_the_blocks_train_on():
+    for method in grasp.EXPERIMENTS["varying"].methods:
+        assert tuple(load_hyperparams(method.block)["env_kwargs"]["camera_range"]) == PANDA_CAMERA["camera_range"]
 
 
 def test_every_goal_is_of_a_row_and_a_method():
-    assert set(grasp.GOALS) <= {method.label for method in grasp.EXPERIMENTS["empty"].methods}
+    assert set(grasp.GOALS) <= {method.label for method in grasp.EXPERIMENTS["fixed"].methods}
     for goals in grasp.GOALS.values():
         assert set(goals) == {row.name for row in PANDA_GRASP}
 
@@ -132,28 +130,13 @@ def test_the_failures_are_drawn_in_the_sector_of_their_yaw():
     assert angles[5] == pytest.approx(5.5 * 2 * np.pi / 24)
 
 
-def test_the_failures_are_drawn_over_what_the_level_gets_wrong():
-    error = np.repeat([-0.05, -0.01, 0.01, 0.05], 5)
+def test_the_failures_are_drawn_over_the_camera_s_height():
+    camera = np.repeat([-0.06, -0.02, 0.02, 0.06], 5)
     cost = np.repeat([1.0, 0.0, 0.0, 0.4], 5)
-    records = pd.DataFrame(dict(model="PG", error=error, cost=cost))
-    figure = failures_by_level(records, n_bins=4, min_episodes=5)
-    (line,) = figure.axes[0].lines
+    (line,) = failures_by_camera(pd.DataFrame(dict(model="PG", camera=camera, cost=cost)), n_bins=4).axes[0].lines
     middles, shares = line.get_data()
-    np.testing.assert_allclose(middles, [-3.75, -1.25, 1.25, 3.75])
+    np.testing.assert_allclose(middles, [-4.5, -1.5, 1.5, 4.5], atol=1e-6)
     np.testing.assert_allclose(shares, [1.0, 0.0, 0.0, 0.4])
-    (few,) = failures_by_level(records, n_bins=4, min_episodes=6).axes[0].lines
-    assert np.isnan(few.get_ydata()).all()
-
-
-def test_the_level_s_error_is_nothing_where_it_tells_x(monkeypatch):
-    seen = []
-    monkeypatch.setattr(grasp, "failures_by_level", seen.append)
-    env = PandaGraspEnv(**{**PANDA_DRINK, "level_spread": 0.0})
-    env.reset(seed=0)
-    state = env._initial_state(50)
-    for shift in (0.0, 0.02):
-        grasp._draw_level(pd.DataFrame(dict(scenario="Any level", x=state[:, 0] - shift, level=state[:, 4])))
-        np.testing.assert_allclose(seen[-1]["error"], shift, atol=1e-12)
 
 
 # -- what is told of the policies --------------------------------------------------------------------------------------
@@ -213,24 +196,6 @@ def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
     assert (of_one_epoch["penalty from epoch"], of_one_epoch["nats, last"]) == ("none", "5.00")
 
 
-def test_the_regression_tells_who_follows_the_mug_and_who_its_level():
-    env = PandaGraspEnv(**{**PANDA_DRINK, "level_spread": 1.0})
-    env.reset(seed=0)
-    state = env._initial_state(500)
-    x, level = pd.Series(state[:, 0]), pd.Series(state[:, 4])
-    told = grasp_analysis.told_x(level)
-    assert told.between(0.45, 0.55).all()
-    hands = {("sees", 0): x + 0.04, ("sees", 1): x + 0.03, ("is told", 0): told, ("half", 0): (x + told) / 2}
-    records = pd.concat(
-        pd.DataFrame(dict(model=label, train_seed=seed, x=x, level=level, grasp_x=hand))
-        for (label, seed), hand in hands.items()
-    )
-    table = grasp_analysis.followed_table(records).set_index("model")
-    assert table.loc["sees"].tolist() == ["1.00 [1.00, 1.00]", "0.00 [0.00, 0.00]"]
-    assert table.loc["is told", "of the level"] == "1.00 [1.00, 1.00]"
-    assert table.loc["half"].tolist() == ["0.50 [0.50, 0.50]"] * 2
-
-
 @pytest.mark.parametrize("half_width", [np.pi, np.pi / 4])
 def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_width):
     poses = th.tensor(np.random.default_rng(0).uniform(-1, 1, (1, 20_000, 4)) * [0.1, 0.1, 0, half_width])
@@ -242,9 +207,9 @@ def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_widt
     known = grasp_knowledge(InformationBatch(poses, told, told, th.ones_like(told)))
     assert known["x"] > 0.99
     assert known["y"] < 0.02
-    assert "level" not in known
-    with_level = th.cat([poses, noise[..., 2:3]], dim=-1)
-    assert grasp_knowledge(InformationBatch(with_level, told, told, th.ones_like(told)))["level"] > 0.99
+    assert "camera" not in known
+    with_camera = th.cat([poses, noise[..., 2:3]], dim=-1)
+    assert grasp_knowledge(InformationBatch(with_camera, told, told, th.ones_like(told)))["camera"] > 0.99
     share = (sine.var() / (sine.var() + th.cos(poses[..., 3]).var())).item()
     assert known["yaw"] == pytest.approx(0.25 * share, abs=0.08)
     assert known["yaw"] > 0.05

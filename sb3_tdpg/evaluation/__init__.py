@@ -3,7 +3,7 @@
 from sb3_tdpg.evaluation.figures import (
     cost_histograms,
     diagnosis_bars,
-    failures_by_level,
+    failures_by_camera,
     failures_by_yaw,
     lava_trajectories,
     robustness_curves,
@@ -27,7 +27,7 @@ __all__ = [
     "draw_mugs",
     "encode_mugs",
     "evaluate_scenarios",
-    "failures_by_level",
+    "failures_by_camera",
     "failures_by_yaw",
     "grasp_knowledge",
     "lava_trajectories",

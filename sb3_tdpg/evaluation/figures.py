@@ -221,26 +221,22 @@ def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
     return figure
 
 
-def failures_by_level(records: pd.DataFrame, *, n_bins: int = 15, min_episodes: int = 50) -> Figure:
+def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
     """
-    Draw the share of failed grasps over how far the level of a drink is from telling where the mug stands.
+    Draw the share of failed grasps over how much higher than usual the camera was.
 
-    :param records: Episodes with the columns ``model``, ``error`` (where the level would have the mug minus where it
-        is, along x, in m) and ``cost`` (1 for a failure).
-    :param n_bins: Parts of the range of the error.
-    :param min_episodes: Parts with fewer episodes of a model are left out.
+    :param records: Episodes with the columns ``model``, ``camera`` (m) and ``cost`` (1 for a failure).
+    :param n_bins: Parts of the range of heights.
     """
     figure = _new_figure(WIDTH * 0.7, 3.2)
     axes = figure.add_subplot()
     _tidy(axes)
-    centimetres = 100 * records["error"]
+    centimetres = 100 * records["camera"]
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
     for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
-        part = np.digitize(centimetres[group.index], edges) - 1
-        of_part = group["cost"].groupby(part)
-        share = of_part.mean().where(of_part.count() >= min_episodes).reindex(range(n_bins))
+        share = group["cost"].groupby(np.digitize(centimetres[group.index], edges) - 1).mean().reindex(range(n_bins))
         axes.plot((edges[:-1] + edges[1:]) / 2, share, color=color, label=str(label), marker=".")
-    axes.set_xlabel("x as the level tells it, minus the mug's x, in cm", fontsize=9)
+    axes.set_xlabel("height of the camera above its usual place, in cm", fontsize=9)
     axes.set_ylabel("share of failed grasps", fontsize=9)
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=8, frameon=False)

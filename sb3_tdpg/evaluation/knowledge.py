@@ -74,7 +74,7 @@ def trv_knowledge(
 class Mugs(NamedTuple):
     """N mugs of the grasping problem, and what the camera shows of them."""
 
-    states: np.ndarray  # (N, 4): x, y, z, yaw; with a drink (N, 5), the last its level
+    states: np.ndarray  # (N, 4): x, y, z, yaw; (N, 5) with the camera's height where it varies
     images: np.ndarray  # (N, 1, 128, 128)
 
 
@@ -122,15 +122,15 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
 
     :param batch: From :func:`encode_mugs`, with an even number of mugs.
     :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (of its sine and cosine together), and of the
-        ``"level"`` of a drink
+        ``"camera"``'s height where it varies
     """
-    x, y, _, yaw, *level = batch.states[0].numpy().astype(np.float64).T
+    x, y, _, yaw, *camera = batch.states[0].numpy().astype(np.float64).T
     trvs = batch.trvs[0].numpy().astype(np.float64)
     row, column = np.triu_indices(trvs.shape[1])
     known = np.concatenate([trvs, trvs[:, row] * trvs[:, column]], axis=1)[None]
     targets = dict(x=x[:, None], y=y[:, None], yaw=np.stack([np.sin(yaw), np.cos(yaw)], axis=1))
-    if level:
-        targets["level"] = level[0][:, None]
+    if camera:
+        targets["camera"] = camera[0][:, None]
     return {name: _r2(known, target[None], pooled=True) for name, target in targets.items()}
 
 

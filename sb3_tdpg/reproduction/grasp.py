@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from sb3_tdpg.envs.scenarios import PANDA_GRASP, PANDA_GRASP_DRINK, Scenario
+from sb3_tdpg.envs.scenarios import PANDA_GRASP, PANDA_GRASP_CAMERA, Scenario
 from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
-    failures_by_level,
+    failures_by_camera,
     failures_by_yaw,
     provenance,
     save_figure,
@@ -34,14 +34,11 @@ from sb3_tdpg.reproduction.common import (
 )
 from sb3_tdpg.reproduction.grasp_analysis import (
     ESTIMATES,
-    FOLLOWED,
     KNOWLEDGE,
     PENALTY,
     estimates_table,
-    followed_table,
     knowledge_table,
     penalty_table,
-    told_x,
 )
 from sb3_tdpg.runs import read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
@@ -111,13 +108,12 @@ def _draw_yaw(records: pd.DataFrame) -> Figure:
     return failures_by_yaw(of_row(records, PANDA_GRASP[1]))
 
 
-def _draw_level(records: pd.DataFrame) -> Figure:
-    of_any_level = of_row(records, PANDA_GRASP_DRINK[1])
-    return failures_by_level(of_any_level.assign(error=told_x(of_any_level["level"]) - of_any_level["x"]))
+def _draw_camera(records: pd.DataFrame) -> Figure:
+    return failures_by_camera(of_row(records, PANDA_GRASP_CAMERA[1]))
 
 
 EXPERIMENTS = {
-    "empty": Experiment(
+    "fixed": Experiment(
         "Grasping (Table III)",
         "make reproduce-grasp",
         _methods("PandaGrasp-v0"),
@@ -127,13 +123,13 @@ EXPERIMENTS = {
         GOALS,
         compares_estimates=True,
     ),
-    "drink": Experiment(
-        "Grasping (mugs with a drink)",
-        "make reproduce-grasp-drink",
-        _methods("PandaGrasp-v0-drink"),
-        PANDA_GRASP_DRINK,
-        "level.png",
-        _draw_level,
+    "varying": Experiment(
+        "Grasping (a camera whose height varies)",
+        "make reproduce-grasp-camera",
+        _methods("PandaGrasp-v0-camera"),
+        PANDA_GRASP_CAMERA,
+        "camera.png",
+        _draw_camera,
     ),
 }
 
@@ -147,7 +143,7 @@ COMPARISON = (
 def reproduce_grasp(
     out: Path,
     *,
-    mug: str = "empty",
+    camera: str = "fixed",
     n_seeds: int = 5,
     n_eval_episodes: int = 1000,
     n_timesteps: int | None = None,
@@ -160,18 +156,18 @@ def reproduce_grasp(
     Finished runs are kept: the same call goes on where an interrupted one stopped.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
-    :param mug: ``"empty"``, Table III; or ``"drink"``, a scenario of our own.
+    :param camera: ``"fixed"``, Table III; or ``"varying"`` in height, a scenario of our own.
     :param n_seeds: Training seeds of each method.
     :param n_eval_episodes: Episodes of each row.
     :param n_timesteps: Environment steps of each training; default: as in the blocks.
     :param jobs: Runs at a time; default: the number of cores.
     :param publish: Folder that gets a copy of everything but ``runs/``.
     :return: the summary, as Markdown
-    :raises ValueError: if there is no such ``mug``; nothing has been run by then.
+    :raises ValueError: if there is no such ``camera``; nothing has been run by then.
     """
-    if mug not in EXPERIMENTS:
-        raise ValueError(f"mug={mug!r} must be one of {list(EXPERIMENTS)}")
-    experiment = EXPERIMENTS[mug]
+    if camera not in EXPERIMENTS:
+        raise ValueError(f"camera={camera!r} must be one of {list(EXPERIMENTS)}")
+    experiment = EXPERIMENTS[camera]
     methods, rows = experiment.methods, experiment.rows
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
@@ -184,7 +180,7 @@ def reproduce_grasp(
     poses.update({f"final_grasp_{i}": f"grasp_{name}" for i, name in enumerate(("x", "y", "z", "yaw"))})
     records = trained.records()
     if "final_state_4" in records:
-        poses["final_state_4"] = "level"
+        poses["final_state_4"] = "camera"
     records = records.rename(columns=poses)
     columns = ["model", "train_seed", "scenario", "episode", "cost", *poses.values(), "seed", "deterministic"]
     write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 6)), out / "episodes.csv.xz")
@@ -222,8 +218,6 @@ def reproduce_grasp(
         KNOWLEDGE,
         markdown_table(means, digits=2),
     ]
-    if "level" in records:
-        sections += ["## Mug or level?", FOLLOWED, markdown_table(followed_table(of_row(records, rows[1])))]
     if estimates is not None:
         sections += ["## How much information is it?", ESTIMATES, markdown_table(estimates, digits=2)]
     sections.append(how_made(experiment.command, how, commits_of(list(folders.values()))))

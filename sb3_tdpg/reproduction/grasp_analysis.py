@@ -1,4 +1,4 @@
-"""What the grasping policies know, what they follow, and what the penalty did: tables and what they say."""
+"""What the grasping policies know, and what the penalty did: tables and what they say."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 import torch as th
 
-from sb3_tdpg.envs.panda_grasp import WORKSPACE
-from sb3_tdpg.envs.scenarios import PANDA_DRINK, Scenario
+from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import draw_mugs, encode_mugs, grasp_knowledge
 from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet, Mine, own_sample_bound
 from sb3_tdpg.tdpg import TDPG
@@ -53,10 +52,6 @@ PENALTY = (
     "Of each TDPG: the first epoch with a penalty (none if no epoch met the limit on the failures: then TDPG is its "
     "control), the last weight 1/beta in the log in failures per nat, the bound on the information in the first epoch "
     f"and in the last, and the share of failures in the last {LAST_EPOCHS} epochs of training."
-)
-FOLLOWED = (
-    "Where the level tells nothing: coefficients of a regression of the hand's x on the mug's x and on the x that "
-    "the level would tell, mean over seeds [lowest, highest]. A policy that follows the mug alone has 1 and 0."
 )
 
 
@@ -136,35 +131,4 @@ def penalty_table(progress: Mapping[int, pd.DataFrame]) -> pd.DataFrame:
                 "failures": f"{failures:.3f}",
             }
         )
-    return pd.DataFrame(rows)
-
-
-def told_x(level: pd.Series) -> pd.Series:
-    """Return where a mug whose drink has this level stands in training, in m along x."""
-    first, last = PANDA_DRINK["level_range"]
-    return WORKSPACE[0] + PANDA_DRINK["xy_half_width"] * (2 * (level - first) / (last - first) - 1)
-
-
-def followed_table(records: pd.DataFrame) -> pd.DataFrame:
-    """
-    Tell whether the hand follows the mug or the level of its drink.
-
-    :param records: Episodes where the level tells nothing, with columns ``model``, ``train_seed``, ``x``, ``level``
-        and ``grasp_x``.
-    """
-    coefficients = []
-    for (label, seed), group in records.groupby(["model", "train_seed"], sort=False):
-        causes = np.stack([np.ones(len(group)), group["x"], told_x(group["level"])], axis=1)
-        (_, mug, level), *_ = np.linalg.lstsq(causes, group["grasp_x"].to_numpy(), rcond=None)
-        coefficients.append(dict(model=label, seed=seed, mug=mug, level=level))
-    rows = []
-    for label, of_model in pd.DataFrame(coefficients).groupby("model", sort=False):
-        cells = {
-            # Adding 0 makes a zero of a negative zero.
-            f"of the {cause}": "{:.2f} [{:.2f}, {:.2f}]".format(
-                *of_model[cause].agg(["mean", "min", "max"]).round(2) + 0
-            )
-            for cause in ("mug", "level")
-        }
-        rows.append({"model": label, **cells})
     return pd.DataFrame(rows)
