@@ -134,8 +134,11 @@ class Worker:
         if self.next_number is not None:
             self.next_number += 1
         try:
-            if not self._read().counts(trial.number):
-                self._patiently(lambda: trial.set_user_attr(GIVEN_UP, "another trial has taken its place"))
+            jobs = self._read()
+            if not jobs.counts(trial.number):
+                # One too many keeps its parameters, for the case that it is wanted after all.
+                attribute = GIVEN_UP if trial.number in jobs.duplicates else HANDED_BACK
+                self._patiently(lambda: trial.set_user_attr(attribute, True))
                 self._tell(trial.number, TrialState.FAIL)
                 return
             self._patiently(lambda: trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}"))
