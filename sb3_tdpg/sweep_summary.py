@@ -73,8 +73,8 @@ def _selection(best: pd.Series | None, cost_limit: float, below: int, n: int, is
     where = "`selected.zip`" if is_here else f"not in this folder: `runs/{best['folder']}/model.zip` of its worker"
     return (
         f"**Selected: beta = {best['label']}, seed {best['seed']}** (cost {best['cost']:.4g}, information "
-        f"{best['information']:.3g} nat; {where}). Of the {below} of {n} runs below a cost of {cost_limit:g} it has "
-        f"the least information; of those that have as little to within {tie:g} nat it is the cheapest."
+        f"{best['information']:.3g} nat; {where}). {below} of {n} runs are below a cost of {cost_limit:g}; of those "
+        f"that know as little as the one with the least information, to within {tie:g} nat, it is the cheapest."
     )
 
 

@@ -14,15 +14,15 @@ from small_problems import tiny_tdpg
 optuna = pytest.importorskip("optuna")
 pytest.importorskip("matplotlib")
 
-from postgres import postgres  # noqa: F401
+from postgres import postgres  # noqa: E402, F401
 
-from sb3_tdpg import TDPG
-from sb3_tdpg.envs.scenarios import LAVA
-from sb3_tdpg.evaluation.information import information_bounds, rollout_information
-from sb3_tdpg.information import InformationBatch
-from sb3_tdpg.studies import open_storage
-from sb3_tdpg.sweep import select, sweep
-from sb3_tdpg.sweep_runs import beta_label, parse_inverse_beta
+from sb3_tdpg import TDPG  # noqa: E402
+from sb3_tdpg.envs.scenarios import LAVA  # noqa: E402
+from sb3_tdpg.evaluation.information import information_bounds, rollout_information  # noqa: E402
+from sb3_tdpg.information import InformationBatch  # noqa: E402
+from sb3_tdpg.studies import open_storage  # noqa: E402
+from sb3_tdpg.sweep import select, sweep  # noqa: E402
+from sb3_tdpg.sweep_runs import beta_label, parse_inverse_beta  # noqa: E402
 
 SETTINGS = dict(mi_estimator="logdet", n_episodes=20, policy_kwargs=dict(net_arch=dict(encoder=[8], action_head=[8])))
 

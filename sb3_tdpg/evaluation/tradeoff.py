@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LINEAR_BELOW = 0.01  # nats: less than this is nothing, and a logarithmic axis would spread it out
+ABOUT_NOTHING = 0.01  # nats: differences below it mean nothing, though a logarithmic axis shows them
+FLOOR = 1e-5  # nats
 ORDERED = "Sensor noise"  # scenarios whose names begin so follow the reference in order
 
 
@@ -59,13 +60,21 @@ def tradeoff_figure(
             alpha=0.85,
             zorder=3,
         )
-    scatter.scatter(chosen["information"], chosen["cost"], label="selected" if len(chosen) else None, **at_selected)
-    scatter.set_xscale("symlog", linthresh=LINEAR_BELOW)
-    scatter.set_xlim(-LINEAR_BELOW / 10, 1.6 * max(LINEAR_BELOW, runs["information"].max()))
-    decades = 10.0 ** np.arange(-2, 4)
-    scatter.set_xticks([0, *decades[decades < scatter.get_xlim()[1]]])
-    scatter.xaxis.set_major_formatter("{x:g}")
-    scatter.set_xlabel(f"information in the TRVs (nat; linear below {LINEAR_BELOW:g})", fontsize=9)
+    scatter.scatter(
+        chosen["information"].clip(lower=FLOOR),
+        chosen["cost"],
+        label="selected" if len(chosen) else None,
+        **at_selected,
+    )
+    information = runs["information"].clip(lower=FLOOR)
+    low, high = 0.6 * information.min(), 1.7 * information.max()
+    _log_axis(scatter, "x", subs=(1,))
+    scatter.set_xlim(low, max(high, 12 * low))  # at least one tick
+    if low < ABOUT_NOTHING:
+        scatter.axvspan(
+            low, min(ABOUT_NOTHING, high), color="#EEEEEE", zorder=0, label="information of about 0", linewidth=0
+        )
+    scatter.set_xlabel("information in the TRVs (nat, logarithmic axis)", fontsize=9)
     scatter.set_ylabel(quantity, fontsize=9)
     costs = runs[list(rows.values())].to_numpy()
     if costs.min() > 0 and costs.max() > 4 * costs.min():
@@ -112,7 +121,7 @@ def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: 
 
 
 def _tick(name: str) -> str:
-    return "training" if name == "Training" else _short(name)
+    return "train" if name == "Training" else _short(name)
 
 
 def _what(names: Sequence[str]) -> str:
