@@ -5,8 +5,8 @@ What is to be done follows from the trials in the storage alone, so that a worke
 
 - A *job* is a parameter set that is to be run to its end once. Its trials are its *attempts*: they share the
   attribute ``job``, the number of the first one or what :func:`enqueue_once` wrote there.
-- Of several living attempts at a job the one with the lowest number counts; the others are given up before they are
-  run. Likewise a job beyond ``n_trials``, as appears when two workers begin the last one at once, is put back.
+- Of several living attempts at a job the one with the lowest number counts; the others are handed back before they are
+  run. So is a job beyond ``n_trials``, as appears when two workers begin the last one at once.
 - A worker changes the attribute ``heartbeat`` of its trial every few seconds. A running trial whose heartbeat no other
   worker sees change for ``grace_period`` is failed, and attempted again with the same parameters.
 

@@ -8,8 +8,8 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 
 # Attributes of a trial.
 JOB, HEARTBEAT, WORKER, REASON = "job", "heartbeat", "worker", "reason"
-GIVEN_UP, HANDED_BACK = "given_up", "handed_back"
-BOOKKEEPING = frozenset({JOB, HEARTBEAT, WORKER, REASON, GIVEN_UP, HANDED_BACK})
+HANDED_BACK = "handed_back"
+BOOKKEEPING = frozenset({JOB, HEARTBEAT, WORKER, REASON, HANDED_BACK})
 
 DONE, ALIVE = (TrialState.COMPLETE, TrialState.PRUNED), (TrialState.RUNNING, TrialState.WAITING)
 
@@ -31,7 +31,7 @@ class Jobs:
     def __init__(self, trials: Sequence[FrozenTrial], n_trials: int | None, max_retries: int) -> None:
         attempts: dict[int | str, list[FrozenTrial]] = {}
         for trial in trials:
-            if GIVEN_UP not in trial.user_attrs and (n_trials is not None or JOB in trial.user_attrs):
+            if n_trials is not None or JOB in trial.user_attrs:
                 attempts.setdefault(job_of(trial), []).append(trial)
         self.n_trials = n_trials
         self.done = {job for job, tried in attempts.items() if any(t.state in DONE for t in tried)}

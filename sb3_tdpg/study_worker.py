@@ -15,7 +15,7 @@ import optuna
 from optuna.exceptions import StorageInternalError, TrialPruned, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_tdpg.study_jobs import GIVEN_UP, HANDED_BACK, HEARTBEAT, REASON, WORKER, Jobs
+from sb3_tdpg.study_jobs import HANDED_BACK, HEARTBEAT, REASON, WORKER, Jobs
 
 Objective = Callable[[optuna.Trial], float | Sequence[float]]
 Result = TypeVar("Result")
@@ -134,12 +134,8 @@ class Worker:
         if self.next_number is not None:
             self.next_number += 1
         try:
-            jobs = self._read()
-            if not jobs.counts(trial.number):
-                # One too many keeps its parameters, for the case that it is wanted after all.
-                attribute = GIVEN_UP if trial.number in jobs.duplicates else HANDED_BACK
-                self._patiently(lambda: trial.set_user_attr(attribute, True))
-                self._tell(trial.number, TrialState.FAIL)
+            if not self._read().counts(trial.number):
+                self._hand_back(trial)
                 return
             self._patiently(lambda: trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}"))
             with _Heartbeat(trial, self.heartbeat_interval):
@@ -153,10 +149,14 @@ class Worker:
             self._finish(trial, TrialState.FAIL, reason=_reason(e))
             raise
         except BaseException:
-            self._patiently(lambda: trial.set_user_attr(HANDED_BACK, True))
-            self._tell(trial.number, TrialState.FAIL)
+            self._hand_back(trial)
             self.report(f"trial {trial.number} is put back into the queue")
             raise
+
+    def _hand_back(self, trial: optuna.Trial) -> None:
+        """End an attempt that is no failure: its job is run later, if it is still wanted."""
+        self._patiently(lambda: trial.set_user_attr(HANDED_BACK, True))
+        self._tell(trial.number, TrialState.FAIL)
 
     def _finish(
         self,

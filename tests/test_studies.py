@@ -103,6 +103,23 @@ def test_ctrl_c_hands_the_trial_to_the_next_worker_at_once(workers, url):
     assert not [line for line in said if "silent" in line]
 
 
+def test_a_trial_may_be_interrupted_any_number_of_times():
+    study, points = open_study(optuna.storages.InMemoryStorage(), "s", space={}), []
+
+    def objective(trial):
+        points.append(trial.suggest_float("x", 0, 1))
+        if len(points) < 4:
+            raise KeyboardInterrupt
+        return 0.0
+
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            work_quickly(study, objective, 1, max_retries=1)
+    work_quickly(study, objective, 1, max_retries=1)
+    assert len(points) == 4
+    assert len(set(points)) == 1
+
+
 def test_a_database_that_is_restarted_costs_no_trial(tmp_path, postgres):  # noqa: F811
     team = Workers(tmp_path, postgres.create_database("restarted"), 2)
     try:
@@ -126,29 +143,30 @@ def test_workers_that_start_at_once_run_exactly_as_many_trials_as_asked_for(work
     assert sum(t.state in FINISHED for t in open_quick(url).get_trials()) == 2
 
 
-def test_of_two_that_begin_the_last_trial_at_once_one_gives_it_up(tmp_path):
+def test_of_two_that_begin_the_last_trial_at_once_one_hands_it_back(tmp_path):
     # Both have seen that one trial is missing, and both begin one.
     url = f"sqlite:///{tmp_path}/study.db"
     first, second = open_quick(url), open_quick(url)
     ran = []
-    both_have_begun = threading.Barrier(2, timeout=10)
+    together = threading.Barrier(2, timeout=30)
 
     def begin_together(study):
         ask = study.ask
 
-        def slow_ask():
+        def ask_together():
+            together.wait()
             trial = ask()
-            both_have_begun.wait()
+            together.wait()
             return trial
 
-        study.ask = slow_ask
-        work_quickly(study, lambda trial: ran.append(trial.number) or time.sleep(0.3) or 0.0, 1)
+        study.ask = ask_together
+        work_quickly(study, lambda trial: ran.append(trial.number) or time.sleep(0.3) or 0.0, 1, grace_period=30)
 
     threads = [threading.Thread(target=begin_together, args=(s,)) for s in (first, second)]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join(40)
     assert ran == [0]
     assert [t.state for t in first.get_trials()] == [TrialState.COMPLETE, TrialState.FAIL]
 
@@ -208,13 +226,19 @@ def test_a_worker_that_was_taken_for_dead_cannot_finish_its_trial(tmp_path):
 
 def test_a_worker_that_sees_a_slow_trial_of_another_waits_for_it(tmp_path):
     url = f"sqlite:///{tmp_path}/study.db"
-    study, said, ran = open_quick(url), [], []
-    slow = threading.Thread(target=work_quickly, args=(open_quick(url), lambda _: time.sleep(2.0) or 1.0, 1))
+    study, said, ran, begun = open_quick(url), [], [], threading.Event()
+
+    def slow_objective(_):
+        begun.set()
+        time.sleep(2.0)
+        return 1.0
+
+    slow = threading.Thread(target=work_quickly, args=(open_quick(url), slow_objective, 1))
     slow.start()
-    time.sleep(0.5)
-    work_quickly(study, lambda trial: ran.append(trial) or 0.0, 1, report=said.append)
+    assert begun.wait(20)
+    work_quickly(study, lambda trial: ran.append(trial) or 0.0, 1, grace_period=30, report=said.append)
     slow.join()
-    assert said == ["waiting for 1 trials of other workers; those silent for 0.5 s are taken over"]
+    assert said == ["waiting for 1 trials of other workers; those silent for 30 s are taken over"]
     assert ran == []
     assert [t.values for t in study.get_trials()] == [[1.0]]
 

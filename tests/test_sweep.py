@@ -43,7 +43,7 @@ def assert_complete(out, n_runs):
 
 
 def test_a_sweep_writes_everything_that_it_promises_and_a_second_call_trains_nothing(tmp_path, monkeypatch):
-    text = quick_sweep(tmp_path, jobs=2, n_seeds=1)
+    text = quick_sweep(tmp_path, jobs=1, n_seeds=1)
     runs = assert_complete(tmp_path, 2)
     assert runs["label"].tolist() == ["inf", "1/25"]
     for folder in runs["folder"]:
