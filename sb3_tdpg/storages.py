@@ -62,6 +62,8 @@ def _parse(text: str) -> sa.URL:
         parsed = sa.make_url(text)
     except (sa.exc.ArgumentError, ValueError) as e:
         raise ValueError(f"storage={_without_password(text)!r} is malformed, expected {FORMS}") from e
+    if "@" in (parsed.host or ""):
+        raise ValueError(f"storage={_without_password(text)!r}: write an @ in the password as %40")
     if parsed.drivername in ("postgresql", "postgres"):
         parsed = parsed.set(drivername="postgresql+psycopg")
     return parsed
@@ -73,7 +75,7 @@ def _connect_args(url: sa.URL) -> dict[str, Any]:
     limits = dict(connect_timeout=CONNECT_TIMEOUT)
     # A line that is cut in silence must not hold a worker for the hours that an operating system takes to notice.
     alive = dict(keepalives_idle=30, keepalives_interval=10, keepalives_count=3, tcp_user_timeout=60_000)
-    if url.get_driver_name() in ("psycopg", "psycopg2"):
+    if url.drivername in ("postgresql+psycopg", "postgresql+psycopg2"):
         return {**limits, **alive}
     return limits if url.get_backend_name() == "mysql" else {}
 
@@ -84,17 +86,12 @@ def _check_answers(url: sa.URL, connect_args: dict[str, Any], shown: str) -> Non
         with engine.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
     except ImportError as e:
-        raise ImportError(
-            f"storage {shown} needs the driver {e.name}: pip install {_package_of(e.name)}, or name another driver"
-        ) from e
+        mend = "pip install sb3_tdpg[postgres]" if e.name == "psycopg" else "install it, or name another one"
+        raise ImportError(f"storage {shown} needs the driver {e.name}: {mend}") from e
     except sa.exc.NoSuchModuleError as e:
         raise ValueError(f"storage={shown!r} is of an unknown kind, expected {FORMS}") from e
     except (sa.exc.SQLAlchemyError, ValueError, TypeError) as e:
         raise ValueError(f"storage {shown} does not answer: {_one_line(getattr(e, 'orig', None) or e)}") from e
-
-
-def _package_of(module: str | None) -> str:
-    return "'psycopg[binary]'" if module == "psycopg" else str(module)
 
 
 def _open_journal(path: Path) -> BaseStorage:

@@ -5,8 +5,8 @@ What is to be done follows from the trials in the storage alone, so that a worke
 
 - A *job* is a parameter set that is to be run to its end once. Its trials are its *attempts*: they share the
   attribute ``job``, the number of the first one or what :func:`enqueue_once` wrote there.
-- Of several living attempts at a job the one with the lowest number counts; the others are given up before they are
-  run. Likewise a job beyond ``n_trials``, which appears when two workers begin the last one at once.
+- Of several living attempts at a job the one with the lowest number counts; the others are handed back before they are
+  run. So is a job beyond ``n_trials``, as appears when two workers begin the last one at once.
 - A worker changes the attribute ``heartbeat`` of its trial every few seconds. A running trial whose heartbeat no other
   worker sees change for ``grace_period`` is failed, and attempted again with the same parameters.
 
@@ -33,8 +33,7 @@ from sb3_tdpg.study_worker import Objective, Worker
 
 __all__ = ["enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
 
-HEARTBEAT_INTERVAL = 20.0  # seconds
-GRACE_PERIOD = 120.0
+GRACE_PERIOD = 120.0  # seconds
 CREATION_TIME = 10.0  # seconds from the creation of a study to the description of its space, at most
 SPACE = "space"  # attribute of a study
 
@@ -122,8 +121,8 @@ def work(
     n_trials: int | None = None,
     *,
     max_retries: int = 3,
-    heartbeat_interval: float = HEARTBEAT_INTERVAL,
     grace_period: float = GRACE_PERIOD,
+    heartbeat_interval: float | None = None,
     report: Callable[[str], None] = print,
 ) -> None:
     """
@@ -139,13 +138,15 @@ def work(
         that :func:`enqueue_once` put into the queue.
     :param max_retries: How often a trial that failed, or took its worker with it, is run again. Then it is left, and
         if ``n_trials`` is given, another one takes its place.
-    :param heartbeat_interval: Seconds.
-    :param grace_period: Seconds without a heartbeat after which a worker counts as dead.
+    :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+    :param heartbeat_interval: Seconds; default: a sixth of the grace period.
     :param report: Gets a line of text whenever something happens.
     :raises ValueError: if the grace period is too short, or the storage stays away.
     """
     if n_trials is not None and n_trials < 1:
         raise ValueError(f"n_trials={n_trials} must be at least 1")
-    if grace_period < 2 * heartbeat_interval:
-        raise ValueError(f"{grace_period=} must be at least twice heartbeat_interval={heartbeat_interval} (seconds)")
+    if heartbeat_interval is None:
+        heartbeat_interval = grace_period / 6
+    if not 0 < 2 * heartbeat_interval <= grace_period:
+        raise ValueError(f"{grace_period=} must be at least twice {heartbeat_interval=}, and both positive (seconds)")
     Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report).run()

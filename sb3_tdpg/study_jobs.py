@@ -8,8 +8,8 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 
 # Attributes of a trial.
 JOB, HEARTBEAT, WORKER, REASON = "job", "heartbeat", "worker", "reason"
-GIVEN_UP, HANDED_BACK = "given_up", "handed_back"
-BOOKKEEPING = frozenset({JOB, HEARTBEAT, WORKER, REASON, GIVEN_UP, HANDED_BACK})
+HANDED_BACK = "handed_back"
+BOOKKEEPING = frozenset({JOB, HEARTBEAT, WORKER, REASON, HANDED_BACK})
 
 DONE, ALIVE = (TrialState.COMPLETE, TrialState.PRUNED), (TrialState.RUNNING, TrialState.WAITING)
 
@@ -31,33 +31,38 @@ class Jobs:
     def __init__(self, trials: Sequence[FrozenTrial], n_trials: int | None, max_retries: int) -> None:
         attempts: dict[int | str, list[FrozenTrial]] = {}
         for trial in trials:
-            if GIVEN_UP not in trial.user_attrs and (n_trials is not None or JOB in trial.user_attrs):
+            if n_trials is not None or JOB in trial.user_attrs:
                 attempts.setdefault(job_of(trial), []).append(trial)
         self.n_trials = n_trials
         self.done = {job for job, tried in attempts.items() if any(t.state in DONE for t in tried)}
         self.open: dict[int | str, FrozenTrial | None] = {}  # the attempt that counts, if one is alive
         self.failed: dict[int | str, FrozenTrial] = {}  # the last attempt
+        self.duplicates: set[int] = set()  # numbers of attempts that are alive and do not count
         for job, tried in attempts.items():  # in the order of their first attempts
-            alive = next((t for t in tried if t.state in ALIVE), None)
+            alive = [t for t in tried if t.state in ALIVE]
             failures = sum(t.state == TrialState.FAIL and HANDED_BACK not in t.user_attrs for t in tried)
             if job in self.done:
-                continue
-            if alive is None and failures > max_retries:
+                self.duplicates.update(t.number for t in alive)
+            elif not alive and failures > max_retries:
                 self.failed[job] = tried[-1]
             elif n_trials is None or len(self.done) + len(self.open) < n_trials:
-                self.open[job] = alive
+                self.open[job] = alive[0] if alive else None
+                self.duplicates.update(t.number for t in alive[1:])
         self._last_attempts = {job: attempts[job][-1] for job in self.open}
+        self._waiting = {t.number for t in trials if t.state == TrialState.WAITING}
 
     @property
     def finished(self) -> bool:
         """Whether nothing is left to do."""
-        return not self.open if self.n_trials is None else len(self.done) >= self.n_trials
+        done = not self.open if self.n_trials is None else len(self.done) >= self.n_trials
+        return done and not self.duplicates & self._waiting
 
     @property
     def has_room(self) -> bool:
-        """Whether another trial may begin: one waits, or there are too few."""
-        waits = any(trial is not None and trial.state == TrialState.WAITING for trial in self.open.values())
-        return waits or (self.n_trials is not None and len(self.done) + len(self.open) < self.n_trials)
+        """Whether a trial is to be begun: one that waits, or a new one."""
+        counting = {trial.number for trial in self.open.values() if trial is not None}
+        is_short = self.n_trials is not None and len(self.done) + len(self.open) < self.n_trials
+        return is_short or bool((counting | self.duplicates) & self._waiting)
 
     def counts(self, number: int) -> bool:
         """Whether this trial is to be run."""

@@ -15,7 +15,7 @@ import optuna
 from optuna.exceptions import StorageInternalError, TrialPruned, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_tdpg.study_jobs import GIVEN_UP, HANDED_BACK, HEARTBEAT, REASON, WORKER, Jobs
+from sb3_tdpg.study_jobs import HANDED_BACK, HEARTBEAT, REASON, WORKER, Jobs
 
 Objective = Callable[[optuna.Trial], float | Sequence[float]]
 Result = TypeVar("Result")
@@ -135,8 +135,7 @@ class Worker:
             self.next_number += 1
         try:
             if not self._read().counts(trial.number):
-                self._patiently(lambda: trial.set_user_attr(GIVEN_UP, "another trial has taken its place"))
-                self._tell(trial.number, TrialState.FAIL)
+                self._hand_back(trial)
                 return
             self._patiently(lambda: trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}"))
             with _Heartbeat(trial, self.heartbeat_interval):
@@ -150,10 +149,14 @@ class Worker:
             self._finish(trial, TrialState.FAIL, reason=_reason(e))
             raise
         except BaseException:
-            self._patiently(lambda: trial.set_user_attr(HANDED_BACK, True))
-            self._tell(trial.number, TrialState.FAIL)
+            self._hand_back(trial)
             self.report(f"trial {trial.number} is put back into the queue")
             raise
+
+    def _hand_back(self, trial: optuna.Trial) -> None:
+        """End an attempt that is no failure: its job is run later, if it is still wanted."""
+        self._patiently(lambda: trial.set_user_attr(HANDED_BACK, True))
+        self._tell(trial.number, TrialState.FAIL)
 
     def _finish(
         self,

@@ -5,6 +5,7 @@ import pwd
 import shutil
 import socket
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -23,11 +24,10 @@ def find_programs():
 class Postgres:
     """A server that can be stopped and started."""
 
-    def __init__(self, folder):
+    def __init__(self):
         self.programs = find_programs()
         if self.programs is None:
             pytest.skip("PostgreSQL is not installed: apt install postgresql")
-        self.folder = folder
         self.user = None
         if os.geteuid() == 0:  # as root it refuses to run
             try:
@@ -35,10 +35,10 @@ class Postgres:
             except KeyError:
                 pytest.skip("PostgreSQL does not run as root, and there is no user postgres: apt install postgresql")
             self.user = "postgres"
-            shutil.chown(folder, self.user)
-            for parent in folder.parents:  # pytest's folders are its owner's alone
-                if parent.owner() == "root" and not parent.stat().st_mode & 0o001:
-                    parent.chmod(parent.stat().st_mode | 0o011)
+        # Not in pytest's folder, which nobody but its owner may enter.
+        self.folder = folder = Path(tempfile.mkdtemp(prefix="sb3_tdpg-postgres-"))
+        if self.user:
+            shutil.chown(folder, self.user, self.user)
         with socket.socket() as s:
             s.bind(("127.0.0.1", 0))
             self.port = s.getsockname()[1]
@@ -57,7 +57,7 @@ class Postgres:
         return f"postgresql://tester:{password}@127.0.0.1:{self.port}/{database}"
 
     def start(self):
-        settings = f"-p {self.port} -k '{self.folder}' -h 127.0.0.1 -c fsync=off"
+        settings = f"-p {self.port} -c unix_socket_directories='' -h 127.0.0.1 -c fsync=off"
         self._run("pg_ctl", "-D", self.data, "-w", "-l", str(self.folder / "log"), "-o", settings, "start")
 
     def stop(self):
@@ -69,6 +69,10 @@ class Postgres:
         with psycopg.connect(self.url(), autocommit=True) as connection:
             connection.execute(f"CREATE DATABASE {name}")
         return self.url(name)
+
+    def close(self):
+        self.stop()
+        shutil.rmtree(self.folder)
 
     def _run(self, program, *arguments):
         as_user = dict(user=self.user, group=self.user, extra_groups=[]) if self.user else {}
@@ -84,3 +88,12 @@ class Postgres:
             **as_user,
         )
         assert result.returncode == 0, f"{program} failed: {result.stderr}"
+
+
+@pytest.fixture(scope="session")
+def postgres():
+    """Start a server for all tests of this process."""
+    server = Postgres()
+    server.start()
+    yield server
+    server.close()

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
-from sb3_tdpg.evaluation.information import encode_episodes
+from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.studies import open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
@@ -183,7 +183,7 @@ class _Measuring(BaseCallback):
         """Return the expected cost and the information in nats of the policy as it is now."""
         assert isinstance(self.model, TDPG)
         episodes = encode_episodes(self.model, self.env, seed=self.trial.number)
-        self.last = (float(episodes.costs.mean()), episodes.information)
+        self.last = (float(episodes.costs.mean()), max(0.0, information_bounds(episodes.batch).upper))
         for name, value in zip((COST, INFORMATION), self.last, strict=True):
             self.trial.set_user_attr(name, value)
         return self.last

@@ -1,0 +1,97 @@
+"""Real worker processes of a study, for the tests: they may be killed."""
+
+import multiprocessing as mp
+import os
+import signal
+import sys
+import time
+import warnings
+from multiprocessing.forkserver import ensure_running
+from unittest.mock import patch
+
+import optuna
+
+from sb3_tdpg.studies import enqueue_once, open_storage, open_study, quiet_optuna, work
+
+HEARTBEAT_INTERVAL, GRACE_PERIOD = 0.5, 2.0
+JOBS = [{"x": x} for x in (-2, -1, 0, 1, 2, 3)]
+
+
+def open_quick(url, name="s", **kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return open_study(open_storage(url), name, **{"space": {"x": [-1, 1]}, **kwargs})
+
+
+def run_worker(url, n_trials, log, seconds):
+    """Work at the study "s", and write the beginning and the end of each trial, and what is said, to a log."""
+
+    def objective(trial):
+        x = trial.suggest_float("x", -1.0, 1.0) if n_trials else trial.suggest_int("x", -2, 3)
+        y = trial.suggest_float("y", -1.0, 1.0)
+        write(f"begin {os.getpid()} {x} {y}")
+        time.sleep(seconds)
+        write(f"end {os.getpid()} {x} {y}")
+        return x * x + y
+
+    def write(text):
+        with open(log, "a") as file:
+            file.write(text + "\n")
+
+    quiet_optuna()
+    # The same seed in all workers: they must not try the same points for it.
+    study = open_quick(url, sampler=optuna.samplers.TPESampler(seed=0))
+    if n_trials is None:
+        enqueue_once(study, JOBS)
+    times = dict(heartbeat_interval=HEARTBEAT_INTERVAL, grace_period=GRACE_PERIOD)
+    work(study, objective, n_trials, **times, report=lambda text: write(f"say {os.getpid()} {text}"))
+
+
+class Workers:
+    """Worker processes, and the log that they write."""
+
+    def __init__(self, folder, url, n_trials):
+        self.url, self.n_trials, self.log = url, n_trials, folder / "log"
+        self.processes = []
+        # Forked by a process that has imported what they need, they start in milliseconds. What that is to import it
+        # finds through the environment alone.
+        self.context = mp.get_context("forkserver")
+        self.context.set_forkserver_preload([__name__])
+        with patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)):
+            ensure_running()
+
+    def start(self, *seconds):
+        """Start a worker for each duration of a trial."""
+        new = [self.context.Process(target=run_worker, args=(self.url, self.n_trials, self.log, s)) for s in seconds]
+        for process in new:
+            process.start()
+        self.processes += new
+        return new
+
+    def lines(self, kind, process=None):
+        """What was written, as tuples of words: the parameters of trials that begin or end."""
+        lines = [line.split() for line in self.log.read_text().splitlines()] if self.log.exists() else []
+        return [tuple(at) for word, pid, *at in lines if word == kind and (process is None or int(pid) == process.pid)]
+
+    @property
+    def said(self):
+        return "\n".join(" ".join(words) for words in self.lines("say"))
+
+    def wait_for(self, kind, process):
+        deadline = time.monotonic() + 30
+        while not self.lines(kind, process):
+            assert time.monotonic() < deadline, f"no {kind} in the log: {[p.exitcode for p in self.processes]}"
+            time.sleep(0.02)
+
+    def send(self, name, process):
+        os.kill(process.pid, getattr(signal, name))
+
+    def join(self, processes):
+        for process in processes:
+            process.join(40)
+        assert [process.exitcode for process in processes] == [0] * len(processes), self.said
+
+    def stop(self):
+        for process in self.processes:
+            process.kill()
+            process.join()

@@ -1,0 +1,333 @@
+"""Workers that share a study: real processes on a real PostgreSQL, on SQLite and on a journal file."""
+
+import re
+import threading
+import time
+
+import pytest
+
+optuna = pytest.importorskip("optuna")
+
+from optuna.trial import TrialState  # noqa: E402
+from postgres import PASSWORD, postgres  # noqa: E402, F401
+from study_workers import Workers, open_quick  # noqa: E402
+
+from sb3_tdpg import studies  # noqa: E402
+from sb3_tdpg.studies import enqueue_once, open_storage, open_study, quiet_optuna, work  # noqa: E402
+
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+
+
+@pytest.fixture(autouse=True)
+def silent_optuna():
+    quiet_optuna()
+
+
+@pytest.fixture(params=["postgresql", "sqlite", "journal"])
+def url(request, tmp_path):
+    """A storage that has never been used."""
+    if request.param == "postgresql":
+        server = request.getfixturevalue("postgres")
+        return server.create_database("d" + re.sub(r"\W", "_", tmp_path.name).lower())
+    return f"sqlite:///{tmp_path}/study.db" if request.param == "sqlite" else str(tmp_path / "study.log")
+
+
+def work_quickly(study, objective, n_trials=None, **kwargs):
+    settings = dict(heartbeat_interval=0.1, grace_period=0.5, report=lambda _: None)
+    work(study, objective, n_trials, **{**settings, **kwargs})
+
+
+@pytest.fixture
+def workers(tmp_path, url):
+    made = []
+
+    def make(n_trials):
+        made.append(Workers(tmp_path, url, n_trials))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.stop()
+
+
+def test_a_trial_whose_worker_is_killed_is_run_again_with_its_parameters_and_exactly_n_are_finished(workers, url):
+    team = workers(8)
+    victim, *others = team.start(60, 0.1, 0.1)
+    team.wait_for("begin", victim)
+    team.send("SIGKILL", victim)
+    team.join(others)
+
+    trials = open_quick(url).get_trials()
+    finished = [t for t in trials if t.state in FINISHED]
+    assert len(finished) == 8
+    assert not [t for t in trials if t.state in (TrialState.RUNNING, TrialState.WAITING)]
+    (lost,) = team.lines("begin", victim)
+    assert sum((str(t.params["x"]), str(t.params["y"])) == lost for t in finished) == 1
+    assert "is silent for 2 s: to be run again" in team.said
+    # Nothing was computed twice, and no two workers tried the same point though their samplers have the same seed.
+    ended = team.lines("end")
+    assert len(ended) == len(set(ended)) == 8
+
+
+def test_every_job_is_done_once_by_workers_that_begin_at_once_while_one_is_killed(workers, url):
+    team = workers(None)
+    victim, *others = team.start(60, 0.2, 0.2)
+    team.wait_for("begin", victim)
+    team.send("SIGKILL", victim)
+    team.join(others)
+
+    trials = open_quick(url).get_trials()
+    assert sorted(t.params["x"] for t in trials if t.state in FINISHED) == [-2, -1, 0, 1, 2, 3]
+    assert sorted(int(x) for x, _ in team.lines("end")) == [-2, -1, 0, 1, 2, 3]
+    assert not [t for t in trials if t.state in (TrialState.RUNNING, TrialState.WAITING)]
+
+
+def test_ctrl_c_hands_the_trial_to_the_next_worker_at_once(workers, url):
+    team = workers(2)
+    (first,) = team.start(60)
+    team.wait_for("begin", first)
+    team.send("SIGINT", first)
+    first.join(20)
+    assert first.exitcode not in (0, None)
+    assert "trial 0 is put back into the queue" in team.said
+
+    ran, said = [], []
+
+    def objective(trial):
+        ran.append((str(trial.suggest_float("x", -1, 1)), str(trial.suggest_float("y", -1, 1))))
+        return 0.0
+
+    work_quickly(open_quick(url), objective, 2, grace_period=60, report=said.append)
+    assert len(ran) == 2
+    assert ran[:1] == team.lines("begin")
+    assert not [line for line in said if "silent" in line]
+
+
+def test_a_trial_may_be_interrupted_any_number_of_times():
+    study, points = open_study(optuna.storages.InMemoryStorage(), "s", space={}), []
+
+    def objective(trial):
+        points.append(trial.suggest_float("x", 0, 1))
+        if len(points) < 4:
+            raise KeyboardInterrupt
+        return 0.0
+
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            work_quickly(study, objective, 1, max_retries=1)
+    work_quickly(study, objective, 1, max_retries=1)
+    assert len(points) == 4
+    assert len(set(points)) == 1
+
+
+def test_a_database_that_is_restarted_costs_no_trial(tmp_path, postgres):  # noqa: F811
+    team = Workers(tmp_path, postgres.create_database("restarted"), 2)
+    try:
+        (worker,) = team.start(1.0)
+        team.wait_for("begin", worker)
+        postgres.stop()
+        team.wait_for("end", worker)
+        time.sleep(0.5)
+        postgres.start()
+        team.join([worker])
+    finally:
+        team.stop()
+    assert "the storage does not answer" in team.said
+    assert len(team.lines("begin")) == len(team.lines("end")) == 2
+
+
+def test_workers_that_start_at_once_run_exactly_as_many_trials_as_asked_for(workers, url):
+    team = workers(2)
+    team.join(team.start(*[0.5] * 4))
+    assert len(team.lines("begin")) == len(team.lines("end")) == 2
+    assert sum(t.state in FINISHED for t in open_quick(url).get_trials()) == 2
+
+
+def test_of_two_that_begin_the_last_trial_at_once_one_hands_it_back(tmp_path):
+    # Both have seen that one trial is missing, and both begin one.
+    url = f"sqlite:///{tmp_path}/study.db"
+    first, second = open_quick(url), open_quick(url)
+    ran = []
+    together = threading.Barrier(2, timeout=30)
+
+    def begin_together(study):
+        ask = study.ask
+
+        def ask_together():
+            together.wait()
+            trial = ask()
+            together.wait()
+            return trial
+
+        study.ask = ask_together
+        work_quickly(study, lambda trial: ran.append(trial.number) or time.sleep(0.3) or 0.0, 1, grace_period=30)
+
+    threads = [threading.Thread(target=begin_together, args=(s,)) for s in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(40)
+    assert ran == [0]
+    assert [t.state for t in first.get_trials()] == [TrialState.COMPLETE, TrialState.FAIL]
+
+
+def test_a_value_error_prunes_the_trial_and_is_kept(url):
+    study, said = open_quick(url), []
+
+    def objective(trial):
+        if trial.number == 0:
+            raise ValueError("rate is too high")
+        return float("nan") if trial.number == 1 else 1.0
+
+    work_quickly(study, objective, 3, report=said.append)
+    trials = study.get_trials()
+    assert [t.state for t in trials] == [TrialState.PRUNED, TrialState.PRUNED, TrialState.COMPLETE]
+    assert trials[0].user_attrs["reason"] == "rate is too high"
+    assert "nan" in trials[1].user_attrs["reason"]
+    assert said[0] == "trial 0: pruned: rate is too high (1 of 3 finished)"
+
+
+def test_another_exception_stops_the_worker_and_the_trial_is_run_again_a_few_times():
+    study = open_study(optuna.storages.InMemoryStorage(), "s", space={})
+    points = []
+
+    def objective(trial):
+        points.append(trial.suggest_float("x", 0, 1))
+        if len(points) <= 3:
+            raise RuntimeError("out of memory")
+        return 0.0
+
+    for attempt in range(3):
+        with pytest.raises(RuntimeError, match="out of memory"):
+            work_quickly(study, objective, 2, max_retries=2)
+        assert study.get_trials()[-1].user_attrs["reason"] == "RuntimeError: out of memory", attempt
+    said = []
+    work_quickly(study, objective, 2, max_retries=2, report=said.append)
+    assert len(set(points[:3])) == 1  # the same parameters each time
+    assert len(set(points)) == 3  # then two others took their place
+    assert said[-1] == "trial 2 failed 3 times and is left: RuntimeError: out of memory"
+
+
+def test_a_worker_that_was_taken_for_dead_cannot_finish_its_trial(tmp_path):
+    study = open_quick(str(tmp_path / "study.log"))
+    said = []
+
+    def objective(trial):
+        study.tell(trial.number, state=TrialState.FAIL)  # as another worker would
+        return 1.0 if trial.number == 0 else 2.0
+
+    def then_well(trial):
+        return objective(trial) if trial.number == 0 else 2.0
+
+    work_quickly(study, then_well, 1, report=said.append)
+    assert said[0] == "trial 0 was taken over by another worker: its result is dropped"
+    assert [t.values for t in study.get_trials()] == [None, [2.0]]
+
+
+def test_a_worker_that_sees_a_slow_trial_of_another_waits_for_it(tmp_path):
+    url = f"sqlite:///{tmp_path}/study.db"
+    study, said, ran, begun = open_quick(url), [], [], threading.Event()
+
+    def slow_objective(_):
+        begun.set()
+        time.sleep(2.0)
+        return 1.0
+
+    slow = threading.Thread(target=work_quickly, args=(open_quick(url), slow_objective, 1))
+    slow.start()
+    assert begun.wait(20)
+    work_quickly(study, lambda trial: ran.append(trial) or 0.0, 1, grace_period=30, report=said.append)
+    slow.join()
+    assert said == ["waiting for 1 trials of other workers; those silent for 30 s are taken over"]
+    assert ran == []
+    assert [t.values for t in study.get_trials()] == [[1.0]]
+
+
+def test_a_study_with_other_settings_is_refused_and_says_what_differs(url):
+    open_quick(url, space={"x": [-1, 1], "env": {"id": "Lava-v0", "noise": 0.1}})
+    assert open_quick(url, space={"x": (-1, 1), "env": {"id": "Lava-v0", "noise": 0.1}}).user_attrs["space"]
+    with pytest.raises(ValueError, match=r"study 's' .* env.noise: 0.1 there, 0.2 here; x: \[-1, 1\] there, nothing"):
+        open_quick(url, space={"env": {"id": "Lava-v0", "noise": 0.2}})
+    with pytest.raises(ValueError, match=r'directions: \["minimize"\] there, \["maximize"\] here'):
+        open_quick(url, space={"x": [-1, 1], "env": {"id": "Lava-v0", "noise": 0.1}}, directions=["maximize"])
+
+
+def test_a_study_of_another_program_is_refused(tmp_path):
+    storage = open_storage(f"sqlite:///{tmp_path}/study.db")
+    optuna.create_study(storage=storage, study_name="s").optimize(lambda trial: 0.0, n_trials=1)
+    with pytest.raises(ValueError, match="study 's' was made by another program"):
+        open_study(storage, "s", space={})
+
+
+def test_a_study_whose_maker_died_before_it_said_what_it_is_can_be_used(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "CREATION_TIME", 0.2)
+    storage = open_storage(f"sqlite:///{tmp_path}/study.db")
+    optuna.create_study(storage=storage, study_name="s")
+    assert open_study(storage, "s", space={"x": 1}).user_attrs["space"] == {"x": 1}
+
+
+def test_jobs_may_be_put_into_the_queue_again_and_more_of_them(url):
+    study, ran = open_quick(url), []
+
+    def objective(trial):
+        ran.append(trial.suggest_categorical("k", ["a", "b", "c"]))
+        return 0.0
+
+    enqueue_once(study, [{"k": "a"}, {"k": "b"}])
+    enqueue_once(study, [{"k": "a"}, {"k": "b"}])
+    work_quickly(study, objective)
+    enqueue_once(study, [{"k": "b"}, {"k": "c"}])
+    work_quickly(study, objective)
+    assert ran == ["a", "b", "c"]
+
+
+def test_a_password_is_neither_shown_nor_an_obstacle(postgres):  # noqa: F811
+    open_storage(postgres.url())
+    shown = None
+    try:
+        open_storage(postgres.url("missing"))
+    except ValueError as e:
+        shown = str(e)
+    assert shown is not None
+    assert "\n" not in shown
+    assert 'database "missing" does not exist' in shown
+    assert PASSWORD not in shown
+    assert "rc%25nt" not in shown
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("postgresql://someone:secret@127.0.0.1:1/x", r"storage postgresql\S+//someone:\*\*\*@127.0.0.1:1/x does not"),
+        ("postgresql://someone:sec@secret@host/x", "write an @ in the password as %40"),
+        ("postgresql://::::", "is malformed"),
+        ("nothing://host/x", "unknown kind"),
+        ("study.txt", "is none of postgresql://"),
+        ("/proc/nowhere/study.log", "cannot be used as a journal file"),
+        ("sqlite:////proc/study.db", "does not answer"),
+    ],
+)
+def test_a_storage_that_cannot_be_used_is_named_in_one_line(url, message):
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match=message) as caught:
+        open_storage(url)
+    assert "secret" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert time.monotonic() - begin < 15
+
+
+def test_a_file_that_is_no_journal_is_left_alone(tmp_path):
+    path = tmp_path / "training.log"
+    path.write_text("epoch 1\n")
+    with pytest.raises(ValueError, match="journal file"):
+        open_storage(path)
+    assert path.read_text() == "epoch 1\n"
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"), [(dict(n_trials=0), "n_trials=0"), (dict(grace_period=0.1), "at least twice")]
+)
+def test_bad_arguments_are_named(kwargs, message):
+    study = open_study(optuna.storages.InMemoryStorage(), "s", space={})
+    with pytest.raises(ValueError, match=message):
+        work_quickly(study, lambda trial: 0.0, **kwargs)
