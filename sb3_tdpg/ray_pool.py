@@ -27,7 +27,7 @@ class Call(NamedTuple):
 
     actor: int
     message: bytes
-    reply: Any  # a Ray object reference
+    reply: list[Any]  # Ray's references to the observations and to the rest
 
 
 class ActorPool:
@@ -63,6 +63,8 @@ class ActorPool:
             # choice, and the actors of a second RayVecEnv, for evaluation, would wait for ever.
             self._options = {"num_cpus": 0 if SESSION.is_local else 1, **actor_options}
             n_actors = n_actors or min(len(env_fns), max(1, int(self._ray.cluster_resources().get("CPU", 1))))
+            # Two objects, since Ray sends one of up to 100 kB with the answer itself, and a larger one by a detour.
+            self._ray.method(num_returns=2)(EnvActor.call)
             # Ray's own restart would give an actor without environments.
             self._actor_class = self._ray.remote(EnvActor).options(**self._options, max_restarts=0, max_task_retries=0)
             bounds = [len(env_fns) * i // n_actors for i in range(n_actors + 1)]
@@ -118,7 +120,7 @@ class ActorPool:
         by_index = dict(zip(itertools.chain.from_iterable(asked), answers, strict=True))
         return [by_index[i] for i in indices]
 
-    def _received(self, reply: Any, timeout: float | None = None) -> tuple[Any, Any]:
+    def _received(self, reply: list[Any], timeout: float | None = None) -> tuple[Any, Any]:
         try:
             observations, rest = self._ray.get(reply, timeout=timeout)
         except self._ray.exceptions.RayTaskError as error:
@@ -137,14 +139,15 @@ class ActorPool:
                 share = self.shares[i]
                 env_fns = self._env_fns[share.start : share.stop]
                 replies.append(actor.call.remote(cloudpickle.dumps(("make", (env_fns, self.max_restarts > 0)))))
-            _, late = self._ray.wait(replies, num_returns=len(replies), timeout=self._start_timeout)
+            made = [rest for _, rest in replies]
+            _, late = self._ray.wait(made, num_returns=len(made), timeout=self._start_timeout)
             if late:
                 raise TimeoutError(self._why_late(len(late), len(which)))
-            made = [self._received(reply)[1] for reply in replies]
+            env_spaces = [self._received(reply)[1] for reply in replies]
         except BaseException:
             self._kill(actors)
             raise
-        return actors, made[0]
+        return actors, env_spaces[0]
 
     def _why_late(self, n_late: int, n: int) -> str:
         there, free = (
@@ -207,7 +210,7 @@ class ActorPool:
             return
         self._is_closed = True
         if self._ray.is_initialized() and self._actors:
-            replies = [self.send(i, "close").reply for i in range(len(self._actors))]
+            replies = [self.send(i, "close").reply[1] for i in range(len(self._actors))]
             self._ray.wait(replies, num_returns=len(replies), timeout=CLOSE_TIMEOUT)
             self._kill(self._actors)
         SESSION.leave()
