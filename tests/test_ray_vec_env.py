@@ -99,12 +99,23 @@ class WanderEnv(gym.Env):
 
 
 class OwnNoiseEnv(WanderEnv):
-    """Draws from a generator of its own, which no seed reaches."""
+    """Draws from a generator of its own, which no seed reaches, where it begins or for its rewards."""
+
+    def __init__(self, kind, name, noise_in):
+        super().__init__(kind, name)
+        self.noise_in = noise_in
 
     def reset(self, *, seed=None, options=None):
         _, info = super().reset(seed=seed, options=options)
-        self.x += np.random.default_rng().standard_normal(3)
+        if self.noise_in == "reset":
+            self.x += np.random.default_rng().standard_normal(3)
         return self._observe(), info
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        if self.noise_in == "reward":
+            reward += np.random.default_rng().standard_normal()
+        return observation, reward, *rest
 
 
 class CrashingEnv(WanderEnv):
@@ -374,11 +385,14 @@ def test_a_training_goes_on_from_its_checkpoint_after_a_dead_actor_was_reported(
     assert_same_parameters(parameters(resumed.policy), parameters(undisturbed.policy))
 
 
-def test_an_actor_whose_environments_do_not_come_out_as_before_is_reported_not_replaced(make):
-    env = make(wanderers(env_class=OwnNoiseEnv), max_restarts=3)
-    env.seed(0)
+@pytest.mark.parametrize("noise_in, n_steps", [("reset", 0), ("reward", 2)])
+def test_an_actor_whose_environments_do_not_come_out_as_before_is_reported_not_replaced(noise_in, n_steps, make):
+    env = make(wanderers(env_class=OwnNoiseEnv, noise_in=noise_in), max_restarts=3)
+    env.seed(1)
     env.reset()
-    env.step(actions(0))
+    for t in range(n_steps):
+        env.step(actions(t))
+    assert env.get_attr("t", indices=[0]) == [n_steps]  # still the first episode
     kill(env, 0)
     for _ in range(2):  # nothing goes on with other episodes
         with pytest.warns(UserWarning), pytest.raises(DeadActorError, match="more than np_random and the actions"):
