@@ -1,7 +1,8 @@
 """
 ``make bench``: what batching is worth, as ratios measured in this run on one thread.
 
-Every ratio compares two ways to do the same thing, run in turn (A B A B ...), by the medians of their CPU times.
+Every ratio compares two ways to do the same thing, run in turn (A B A B ...), by the medians of their CPU times; where
+several processes work, of their elapsed times.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import torch as th  # noqa: E402
 from sb3_contrib import RecurrentPPO  # noqa: E402
 from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
 from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
-from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv  # noqa: E402
 from torch import nn  # noqa: E402
 
 from sb3_tdpg import TDPG, make_episodes_env  # noqa: E402
@@ -38,7 +39,13 @@ from sb3_tdpg.envs.ball_fast import FastRenderer  # noqa: E402
 from sb3_tdpg.envs.ball_scene import Renderer  # noqa: E402
 from sb3_tdpg.envs.panda_bullet import MOTIONS, GraspSimulation  # noqa: E402
 from sb3_tdpg.envs.panda_camera import DepthCamera  # noqa: E402
-from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv  # noqa: E402
+from sb3_tdpg.envs.panda_grasp import (  # noqa: E402
+    ACTION_SCALE,
+    HIGHEST_ACTION,
+    LOWEST_ACTION,
+    NOMINAL_GRASP,
+    PandaGraspEnv,
+)
 from sb3_tdpg.envs.panda_scene import TABLE_FILE, TABLE_POSITION  # noqa: E402
 from sb3_tdpg.information import InformationBatch, Mine  # noqa: E402
 from tests.reference_loop import LoopTDPG, draw_randomness, unbatch  # noqa: E402
@@ -100,7 +107,7 @@ def compare(
     our_time, reference_time = (statistics.median(column) for column in zip(*times, strict=True))
     ratios = [theirs / mine for mine, theirs in times]
     row = Row(what, our_time, reference_time, min(ratios), max(ratios), goal)
-    print(f"{row.what}: {row.ratio:.1f}x", flush=True)
+    print(f"{row.what}: {format_ratio(row.ratio)}x", flush=True)
     return row
 
 
@@ -298,6 +305,15 @@ def bench_camera(sizes: Sizes) -> Iterable[Row]:
 # -- (f) grasping -----------------------------------------------------------------------------------------------------
 
 
+def some_grasps(states: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Poses and actions of an untrained policy's kind, half of which lift the mug: ``(N, 4)`` each."""
+    poses = np.tile(NOMINAL_GRASP, (len(states), 1))
+    poses[:, :2] = states[:, :2] + [0.045, 0.01]
+    poses += rng.normal(size=poses.shape) * [0.03, 0.03, 0.01, 0.3]
+    actions = np.clip((poses - NOMINAL_GRASP) / ACTION_SCALE, LOWEST_ACTION, HIGHEST_ACTION)
+    return NOMINAL_GRASP + ACTION_SCALE * actions, actions
+
+
 class GraspTrials:
     """Trials of an untrained policy's kind, half of which lift the mug, and what they are made of."""
 
@@ -306,12 +322,7 @@ class GraspTrials:
         self.env = PandaGraspEnv()
         self.env.reset(seed=SEED)
         self.states = self.env._initial_state(n)
-        self.poses = np.tile(NOMINAL_GRASP, (n, 1))
-        self.poses[:, :2] = self.states[:, :2] + [0.045, 0.01]
-        self.poses += np.random.default_rng(SEED).normal(size=(n, 4)) * [0.03, 0.03, 0.01, 0.3]
-        box = self.env.action_space
-        self.actions = np.clip((self.poses - NOMINAL_GRASP) / 0.1, box.low, box.high)
-        self.poses = NOMINAL_GRASP + 0.1 * self.actions
+        self.poses, self.actions = some_grasps(self.states, np.random.default_rng(SEED))
 
     def run(self) -> None:
         """Whole trials, as in training: the image before and the one after the grasp among them."""
@@ -379,6 +390,46 @@ def bench_grasp(sizes: Sizes) -> Iterable[Row]:
         each.close()
 
 
+# -- (g) several processes --------------------------------------------------------------------------------------------
+
+
+def grasping_of_two(vec_env_class: Callable[..., VecEnv], n_steps: int) -> tuple[VecEnv, Callable[[], float]]:
+    """Return two environments, and a function that carries out trials in them and returns the elapsed time of one."""
+    env = make_vec_env("sb3_tdpg:PandaGrasp-v0", n_envs=2, seed=SEED, vec_env_cls=vec_env_class)  # type: ignore[arg-type]
+    env.reset()
+    rng = np.random.default_rng(SEED)
+
+    def run() -> float:
+        start = time.perf_counter()
+        for _ in range(n_steps):
+            states = np.array([info["state"] for info in env.reset_infos])
+            env.step(some_grasps(states, rng)[1].astype(np.float32))
+        return (time.perf_counter() - start) / (n_steps * env.num_envs)
+
+    return env, run
+
+
+def bench_processes(sizes: Sizes) -> Iterable[Row]:
+    """Compare Ray's actors with SB3's processes, two of each."""
+    try:
+        from sb3_tdpg.ray_vec_env import RayVecEnv
+
+        ours, run_ours = grasping_of_two(RayVecEnv, sizes.n_episodes // 50)
+    except ImportError as e:
+        print(f"left out: {e}")
+        return
+    reference, run_reference = grasping_of_two(SubprocVecEnv, sizes.n_episodes // 50)
+    yield compare(
+        "trial of PandaGrasp, elapsed time: RayVecEnv with 2 actors against SubprocVecEnv with 2 processes",
+        run_ours,
+        run_reference,
+        5 * sizes.repetitions,  # short ones: what else runs on the machine disturbs elapsed times
+        goal=0.9,
+    )
+    for env in (ours, reference):
+        env.close()
+
+
 # -- the table --------------------------------------------------------------------------------------------------------
 
 
@@ -390,12 +441,17 @@ def format_time(value: float) -> str:
     return f"{value / 1e-9:.3g} ns"
 
 
+def format_ratio(value: float) -> str:
+    """Print a ratio, and one of about 1 with one digit more."""
+    return f"{value:.2f}" if value < 2 else f"{value:.1f}"
+
+
 def format_table(rows: Iterable[Row]) -> str:
     """Lay out the rows as a Markdown table."""
     lines = ["| what | ours | reference | ratio (lowest-highest) | goal | met |", "|---|---|---|---|---|---|"]
     for row in rows:
-        goal = "-" if row.goal is None else f"{row.goal:.0f}x"
-        ratio = f"{row.ratio:.1f}x ({row.lowest:.1f}-{row.highest:.1f})"
+        goal = "-" if row.goal is None else f"{row.goal:g}x"
+        ratio = f"{format_ratio(row.ratio)}x ({format_ratio(row.lowest)}-{format_ratio(row.highest)})"
         lines.append(
             f"| {row.what} | {format_time(row.ours)} | {format_time(row.reference)} | {ratio} | {goal} | {row.met} |"
         )
@@ -430,14 +486,23 @@ def main() -> None:
     sizes = QUICK if arguments.quick else FULL
 
     start = time.perf_counter()
-    benches = (bench_epoch, bench_critics, bench_training, bench_environment, bench_camera, bench_grasp)
+    benches = (
+        bench_epoch,
+        bench_critics,
+        bench_training,
+        bench_environment,
+        bench_camera,
+        bench_grasp,
+        bench_processes,
+    )
     rows = [row for bench in benches for row in bench(sizes)]
     split = GraspTrials(max(10, sizes.n_episodes // 5)).split(sizes.loop_repetitions)
     elapsed = time.perf_counter() - start
     title = "# Speed" + (" (--quick: not the paper's sizes)" if arguments.quick else "")
     notes = (
-        "CPU time of one thread, medians over repetitions in which both sides take turns; the ratio is that of the "
-        "medians. The first policy epoch, with the critics' warm-up, is not counted. "
+        "CPU time of one thread (elapsed time where the row says so), medians over repetitions in which both sides "
+        "take turns; the ratio is that of the medians. The first policy epoch, with the critics' warm-up, is not "
+        "counted. "
         f"{sizes.repetitions} repetitions ({sizes.loop_repetitions} of the loop over samples), {elapsed:.0f} s in all."
     )
     report = "\n\n".join([title, describe_machine(), format_table(rows), split, notes]) + "\n"
