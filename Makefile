@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
-EXTRAS ?= zoo,tests,plots,docs,dev
+EXTRAS ?= zoo,postgres,ray,hub,tests,plots,docs,dev
 
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed

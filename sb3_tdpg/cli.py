@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         advice = "" if out is None else f"; {out} keeps what is done, and the same command goes on from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
-    except ValueError as e:
+    except (ValueError, ImportError) as e:  # a missing extra is told as an ImportError
         print(f"error: {e}", file=sys.stderr)
         return 2
     return 0
@@ -77,9 +77,39 @@ def _zoo(program: str, arguments: Sequence[str]) -> None:
     try:
         from sb3_tdpg.zoo.programs import run
     except ImportError as e:
-        raise ValueError(f"{program} needs rl-zoo3 ({e}): pip install 'sb3_tdpg[zoo]'") from e
+        raise ImportError(f"{program} needs rl-zoo3 ({e}): pip install 'sb3_tdpg[zoo]'") from e
 
     run(program, arguments)
+
+
+def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> None:
+    from sb3_tdpg.enjoy import parse_keywords
+    from sb3_tdpg.sweep import sweep
+
+    out = options.pop("out") or Path("results", f"sweep-{options['block'] or env}")
+    print(
+        f"\n{sweep(env, n_seeds=seeds, settings=parse_keywords(settings), out=out, **options)}\n\nresults are in {out}"
+    )
+
+
+def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_episodes: int) -> None:
+    from sb3_tdpg.hub import push_to_hub, write_model_card
+
+    if not (folder / "README.md").exists():
+        card = card or folder.with_name(f"{folder.name}-hub")
+        folder = write_model_card(folder, card, repo_id, film_episodes=film_episodes)
+    if not dry_run:
+        print(f"{folder} is now at {push_to_hub(folder, repo_id)}")
+        return
+    print(f"{folder} is ready; without --dry-run it goes to https://huggingface.co/{repo_id}:")
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        print(f"{path.stat().st_size:>12,}  {path.relative_to(folder)}")
+
+
+def _pull(repo_id: str, to: Path) -> None:
+    from sb3_tdpg.hub import pull_from_hub
+
+    print(f"{repo_id} is in {pull_from_hub(repo_id, to)}")
 
 
 # rl-zoo3's programs read their flags themselves.
@@ -98,7 +128,14 @@ def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
     return arguments[0] in ZOO_PROGRAMS or (arguments[0] == "enjoy" and not any(a.endswith(".zip") for a in arguments))
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"demo": _demo, "reproduce": _reproduce, "enjoy": _enjoy}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": _demo,
+    "reproduce": _reproduce,
+    "enjoy": _enjoy,
+    "sweep": _sweep,
+    "push": _push,
+    "pull": _pull,
+}
 
 
 def _make_parser() -> argparse.ArgumentParser:
@@ -148,7 +185,49 @@ def _make_parser() -> argparse.ArgumentParser:
     enjoy.add_argument("--n-episodes", type=_positive, default=1)
     enjoy.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
     enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4")
+    _add_sweep(commands)
+    _add_hub(commands)
     return parser
+
+
+def _add_sweep(commands: Any) -> None:
+    sweep = commands.add_parser(
+        "sweep", help="train with several betas and seeds, select by the paper's rule, draw cost against information"
+    )
+    sweep.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
+    sweep.add_argument("--betas", nargs="+", required=True, metavar="BETA", help="1/25 1/50 0.01 inf ...")
+    sweep.add_argument("--seeds", type=_positive, default=5, help="training seeds of each beta")
+    sweep.add_argument("--cost-limit", type=float, default=None, help="for the selection (default: the environment's)")
+    sweep.add_argument("--block", default=None, help="block of hyperparameters (default: that of the environment)")
+    sweep.add_argument(
+        "--set", dest="settings", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        help="settings in place of the block's, the values in YAML: mi_estimator=logdet",
+    )  # fmt: skip
+    sweep.add_argument("--out", type=Path, default=None, help="folder for the results (default: results/sweep-<block>)")
+    sweep.add_argument(
+        "--storage", default=None, metavar="URL",
+        help="work at a sweep that others work at, too: postgresql://..., sqlite:///FILE or FILE.log",
+    )  # fmt: skip
+    sweep.add_argument("--study-name", default=None, help="its name there (default: sweep-<block>)")
+    sweep.add_argument(
+        "--grace-period", type=float, default=120.0, help="seconds of silence after which a worker counts as dead"
+    )
+    sweep.add_argument(
+        "--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores; with --storage 1)"
+    )
+    _add_sizes(sweep)
+
+
+def _add_hub(commands: Any) -> None:
+    push = commands.add_parser("push", help="publish a trained model and its card on the Hugging Face Hub")
+    push.add_argument("folder", type=Path, help="a run's folder, one that train has left, or one with a model card")
+    push.add_argument("--repo-id", required=True, metavar="ORG/NAME", help="by convention ORG/tdpg-<environment>")
+    push.add_argument("--card", type=Path, default=None, help="where the card is written (default: FOLDER-hub)")
+    push.add_argument("--dry-run", action="store_true", help="write the card, and upload nothing")
+    push.add_argument("--film-episodes", type=int, default=0, help="episodes to show in replay.mp4")
+    pull = commands.add_parser("pull", help="download a model and its card from the Hugging Face Hub")
+    pull.add_argument("repo_id", metavar="ORG/NAME")
+    pull.add_argument("--to", type=Path, required=True, help="folder for it")
 
 
 def _add_sizes(parser: argparse.ArgumentParser) -> None:
