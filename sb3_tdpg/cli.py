@@ -18,7 +18,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if _is_for_the_zoo(arguments):
-        command, options = _zoo, dict(program=arguments[0], arguments=arguments[1:])
+        command: Callable[..., None] = _zoo
+        options: dict[str, Any] = dict(program=arguments[0], arguments=arguments[1:])
     else:
         options = vars(_make_parser().parse_args(arguments))
         command = COMMANDS[options.pop("command")]

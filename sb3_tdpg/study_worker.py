@@ -179,7 +179,8 @@ class Worker:
         if told is None or told.state != state:
             self._say_taken_over(trial)
             return
-        text = {TrialState.COMPLETE: f"{told.values}", TrialState.PRUNED: "pruned"}.get(state, "failed")
+        values_text = ", ".join(f"{value:.4g}" for value in told.values or ())
+        text = {TrialState.COMPLETE: values_text, TrialState.PRUNED: "pruned"}.get(state, "failed")
         text += f": {reason}" if reason else ""
         total = "" if self.n_trials is None else f" of {self.n_trials}"
         self.report(f"trial {trial.number}: {text} ({len(self._read().done)}{total} finished)")

@@ -54,9 +54,9 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
     :raises ValueError: naming the key, and the mend.
     """
     cls = ALGOS[algo]
-    arguments = {name for base in cls.__mro__ for name in inspect.signature(base.__init__).parameters}
+    arguments = {name for base in cls.__mro__ for name in inspect.signature(base).parameters if base is not object}
     if unknown := sorted(set(block) - ZOO_KEYS - arguments):
-        own = sorted(set(inspect.signature(cls.__init__).parameters) - {"self", "env", "_init_setup_model"})
+        own = sorted(set(inspect.signature(cls).parameters) - {"env", "_init_setup_model"})
         raise ValueError(
             f"{where} has {', '.join(unknown)}, which is neither an argument of {cls.__name__} ({', '.join(own)}) nor "
             f"a key of rl-zoo3 ({', '.join(sorted(ZOO_KEYS))})"

@@ -60,8 +60,9 @@ class TDPGExperimentManager(ExperimentManager):
     # And told them by it: the zoo itself ends an interrupted training like a finished one.
     was_interrupted = False
 
-    def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, config: str | None = None, **kwargs: Any) -> None:
-        super().__init__(args, algo, env_id, *rest, config=config or find_file(algo, self.block or env_id), **kwargs)
+    def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
+        kwargs["config"] = kwargs.get("config") or find_file(algo, self.block or env_id)
+        super().__init__(args, algo, env_id, *rest, **kwargs)
         if algo == "tdpg":
             self.deterministic_eval = False
         if self.resume is not None:
@@ -185,18 +186,23 @@ class TDPGExperimentManager(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """See the zoo. The last policy is replaced by the selected one."""
+        if not isinstance(model, TDPG):
+            super().save_trained_model(model)
+            return
         checkpoint = Path(self.save_path, CHECKPOINT)
-        if isinstance(model, TDPG) and model.num_timesteps < model._total_timesteps:
-            type(self).was_interrupted = True
-            print(f"interrupted after {model.num_timesteps} of {model._total_timesteps} steps")
-            if checkpoint.exists():
-                print(f"`sb3-tdpg train --resume {self.save_path}` goes on from the last checkpoint")
-        else:
-            checkpoint.unlink(missing_ok=True)
+        is_finished = model.num_timesteps >= model._total_timesteps
+        if is_finished:
             for callback in self.callbacks:
                 if isinstance(callback, SelectionCallback):
                     _restore_selected(callback, model)
         super().save_trained_model(model)
+        if is_finished:
+            checkpoint.unlink(missing_ok=True)
+            return
+        type(self).was_interrupted = True
+        print(f"interrupted after {model.num_timesteps} of {model._total_timesteps} steps")
+        if checkpoint.exists():
+            print(f"`sb3-tdpg train --resume {self.save_path}` goes on from the last checkpoint")
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         if self.resume is not None:  # it says how the training began

@@ -25,7 +25,7 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
 from sb3_tdpg.files import write_atomically
-from sb3_tdpg.studies import open_storage, open_study, work
+from sb3_tdpg.studies import open_storage, open_study, quiet_optuna, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
@@ -107,7 +107,7 @@ class TuningManager(TDPGExperimentManager):
             if is_constrained:
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
-                raise optuna.TrialPruned
+                raise optuna.TrialPruned(f"behind the others at expected cost {cost:.4g}, {information:.4g} nat")
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
@@ -127,6 +127,7 @@ class TuningManager(TDPGExperimentManager):
             n_evaluations=self.n_evaluations,
             n_eval_episodes=self.n_eval_episodes,
         )
+        quiet_optuna()
         study = open_study(
             open_storage(self.storage),
             self.study_name,
@@ -134,8 +135,18 @@ class TuningManager(TDPGExperimentManager):
             pruner=self._create_pruner(self.pruner),
             space=description,
         )
+        # What every trial would fail of is told before the first one.
+        self.create_envs(1, eval_env=True).close()
         work(study, self.objective, self.max_total_trials or self.n_trials)
         self._write_results(study, description)
+
+    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
+        if self.algo != "tdpg" or sampler_method != "tpe":
+            return super()._create_sampler(sampler_method)
+        # As the zoo's, but for workers that choose at the same time: each counts the others' open trials as bad ones.
+        return optuna.samplers.TPESampler(
+            n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, constant_liar=True
+        )
 
     def _write_results(self, study: optuna.Study, description: dict[str, Any]) -> None:
         folder = Path(self.save_path)
