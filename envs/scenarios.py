@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -150,3 +150,8 @@ PANDA_GRASP_CAMERA: tuple[Scenario, ...] = (
     Scenario("Twice the range", "PandaGrasp-v0", dict(camera_range=(-0.06, 0.06))),
     Scenario("Usual height", "PandaGrasp-v0", dict(camera_range=(0.0, 0.0))),
 )
+
+PAPER_ROWS: Mapping[str, Sequence[Scenario]] = MappingProxyType(
+    {"Lava-v0": LAVA, "BallCatch-v0": BALL_CATCH, "PandaGrasp-v0": PANDA_GRASP}
+)
+"""The rows of the paper's table, by environment."""

@@ -17,19 +17,12 @@ import yaml
 from stable_baselines3.common.monitor import get_monitor_files, load_results
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, PANDA_GRASP, Scenario
+from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.rerun import scenarios_of, with_numbers
 from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
-
-PAPER_ROWS: Mapping[str, Sequence[Scenario]] = {
-    "Lava-v0": LAVA,
-    "BallCatch-v0": BALL_CATCH,
-    "PandaGrasp-v0": PANDA_GRASP,
-}
-"""What a policy of an environment is evaluated on, where nothing else is asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +179,6 @@ def read_zoo_folder(
         labels=dict(train_seed=args["seed"]),
         progress_bar=progress_bar,
     )
-    versions = _saved_versions(model_path)
     files = {
         "args.yml": inner / "args.yml",
         "config.yml": inner / "config.yml",
@@ -201,9 +193,12 @@ def read_zoo_folder(
         settings=settings,
         seed=args["seed"],
         progress=_monitored_progress(folder, model.n_episodes),
-        notes=[f"Trained with rl-zoo3; the policy is the one {candidates[model_path]}."],
+        notes=[
+            f"Trained with rl-zoo3; the policy is the one {candidates[model_path]}.",
+            _selection_note(folder, settings),
+        ],
         command=_told_command((inner / "command.txt").read_text()) if (inner / "command.txt").exists() else None,
-        how=dict(versions=versions, platform=versions.pop("OS", "unknown"), git=None),
+        how=_zoo_provenance(folder, model_path),
         files={name: path for name, path in files.items() if path.exists()},
         metrics=sorted([*folder.glob("*.csv"), *folder.glob("evaluations.npz")]),
     )
@@ -217,11 +212,21 @@ def _told_command(command: str) -> str | None:
     return shlex.join([Path(program).name, *rest])
 
 
-def _saved_versions(model_path: Path) -> dict[str, str]:
-    """Return what SB3 saves of the machine with a model."""
+def _zoo_notes(folder: Path, settings: Mapping[str, Any], which: str) -> list[str]:
+    note = f"Trained with rl-zoo3; the policy is the one {which}."
+    # The zoo's own program does not put the selected policy in the place of the last one, ours does.
+    return [note, _selection_note(folder, settings)] if (folder / "run.json").exists() else [note]
+
+
+def _zoo_provenance(folder: Path, model_path: Path) -> dict[str, Any]:
+    """Return what our ``train`` has recorded; of the zoo's own only what SB3 saves of the machine with a model."""
+    if (folder / "run.json").exists():
+        how: dict[str, Any] = json.loads((folder / "run.json").read_text())["provenance"]
+        return how
     with zipfile.ZipFile(model_path) as archive:
         lines = archive.read("system_info.txt").decode().splitlines()
-    return dict(line.removeprefix("- ").split(": ", 1) for line in lines if line.startswith("- ") and ": " in line)
+    versions = dict(line.removeprefix("- ").split(": ", 1) for line in lines if line.startswith("- ") and ": " in line)
+    return dict(versions=versions, platform=versions.pop("OS", "unknown"), git=None)
 
 
 def _selection_note(folder: Path, settings: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, PANDA_GRASP, PANDA_GRASP_CAMERA, Scenario
+from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA, PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation.information import information_bounds, rollout_information
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
@@ -20,12 +20,6 @@ from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
 
 N_INFORMATION = 1000  # episodes
-SCENARIOS: Mapping[str, Sequence[Scenario]] = {
-    "Lava-v0": LAVA,
-    "BallCatch-v0": BALL_CATCH,
-    "PandaGrasp-v0": PANDA_GRASP,
-    "PandaGrasp-v0-camera": PANDA_GRASP_CAMERA,
-}
 
 
 @dataclass(frozen=True)
@@ -149,7 +143,8 @@ def make_sweep(
             raise ValueError(f"{name} is what the sweep varies: leave it out of the settings")
     if n_timesteps is not None:
         settings = {**settings, "n_timesteps": n_timesteps}
-    scenarios = SCENARIOS.get("PandaGrasp-v0-camera" if "camera" in block else env_id, (Scenario("Training", env_id),))
+    rows = PAPER_ROWS.get(env_id, (Scenario("Training", env_id),))
+    scenarios = PANDA_GRASP_CAMERA if block.startswith("PandaGrasp-v0-camera") else rows
     plan = Sweep(env_id, block, dict(settings), scenarios, n_eval_episodes)
     try:
         env = make_training(env_id, plan.run(1.0, 0).settings, seed=0, device="cpu").model.env

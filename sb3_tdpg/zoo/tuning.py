@@ -108,6 +108,7 @@ class TuningManager(TDPGExperimentManager):
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
                 raise optuna.TrialPruned(f"behind the others at expected cost {cost:.4g}, {information:.4g} nat")
+            print(f"trial {trial.number}: expected cost {cost:.4g}, {information:.4g} nat")
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
