@@ -190,6 +190,19 @@ def test_two_workers_share_a_study(here):  # noqa: F811
     assert all("best of" in output for output in outputs)
 
 
+@pytest.mark.parametrize("sampler", ["random", "tpe"])
+@pytest.mark.parametrize("pruner", ["none", "halving", "median"])
+def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):  # noqa: F811
+    """As the zoo's own tests try them."""
+    arguments = ["--env", "CartPole-v1", "-n", "100", "-params", 'policy_kwargs:"dict(trv_dim=3)"', "n_envs:1"]
+    arguments += ["n_episodes:2", "batch_size:2", "--seed", "14", "--log-folder", "elsewhere", "--n-trials", "2"]
+    arguments += ["--n-jobs", "1", "--sampler", sampler, "--pruner", pruner, "--n-evaluations", "2"]
+    arguments += ["--n-startup-trials", "1", "--optimization-log-path", "kept", "--eval-episodes", "4"]
+    assert main(["tune", *arguments]) == 0
+    assert len(list(here.glob("kept/trial_*/model.zip"))) == 2
+    assert len(list(here.glob("elsewhere/tdpg/study-CartPole-v1-information/trials.csv"))) == 1
+
+
 def test_a_limit_that_no_trial_meets_is_told(here, capsys):  # noqa: F811
     assert main(["tune", *TINY, "--cost-limit", "1e-6", "--n-trials", "2"]) == 0
     assert "none of the finished trials" in capsys.readouterr().out
@@ -202,6 +215,7 @@ BAD = {
         ["--env", "Pendulum-v1", "--block", "Pendulum-v1-pg"],
         "needs a limit on the expected cost .*--cost-limit",
     ),
+    "threads": (["--n-jobs", "2"], "--n-jobs 2 would be threads .* start the same command several times"),
     "keyword": (["--eval-env-kwargs", "foo:1"], "cannot be made with env_kwargs={'foo': 1}"),
     "space": (["--space", "none.yml"], "the search space none.yml cannot be read"),
     "storage": (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db does not answer"),

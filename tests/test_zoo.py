@@ -268,6 +268,27 @@ def test_the_zoos_own_program_takes_tdpg_as_its_documentation_says(here):
     assert folder_of(here).joinpath("Lava-v0.zip").exists()
 
 
+def test_a_training_is_continued_from_a_model_with_other_settings(here):
+    assert main(["train", *SHORT]) == 0
+    first = TDPG.load(folder_of(here) / "Lava-v0.zip", device="cpu")
+    assert main(["train", *SHORT, "-i", "logs/tdpg/Lava-v0_1/Lava-v0.zip", "-params", "n_episodes:20", "beta:0.5"]) == 0
+    second = TDPG.load(folder_of(here, 2) / "Lava-v0.zip", device="cpu")
+    assert (first.beta, second.beta) == (1 / 75, 0.5)
+    assert (
+        second.policy.optimizer.state_dict()["state"][0]["step"]
+        > first.policy.optimizer.state_dict()["state"][0]["step"]
+    )
+
+
+def test_a_file_or_a_package_of_ones_own_and_a_policy_by_its_path(here, monkeypatch):
+    block = "policy='sb3_tdpg.policies.TRVPolicy', n_timesteps=200, n_episodes=20, mi_estimator='logdet', beta=1.0"
+    (here / "my_settings.py").write_text(f"hyperparams = {{'Lava-v0': dict({block})}}\n")
+    monkeypatch.syspath_prepend(str(here))
+    for where in ("my_settings.py", "my_settings"):
+        assert main(["train", "--env", "Lava-v0", "--conf-file", where, "--eval-freq", "-1"]) == 0
+    assert len(list(here.glob("logs/tdpg/*/Lava-v0.zip"))) == 2
+
+
 def test_help_lists_our_flags_and_the_zoos(capsys):
     for program, flag in (("train", "--resume"), ("tune", "--objective"), ("plot", "--save")):
         with pytest.raises(SystemExit) as stop:

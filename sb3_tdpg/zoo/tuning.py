@@ -52,6 +52,11 @@ class TuningManager(TDPGExperimentManager):
             self.objective_kind = "information" if self._eval_env_kwargs_args is None else "shift"
         if self.objective_kind == "shift" and self._eval_env_kwargs_args is None:
             raise ValueError("--objective shift needs --eval-env-kwargs: what is other there than in training")
+        if self.n_jobs != 1:
+            raise ValueError(
+                f"--n-jobs {self.n_jobs} would be threads of one process, which do not make TDPG faster: start the "
+                "same command several times instead, with --storage"
+            )
         self.n_evaluations = self.n_evaluations or N_EVALUATIONS
         self.study_name = self.study_name or f"{self.block or env_id}-{self.objective_kind}"
         self.save_path = self.params_path = str(Path(self.log_path, f"study-{self.study_name}"))
@@ -64,6 +69,9 @@ class TuningManager(TDPGExperimentManager):
         block, saved = super().read_hyperparameters()
         if self.algo == "tdpg":
             self.settings = copy.deepcopy(dict(saved))
+            policy_kwargs = self.settings.get("policy_kwargs")
+            if isinstance(policy_kwargs, str):  # as on the command line, and in the zoo's own files
+                self.settings["policy_kwargs"] = eval(policy_kwargs)
             self.space = relevant(self.space, block)
             self.cost_limit = self._find_limit(block)
             if block.get("beta") == "auto":
@@ -104,6 +112,8 @@ class TuningManager(TDPGExperimentManager):
             others = [callback for callback in callbacks if not isinstance(callback, SelectionCallback)]
             model.learn(self.n_timesteps, [*others, measuring])
             cost, information = measuring.last if measuring.is_pruned else measuring.measure()
+            if self.optimization_log_path is not None:
+                model.save(Path(self.optimization_log_path, f"trial_{trial.number}", "model.zip"))
             if is_constrained:
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
