@@ -1,0 +1,65 @@
+"""``sweep``, ``push`` and ``pull`` from the command line; what they do is tested with the functions that they call."""
+
+import json
+import re
+
+import pandas as pd
+import pytest
+
+from sb3_tdpg.cli import main
+
+pytest.importorskip("huggingface_hub")
+pytest.importorskip("matplotlib")
+
+SWEEP = ["sweep", "--env", "Lava-v0", "--betas", "1/25", "inf", "--seeds", "1", "--cost-limit", "1e6", "--jobs", "1"]
+TINY = ["--n-timesteps", "200", "--n-eval-episodes", "20", "--set", "mi_estimator=logdet", "n_episodes=20"]
+
+
+def test_a_sweep_and_the_card_of_one_of_its_runs(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*SWEEP, *TINY]) == 0
+    assert "results are in results/sweep-Lava-v0" in capsys.readouterr().out
+    out = tmp_path / "results" / "sweep-Lava-v0"
+    runs = pd.read_csv(out / "runs.csv")
+    assert runs["label"].tolist() == ["inf", "1/25"]
+    config = json.loads((out / "runs" / runs["folder"][1] / "config.json").read_text())
+    assert config["settings"]["mi_estimator"] == "logdet"
+    assert config["settings"]["n_episodes"] == 20
+    assert config["settings"]["n_timesteps"] == 200
+
+    folder = out / "runs" / runs["folder"][1]
+    assert main(["push", str(folder), "--repo-id", "me/tdpg-Lava-v0", "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    card = folder.with_name(folder.name + "-hub")
+    for path in card.rglob("*.*"):
+        assert path.name in text
+    assert "Mean cost [95 %]" in (card / "README.md").read_text()
+
+
+def test_push_and_pull_hand_on_what_they_are_given(tmp_path, capsys, monkeypatch):
+    called = []
+    monkeypatch.setattr("sb3_tdpg.hub.push_to_hub", lambda *a, **k: called.append((a, k)) or "https://there")
+    monkeypatch.setattr("sb3_tdpg.hub.pull_from_hub", lambda *a, **k: called.append((a, k)) or a[1])
+    (tmp_path / "README.md").write_text("a card")
+    assert main(["push", str(tmp_path), "--repo-id", "me/model"]) == 0
+    assert main(["pull", "me/model", "--to", str(tmp_path / "here")]) == 0
+    assert called == [((tmp_path, "me/model"), {}), (("me/model", tmp_path / "here"), {})]
+    assert "https://there" in capsys.readouterr().out
+
+
+BAD = {
+    "beta": ([*SWEEP, "--betas", "1/x"], "beta='1/x' must be a positive number"),
+    "environment": ([*SWEEP, "--env", "Foo-v0"], "'Foo-v0' is not registered"),
+    "block": ([*SWEEP, "--block", "Lava-v0-foo"], "no block 'Lava-v0-foo'.*choose one with --block"),
+    "storage": ([*SWEEP, *TINY, "--storage", "postgresql://a:b@127.0.0.1:1/c"], "does not answer"),
+    "folder": (["push", "nothing", "--repo-id", "a/b"], "nothing holds no training"),
+}
+
+
+@pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
+def test_bad_input_is_told_in_a_line(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error)
+    assert len(error.splitlines()) == 1
