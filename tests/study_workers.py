@@ -25,6 +25,8 @@ def open_quick(url, name="s", **kwargs):
 
 def run_worker(url, n_trials, log, seconds):
     """Work at the study "s", and write the beginning and the end of each trial, and what is said, to a log."""
+    # A shell that runs the tests in the background has it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def objective(trial):
         x = trial.suggest_float("x", -1.0, 1.0) if n_trials else trial.suggest_int("x", -2, 3)

@@ -49,7 +49,7 @@ ARGUMENTS = {
     "batch_size in steps": (dict(batch_size=2000), "batch_size=2000", "number of episodes"),
     "clip_range zero": (dict(clip_range=0.0), "clip_range=0.0", "positive", "inf"),
     "clip_range NaN": (dict(clip_range=math.nan), "clip_range=nan", "positive"),
-    "clip_range a schedule that ends at zero": (dict(clip_range=lambda progress: progress), "clip_range=0.0"),
+    "clip_range a schedule that ends below zero": (dict(clip_range=lambda progress: progress - 0.5), "clip_range=-0.5"),
     "passes without clipping": (dict(n_epochs=3), "n_epochs=3", "clip_range=0.2"),
     "minibatches without clipping": (dict(batch_size=10), "batch_size=10", "2 updates", "clip_range=0.2"),
     "beta a schedule that ends at zero": (dict(beta=lambda progress: progress), "beta=0.0", "positive number"),
