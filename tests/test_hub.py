@@ -259,20 +259,15 @@ def test_nothing_is_unpickled_without_trust(monkeypatch):
 
 
 def test_stable_baselines3s_own_package_loads_the_model(card, on_the_hub, monkeypatch):
-    try:
-        from huggingface_sb3 import load_from_hub as load_as_sb3_does
-    except ImportError as e:
-        pytest.skip(f"huggingface_sb3 does not work with this huggingface_hub: {e}")
+    load_as_sb3_does = pytest.importorskip("huggingface_sb3", exc_type=ModuleNotFoundError).load_from_hub
     monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
     model = TDPG.load(load_as_sb3_does(REPO_ID, f"{model_name('Lava-v0')}.zip"), device="cpu")
     assert model.predict(np.zeros(2, np.float32))[0].shape == (1,)
 
 
 def test_the_zoo_finds_all_files_that_it_asks_for(card, tmp_path, monkeypatch):
-    try:
-        import rl_zoo3.load_from_hub as zoo
-    except ImportError as e:
-        pytest.skip(f"rl_zoo3 does not import: {e}")
+    pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
+    import rl_zoo3.load_from_hub as zoo
     from rl_zoo3 import get_saved_hyperparams
 
     def download(repo_id, filename):
@@ -308,10 +303,9 @@ def test_results_json_is_the_zoos(card):
 @pytest.fixture(scope="module")
 def zoo_folder(tmp_path_factory):
     """What the zoo's train leaves of a training on normalised observations, with the evaluations of a callback."""
-    try:
-        import rl_zoo3.train
-    except ImportError as e:
-        pytest.skip(f"rl_zoo3 does not import: {e}")
+    pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
+    import rl_zoo3.train
+
     folder = tmp_path_factory.mktemp("zoo")
     block = dict(
         policy="TRVPolicy",

@@ -78,7 +78,7 @@ def _tune(arguments: list[str]) -> None:
         print("\nand all flags of rl-zoo3; of TDPG --n-trials and --max-total-trials both count all workers' trials:\n")
     given, rest = ours.parse_known_args(arguments)
     manager = TuningManager
-    manager.block, manager.objective_kind = given.block, given.objective
+    manager.block, manager.resume, manager.objective_kind = given.block, None, given.objective
     manager.cost_limit, manager.space_path = given.cost_limit, given.space
     _check_dictionaries(rest)
     rl_zoo3.train.ExperimentManager = TuningManager  # type: ignore[misc]
