@@ -45,7 +45,8 @@ def clipped_policy_loss(
     """
     shapes = {log_prob.shape, old_log_prob.shape, advantages.shape, alive.shape}
     assert len(shapes) == 1, shapes
-    ratio = th.exp(log_prob - old_log_prob.detach())
+    # What is stored after the end of an episode is no sample of the policy: its ratio may overflow, and 0 * inf is NaN.
+    ratio = th.exp(th.where(alive > 0, log_prob - old_log_prob.detach(), 0.0))
     clipped = ratio.clamp(1.0 - clip_range, 1.0 + clip_range)
     cost = advantages.detach()
     return (alive * th.maximum(cost * ratio, cost * clipped)).sum(dim=0).mean()

@@ -53,6 +53,17 @@ def test_the_cost_to_go_sums_from_each_step_to_the_end_with_the_discount():
     assert cost_to_go(costs, 0.5).tolist() == [[3, 30], [4, 40], [4, 40]]
 
 
+def test_a_ratio_that_overflows_after_the_end_of_an_episode_leaves_the_clipped_loss_and_its_gradient_finite():
+    alive = th.tensor([[1.0, 1.0], [1.0, 0.0]])
+    log_prob = th.tensor([[0.1, 0.0], [0.0, 200.0]], requires_grad=True)
+    for advantage in (-1.0, 1.0):
+        loss = clipped_policy_loss(log_prob, th.zeros(2, 2), advantage * th.ones(2, 2), alive, 0.2)
+        (gradient,) = th.autograd.grad(loss, log_prob)
+        assert th.isfinite(loss)
+        assert th.isfinite(gradient).all()
+        assert gradient[1, 1] == 0
+
+
 def test_the_clipped_loss_begins_with_the_policy_gradient():
     th.manual_seed(0)
     old, advantages, alive = th.randn(3, 4), th.randn(3, 4), (th.rand(3, 4) < 0.7).float()
