@@ -12,6 +12,11 @@ from collections.abc import Callable
 import torch as th
 
 from sb3_tdpg.losses import cost_to_go
+from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
+
+N_CENTRES = 20
+# Of a regression that all time steps share: it has more samples, from states that are further apart.
+N_SHARED_CENTRES = 100
 
 AdvantageFunction = Callable[..., th.Tensor]
 """``(costs, states, alive, gamma, gae_lambda) -> advantages``, see the functions below."""
@@ -40,6 +45,10 @@ def value_advantages(
     """
     Estimate advantages (Schulman et al., 2016) with a value V_t(x_t) of the true state, one regression per time step.
 
+    Beyond a horizon of 50, where the policy's steps share their weights by default, all time steps share one
+    regression, on the state and on what is left of the horizon: a few long episodes have many samples, but few for
+    each step.
+
     With ``gae_lambda=1`` this is the cost to come less its regression on the state. The true state is known in training
     only, and only the baseline sees it: the gradient stays unbiased, since x_t precedes the noise of step t. Each
     half of
@@ -55,14 +64,39 @@ def value_advantages(
     :return: ``(T, N)``
     """
     targets = cost_to_go(costs, gamma)
-    features = _state_features(states, alive)  # (T, N, F)
-    fold = th.arange(costs.shape[1], device=costs.device) % 2
-    values = th.zeros_like(targets)
-    for held_out in (0, 1):
-        values += (fold == held_out) * alive * _ridge(features, targets, alive * (fold != held_out))
+    fold = (th.arange(costs.shape[1], device=costs.device) % 2).expand_as(costs)
+    if len(costs) <= MAX_TIME_VARYING_HORIZON:
+        values = _held_out_predictions(_state_features(states, alive), targets, alive, fold)
+    else:
+        values = _shared_values(states, targets, alive, fold, gamma)
     next_values = th.cat([values[1:], th.zeros_like(values[:1])])
     residuals = costs + gamma * next_values - values
     return cost_to_go(residuals, gamma * gae_lambda)
+
+
+def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold: th.Tensor, gamma: float) -> th.Tensor:
+    """Regress on the state and on how much of the horizon is left, for all time steps at once: ``(T, N)``."""
+    # With a discount it tells only the last steps apart.
+    to_go = cost_to_go(th.ones_like(targets), gamma) / len(targets)
+    living = alive.flatten().nonzero()[:, 0]
+    # In an order without a period, since every so many samples one is taken for a centre.
+    golden = (math.sqrt(5) - 1) / 2
+    order = living[th.argsort(th.arange(len(living), dtype=th.float64, device=living.device) * golden % 1)]
+    inputs = th.cat([states, to_go[..., None]], dim=-1)
+    inputs, outputs, fold = (x.flatten(0, 1)[order][None] for x in (inputs, targets, fold))  # (1, S, ...)
+    weight = th.ones_like(outputs)
+    features = _state_features(inputs, weight, N_SHARED_CENTRES)
+    values = th.zeros_like(targets).flatten()
+    values[order] = _held_out_predictions(features, outputs, weight, fold)[0]
+    return values.view_as(targets)
+
+
+def _held_out_predictions(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, fold: th.Tensor) -> th.Tensor:
+    """Predict each of two folds from the other one: ``(T, N)``."""
+    predictions = th.zeros_like(targets)
+    for held_out in (0, 1):
+        predictions += (fold == held_out) * weight * _ridge(features, targets, weight * (fold != held_out))
+    return predictions
 
 
 def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: float = 0.5) -> th.Tensor:
@@ -82,7 +116,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
     return th.where(seen.any(dim=1, keepdim=True), prediction.clamp(low, high), th.zeros_like(prediction))
 
 
-def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = 20) -> th.Tensor:
+def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENTRES) -> th.Tensor:
     """Standardised state, its squares and Gaussian bumps centred on states of the batch, for each time step."""
     weight = alive[..., None]
     total = weight.sum(1, keepdim=True).clamp(min=1.0)

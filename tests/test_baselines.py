@@ -55,6 +55,42 @@ def test_an_episodes_own_cost_never_enters_its_own_baseline(rollouts):
     assert (new_baseline[:, 7] - baseline[:, 7]).abs().max() > 1  # but it does enter those of the other half
 
 
+@pytest.fixture
+def long_rollouts():
+    """Six episodes of a state that wanders, half of which end early; a cost that the state tells exactly."""
+    states = 0.95 ** th.arange(200.0)[:, None, None] * th.randn(6, 1) + 0.3 * th.randn(200, 6, 1)
+    alive = th.ones(200, 6)
+    alive[120:, ::2] = 0.0
+    return alive * states[..., 0] ** 2, states, alive
+
+
+def test_a_long_horizon_with_few_episodes_has_enough_for_one_regression_that_all_steps_share(long_rollouts):
+    costs, states, alive = long_rollouts
+    living = alive > 0
+    advantages = value_advantages(costs, states, alive, 0.5, 0.0)[living]
+    targets = cost_to_go(costs, 0.5)[living]
+    assert advantages.var() < 0.3 * targets.var()
+    # Step by step three episodes would have to tell what the other three cost.
+    per_step = [value_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(0, 198)]
+    assert advantages.var() < 0.5 * th.stack(per_step)[living[:198]].var()
+
+
+def test_the_end_of_a_long_horizon_is_told_from_its_middle():
+    costs, alive = th.ones(200, 6), th.ones(200, 6)
+    advantages = value_advantages(costs, th.randn(200, 6, 1), alive, 0.9)
+    assert advantages.abs().max() < 1.0  # the cost to come falls from 10 to 1 over the last steps
+
+
+def test_also_over_a_long_horizon_an_episodes_own_cost_never_enters_its_own_baseline(long_rollouts):
+    costs, states, alive = long_rollouts
+    baseline = cost_to_go(costs) - value_advantages(costs, states, alive)
+    changed = costs.clone()
+    changed[:100, 2] += 50
+    new_baseline = cost_to_go(changed) - value_advantages(changed, states, alive)
+    th.testing.assert_close(new_baseline[:, 2], baseline[:, 2], rtol=0, atol=0.02)
+    assert (new_baseline[:, 3] - baseline[:, 3]).abs().max() > 1
+
+
 def test_a_smaller_lambda_keeps_the_noise_of_later_costs_out(rollouts):
     costs, states, alive = rollouts
     noisy_end = costs.clone()
