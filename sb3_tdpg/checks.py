@@ -34,8 +34,9 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     n_episodes, batch_size = settings["n_episodes"], settings["batch_size"]
     for name in ("n_episodes", "n_epochs"):
         check_count(name, settings[name])
-    if batch_size is not None:
-        check_count("batch_size", batch_size)
+    for name in ("batch_size", "bptt_steps"):
+        if settings[name] is not None:
+            check_count(name, settings[name])
     if n_episodes < 2:
         raise ValueError(f"n_episodes={n_episodes} must be at least 2: baseline and information are taken over a batch")
     if batch_size is not None and not 2 <= batch_size <= n_episodes:

@@ -307,14 +307,15 @@ class TRVPolicy(BasePolicy):
             actions = actions[:, 0]
         return self._action_distribution(parameters).log_prob(actions).unflatten(0, trvs.shape[:2])
 
-    def rebuild_trvs(self, features: th.Tensor, noise: th.Tensor) -> RebuiltTRVs:
+    def rebuild_trvs(self, features: th.Tensor, noise: th.Tensor, start: th.Tensor | None = None) -> RebuiltTRVs:
         """
         Unroll eq:lg, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
 
         :param features: ``(T, N, F)``
         :param noise: eps_t, ``(T, N, Z)``
+        :param start: x~_{-1}, ``(N, Z)``; default: zero
         """
-        trv = th.zeros_like(noise[0])
+        trv = th.zeros_like(noise[0]) if start is None else start
         trvs, means, stds = [], [], []
         # Not features[t]: the gradient of each would be as large as all features.
         for t, features_t in enumerate(features.unbind()):
@@ -324,6 +325,29 @@ class TRVPolicy(BasePolicy):
             means.append(mean)
             stds.append(std)
         return RebuiltTRVs(th.stack(trvs), th.stack(means), th.stack(stds))
+
+    def rebuild_trvs_in_parts(self, features: th.Tensor, batch: EpisodeBatch, n_steps: int) -> RebuiltTRVs:
+        """
+        Unroll eq:lg in parts of the horizon, side by side as if each were an episode: truncated back-propagation.
+
+        A part begins with the stored TRVs of the step before it, through which no gradient flows.
+
+        :param features: ``(T, N, F)``
+        :param batch: the rollouts, ``(T, N, ...)``
+        :param n_steps: Steps of a part. All steps must share their weights.
+        """
+        assert not self.time_varying
+        horizon, n_episodes = batch.noise.shape[:2]
+        n_parts = math.ceil(horizon / n_steps)
+
+        def split(x: th.Tensor) -> th.Tensor:  # (T, N, .) -> (n_steps, n_parts * N, .)
+            padded = th.cat([x, x.new_zeros(n_parts * n_steps - horizon, *x.shape[1:])])
+            return padded.unflatten(0, (n_parts, n_steps)).transpose(0, 1).flatten(1, 2)
+
+        rebuilt = self.rebuild_trvs(split(features), split(batch.noise), split(batch.prev_trvs)[0])
+        return RebuiltTRVs(
+            *(x.unflatten(1, (n_parts, n_episodes)).transpose(0, 1).flatten(0, 1)[:horizon] for x in rebuilt)
+        )
 
     # -- the interface of SB3 ---------------------------------------------------------------------------------
 

@@ -84,6 +84,10 @@ class TDPG(OnPolicyAlgorithm):
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (eq:grad phi), as in the paper;
         ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the
         second varies less. Default: ``"score"`` and ``"pathwise"``.
+    :param bptt_steps: Steps that a gradient flows back through the memory: the pathwise one, and the information's.
+        ``None``: to the start of the episode. For long horizons: the horizon is cut into parts of so many steps, which
+        are computed side by side, so that 10 of 200 make an update ten times as fast; what a TRV does for the steps
+        beyond its part is then not credited to it. The steps must share their weights (``time_varying=False``).
     :param n_epochs: Passes over the rollouts of a policy epoch, as in SB3's PPO; default: 1 and 4.
     :param batch_size: Minibatch size, in *episodes*: the memory of an episode cannot be cut. Default: all and 80.
     :param clip_range: PPO's limit to the ratio of probabilities, a number or a function of the remaining progress;
@@ -124,6 +128,7 @@ class TDPG(OnPolicyAlgorithm):
         mi_kwargs: dict[str, Any] | None = None,
         baseline: str = "value",
         encoder_gradient: str | None = None,
+        bptt_steps: int | None = None,
         n_epochs: int | None = None,
         batch_size: int | None = None,
         clip_range: float | Schedule | None = None,
@@ -167,6 +172,7 @@ class TDPG(OnPolicyAlgorithm):
             policy=policy,
             cost_limit=cost_limit,
             baseline=baseline,
+            bptt_steps=bptt_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
             max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
@@ -200,6 +206,7 @@ class TDPG(OnPolicyAlgorithm):
         self.mi_kwargs = {} if mi_kwargs is None else mi_kwargs
         self.baseline = baseline
         self.encoder_gradient: str = settings["encoder_gradient"]
+        self.bptt_steps = bptt_steps
         self.n_epochs: int = settings["n_epochs"]
         self.batch_size: int | None = settings["batch_size"]
         self.clip_range: float | Schedule = settings["clip_range"]
@@ -241,6 +248,12 @@ class TDPG(OnPolicyAlgorithm):
                 f"policy_kwargs={self.policy_kwargs!r} must be a dict of keywords of {self.policy_class.__name__}: {e}"
             ) from e
         self.policy = cast(TRVPolicy, policy).to(self.device)
+        if self.bptt_steps is not None and self.bptt_steps < self.horizon and self.policy.time_varying:
+            raise ValueError(
+                f"bptt_steps={self.bptt_steps} cuts the horizon of {self.horizon} steps into parts that are computed "
+                "side by side, for which all steps must share their weights: give "
+                "policy_kwargs=dict(time_varying=False), or leave bptt_steps out"
+            )
         # Built at beta = inf, too: a policy-gradient model must be able to warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         try:
@@ -467,10 +480,15 @@ class TDPG(OnPolicyAlgorithm):
         """
         features = self.policy.episode_features(batch)
         if self.encoder_gradient == "pathwise":
-            rebuilt = self.policy.rebuild_trvs(features, batch.noise)
+            rebuilt = self._rebuild_trvs(features, batch)
             return self.policy.action_log_prob(rebuilt.trvs, batch), rebuilt
         log_prob = self.policy.trv_log_prob(features, batch) + self.policy.action_log_prob(batch.trvs, batch)
-        return log_prob, self.policy.rebuild_trvs(features, batch.noise) if rebuild else None
+        return log_prob, self._rebuild_trvs(features, batch) if rebuild else None
+
+    def _rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> RebuiltTRVs:
+        if self.bptt_steps is None or self.bptt_steps >= self.horizon:
+            return self.policy.rebuild_trvs(features, batch.noise)
+        return self.policy.rebuild_trvs_in_parts(features, batch, self.bptt_steps)
 
     def _minibatches(self) -> Sequence[th.Tensor | slice]:
         """Columns of the episodes of each minibatch: a random partition into nearly equal parts, or one of all."""
@@ -482,9 +500,10 @@ class TDPG(OnPolicyAlgorithm):
 
     def _record_distance(self, log_ratio: th.Tensor, alive: th.Tensor, clip_range: float) -> None:
         """Log how far the policy has moved from that of the rollouts, as SB3's PPO does."""
+        log_ratio = th.where(alive > 0, log_ratio, 0.0)
         n = alive.sum()
-        kl = (alive * (th.exp(log_ratio) - 1.0 - log_ratio)).sum() / n  # http://joschu.net/blog/kl-approx.html
-        clipped = (alive * ((th.exp(log_ratio) - 1.0).abs() > clip_range)).sum() / n
+        kl = (th.exp(log_ratio) - 1.0 - log_ratio).sum() / n  # http://joschu.net/blog/kl-approx.html
+        clipped = ((th.exp(log_ratio) - 1.0).abs() > clip_range).sum() / n
         self.logger.record_mean("train/approx_kl", kl.item())
         self.logger.record_mean("train/clip_fraction", clipped.item())
 

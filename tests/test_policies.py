@@ -1,5 +1,7 @@
 """The policy step by step, as whole episodes, and with all sorts of spaces."""
 
+import math
+
 import numpy as np
 import pytest
 import torch as th
@@ -8,7 +10,7 @@ from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs
 
 from sb3_tdpg import TDPG, TRVPolicy
 from sb3_tdpg.features import observation_kind
-from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
+from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON, RebuiltTRVs
 
 T, N = 4, 6
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -71,6 +73,24 @@ def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
     if deterministic:
         means = policy.action_head(rebuilt.trvs).chunk(2, dim=-1)[0].detach().numpy()
         np.testing.assert_allclose(actions, np.clip(means, -1, 1), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 3])
+def test_parts_of_the_horizon_side_by_side_give_the_same_trvs_and_no_gradient_beyond_them(n_steps):
+    model = tiny_tdpg("Pendulum-v1", n_episodes=4, n_envs=2, bptt_steps=n_steps, beta=math.inf)
+    train_epochs(model, 1)
+    batch = model.rollout_buffer.episode_batch()
+    batch = type(batch)(*(x[:5] for x in batch))
+    features = model.policy.episode_features(batch).detach().requires_grad_()
+    whole = model.policy.rebuild_trvs(features, batch.noise)
+    stored = batch._replace(trvs=whole.trvs.detach())
+    parts = model.policy.rebuild_trvs_in_parts(features, stored, n_steps)
+    for name in RebuiltTRVs._fields:
+        th.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=1e-4, atol=1e-5)
+    (gradient,) = th.autograd.grad(parts.trvs[-1].sum(), features)
+    reached = gradient.abs().sum(dim=(1, 2)) > 0
+    start = 4 - 4 % n_steps  # of the last part
+    assert reached.tolist() == [t >= start for t in range(5)]
 
 
 def test_the_log_probabilities_are_those_of_the_samples_that_were_drawn():
