@@ -86,8 +86,8 @@ class TDPG(OnPolicyAlgorithm):
         second varies less. Default: ``"score"`` and ``"pathwise"``.
     :param bptt_steps: Steps that a gradient flows back through the memory: the pathwise one, and the information's.
         ``None``: to the start of the episode. For long horizons: the horizon is cut into parts of so many steps, which
-        are computed side by side, so that 10 of 200 make an update ten times as fast; what a TRV does for the steps
-        beyond its part is then not credited to it. The steps must share their weights (``time_varying=False``).
+        are computed side by side; what a TRV does for the steps beyond its part is then not credited to it. The steps
+        must share their weights (``time_varying=False``).
     :param n_epochs: Passes over the rollouts of a policy epoch, as in SB3's PPO; default: 1 and 4.
     :param batch_size: Minibatch size, in *episodes*: the memory of an episode cannot be cut. Default: all and 80.
     :param clip_range: PPO's limit to the ratio of probabilities, a number or a function of the remaining progress;
