@@ -25,9 +25,8 @@ SCENES: dict[str, dict[str, Severities]] = {
             for pitch, height in ((31.0, 2.05), (32.0, 2.1), (34.0, 2.2), (37.0, 2.35), (40.0, 2.5))
         ),
     },
-    # The camera is higher than usual by so much. (The state tells by how much, in a component of its own.)
     "PandaGrasp-v0": {
-        "camera_pose": tuple(dict(camera_range=(height, height)) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
+        "camera_pose": tuple(dict(camera_shift=height) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
     },
 }
 """Keywords by environment, perturbation and severity; add those of your own environment."""
