@@ -287,7 +287,7 @@ def _checked_camera(camera_range: tuple[float, float]) -> tuple[float, float]:
 
 def _checked_shift(camera_shift: float, camera_range: tuple[float, float] | None) -> float:
     low, high = camera_range or (0.0, 0.0)
-    if not (-MAX_CAMERA_SHIFT <= low + camera_shift and high + camera_shift <= MAX_CAMERA_SHIFT):
+    if not (low + camera_shift >= -MAX_CAMERA_SHIFT and high + camera_shift <= MAX_CAMERA_SHIFT):
         raise ValueError(
             f"camera_shift={camera_shift} with camera_range={camera_range} must leave the camera within "
             f"{MAX_CAMERA_SHIFT} m of its usual height: from further away the mug is out of sight"
