@@ -408,6 +408,30 @@ def test_noise_has_the_standard_deviation_of_its_severity():
         assert np.median(np.abs(residual)) / 0.6745 == pytest.approx(255 * std, rel=0.1)
 
 
+@pytest.mark.parametrize("name", [name for name, row in PERTURBATIONS.items() if row.kind == "image"])
+def test_what_it_is_given_stays_what_it_was_and_what_it_returns_is_new(name):
+    images = np.random.default_rng(0).integers(0, 256, (4, 3, 20, 20), dtype=np.uint8)
+    original = images.copy()
+    env = perturbed(toy_vec_env(4, observation_space=spaces.Box(0, 255, (3, 20, 20), np.uint8)), name)
+    for _ in range(4):
+        shown = env._perturber(images)
+        assert not np.shares_memory(shown, images)
+        kept = shown.copy()
+        env._perturber(images[::-1])
+        np.testing.assert_array_equal(shown, kept)
+    np.testing.assert_array_equal(images, original)
+
+
+def test_a_large_batch_has_as_many_draws_as_images():
+    images = images_under("occlusion", 3, np.zeros((150, 3, 32, 32), np.uint8))
+    assert len(np.unique(images, axis=0)) == 150
+
+
+def test_what_is_brighter_than_white_is_white():
+    images = images_under("brightness", 5, np.full((12, 3, 8, 8), 250, np.uint8))
+    assert set(np.unique(images)) == {250 - 102, 255}
+
+
 def test_minmax_noise_stretches_each_image_to_the_bounds():
     images = images_under("noise_minmax", 1, GREY)
     assert (images.min(axis=(1, 2, 3)) == 0).all()
