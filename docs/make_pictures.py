@@ -12,6 +12,7 @@ from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
+from sb3_tdpg.robustness import perturbation_gallery
 
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
 OPEN_LOOP = (-5.0, 0.0, 1.5, 0.0, -1.5)
@@ -140,6 +141,14 @@ def panda_grasp(path: Path) -> None:
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
 
 
+def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
+    """One image under each perturbation in five severities."""
+    perturbation_gallery(env_id, env_kwargs=env_kwargs).savefig(path, dpi=80)
+    with Image.open(path) as picture:
+        # Without a palette: it would put bands of colours into the blurs.
+        picture.convert("RGB").save(path, optimize=True)
+
+
 if __name__ == "__main__":
     folder = Path(__file__).parent / "environments"
     lava(folder / "lava.gif")
@@ -149,3 +158,6 @@ if __name__ == "__main__":
     panda_depth(folder / "panda_depth.png")
     panda_camera(folder / "panda_camera.png")
     panda_grasp(folder / "panda_grasp.gif")
+    guide = Path(__file__).parent / "guide"
+    perturbations(guide / "perturbations_ball.png", "BallCatch-v0", renderer="fast")
+    perturbations(guide / "perturbations_grasp.png", "PandaGrasp-v0")

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from .ball_scene import IMAGE_SIZE, BallScene, Renderer
 from .base import POMDPEnv
+from .noise import NOISE_MODES, noisy_pixels
 from .textures import TRAINING_TEXTURE, load_texture
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highe
 
 # By name, so that PyBullet is imported only where it draws.
 RENDERERS = {"pybullet": ("ball_bullet", "BulletRenderer"), "fast": ("ball_fast", "FastRenderer")}
-NOISE_MODES = ("minmax", "clip")
 NOISE_CHUNK = 64  # images to which noise is added at once: bounds the memory
 
 
@@ -177,12 +177,7 @@ class BallCatchEnv(POMDPEnv):
             return images
         for start in range(0, len(images), NOISE_CHUNK):
             chunk = images[start : start + NOISE_CHUNK]
-            noisy = self.pixel_noise_std * rng.standard_normal(chunk.shape, dtype=np.float32) + chunk / np.float32(255)
-            if self.noise_mode == "minmax":
-                noisy -= noisy.min(axis=(1, 2, 3), keepdims=True)
-                noisy /= noisy.max(axis=(1, 2, 3), keepdims=True)
-            else:
-                np.clip(noisy, 0, 1, out=noisy)
+            noisy = noisy_pixels(chunk / np.float32(255), self.pixel_noise_std, self.noise_mode, rng)
             chunk[...] = np.rint(255 * noisy)
         return images
 

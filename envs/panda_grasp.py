@@ -52,6 +52,7 @@ class PandaGraspEnv(POMDPEnv):
     :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
     :param camera_range: ``(low, high)``: the camera is higher than usual by another distance between these two in every
         trial, uniformly, in m. The distance is the fifth component of the state. ``None``: it is where it is.
+    :param camera_shift: The camera is higher by so much, in m, in every trial, and the state does not tell.
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
@@ -72,6 +73,7 @@ class PandaGraspEnv(POMDPEnv):
         xy_half_width: float = 0.05,
         yaw_range: tuple[float, float] = (-np.pi / 4, np.pi / 4),
         camera_range: tuple[float, float] | None = None,
+        camera_shift: float = 0.0,
         mug_scale: float = 1.0,
         frame_offset: float = 0.012,
         friction: float = 0.5,
@@ -107,6 +109,7 @@ class PandaGraspEnv(POMDPEnv):
         self.yaw_range = low_high
         self.scene = PandaScene(float(mug_scale), float(frame_offset), float(friction))
         self.camera_range = None if camera_range is None else _checked_camera(camera_range)
+        self.camera_shift = _checked_shift(camera_shift, self.camera_range)
         self.solver_iterations = solver_iterations
         self.motion = motion
         self.depth_noise_std = float(depth_noise_std)
@@ -180,7 +183,14 @@ class PandaGraspEnv(POMDPEnv):
         return self._last_details
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
-        return self._with_noise(self._workers(len(state)).images(state), self.np_random)
+        return self._with_noise(self._workers(len(state)).images(self._seen(state)), self.np_random)
+
+    def _seen(self, state: np.ndarray) -> np.ndarray:
+        """Return what an image is drawn of: the mug, and how much higher than usual the camera is, if it is."""
+        if self.camera_shift == 0:
+            return state
+        raised = state[:, 4:] if self.camera_range is not None else np.zeros((len(state), 1))
+        return np.concatenate([state[:, :4], raised + self.camera_shift], axis=1)
 
     def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return np.zeros(len(state))
@@ -246,7 +256,7 @@ class PandaGraspEnv(POMDPEnv):
         return [PandaView.at_rest((x, y, z), yaw)]
 
     def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
-        (depth,) = self._with_noise(self._world.images(np.array([state])), np.random.default_rng(0))
+        (depth,) = self._with_noise(self._world.images(self._seen(np.array([state]))), np.random.default_rng(0))
         return depth
 
     def close(self) -> None:
@@ -273,3 +283,13 @@ def _checked_camera(camera_range: tuple[float, float]) -> tuple[float, float]:
             f"{MAX_CAMERA_SHIFT}: from further away the mug is out of sight"
         )
     return low, high
+
+
+def _checked_shift(camera_shift: float, camera_range: tuple[float, float] | None) -> float:
+    low, high = camera_range or (0.0, 0.0)
+    if not (low + camera_shift >= -MAX_CAMERA_SHIFT and high + camera_shift <= MAX_CAMERA_SHIFT):
+        raise ValueError(
+            f"camera_shift={camera_shift} with camera_range={camera_range} must leave the camera within "
+            f"{MAX_CAMERA_SHIFT} m of its usual height: from further away the mug is out of sight"
+        )
+    return float(camera_shift)

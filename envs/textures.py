@@ -153,12 +153,31 @@ def random_texture(seed: int) -> np.ndarray:
     return _paint(pattern, int(rng.integers(2**31)), dark, light)
 
 
+def blended_texture(share: float, name: str) -> np.ndarray:
+    """
+    Lay a built-in or random texture over the training texture: ``(S, S, 3)``.
+
+    :param share: Opacity of the upper one, in [0, 1].
+    :param name: Of the upper one.
+    :raises ValueError: if the share is out of its range, or the name none of a built-in or random texture.
+    """
+    is_random = re.fullmatch(r"random-\d+", name)
+    if not (0 <= share <= 1 and (name in _BUILT_IN or is_random)):
+        raise ValueError(
+            f"texture='{100 * share:g}%-{name}' must be '<0 to 100>%-<name>' with one of {list(_BUILT_IN)} or "
+            "'random-<seed>'"
+        )
+    lower, upper = built_in_texture(TRAINING_TEXTURE), load_texture(name)
+    return np.rint((1 - share) * lower + share * upper).astype(np.uint8)
+
+
 def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
     """
     Turn a name, a path or an array into a texture.
 
     :param texture: A built-in name (``"brick"`` or one of :data:`TEST_TEXTURES`), ``"random-<seed>"`` for
-        :func:`random_texture`, the path of an image file, or an array ``(H, W, 3)`` uint8.
+        :func:`random_texture`, ``"<percent>%-<name>"`` for one of these laid over the brick with this opacity
+        (``"40%-violet_dots"``), the path of an image file, or an array ``(H, W, 3)`` uint8.
     :return: ``(H, W, 3)`` uint8
     :raises FileNotFoundError: if a path leads to no file.
     :raises ValueError: if a name is unknown, or if a file or an array is not an image.
@@ -174,6 +193,8 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
         return built_in_texture(str(texture))
     if match := re.fullmatch(r"random-(\d+)", os.fspath(texture)):
         return random_texture(int(match[1]))
+    if match := re.fullmatch(r"(\d+)%-(.+)", os.fspath(texture)):
+        return blended_texture(int(match[1]) / 100, match[2])
     return _load_image(texture)
 
 
@@ -183,8 +204,8 @@ def _load_image(texture: str | os.PathLike[str]) -> np.ndarray:
         if path.suffix or path != Path(path.name):
             raise FileNotFoundError(f"texture={str(texture)!r}: there is no such image file; mend the path")
         raise ValueError(
-            f"texture={str(texture)!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', or the path of an "
-            "image file"
+            f"texture={str(texture)!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', '<percent>%-<name>', "
+            "or the path of an image file"
         )
     try:
         with Image.open(path) as image:

@@ -1,6 +1,8 @@
 """
 Random changes to the images that a policy sees in training, so that the bottleneck has something to leave out.
 
+For the evaluation, by one perturbation at a time in five severities, see :mod:`sb3_tdpg.robustness`.
+
 Dimension key: N environments, C channels, H and W rows and columns.
 """
 

@@ -9,6 +9,7 @@ import pytest
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.information import CriticEstimator
+from sb3_tdpg.robustness import PERTURBATIONS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
@@ -48,8 +49,12 @@ def brief_training(monkeypatch):
 
 @pytest.fixture
 def registry(monkeypatch):
-    """Forget the environments that a page registers."""
+    """Forget the environments and the perturbations that a page registers."""
     monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    perturbations = dict(PERTURBATIONS)
+    yield
+    PERTURBATIONS.clear()
+    PERTURBATIONS.update(perturbations)
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if any(python_blocks(p))], ids=name_of)

@@ -115,3 +115,23 @@ def test_a_bad_range_is_refused_with_the_mend(camera_range):
         ValueError, match=r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1"
     ):
         PandaGraspEnv(camera_range=camera_range)
+
+
+@pytest.mark.parametrize("shift", [0.03, -0.02])
+def test_a_camera_that_is_higher_in_every_trial_sees_the_same_and_the_state_does_not_tell(env, shift):
+    shifted, both = PandaGraspEnv(camera_shift=shift), PandaGraspEnv(**PANDA_CAMERA, camera_shift=shift)
+    pose = [0.5, 0.01, 0.0, 0.4]
+    expected = env._sensor(np.array([[*pose, shift]]))
+    np.testing.assert_array_equal(shifted._sensor(np.array([pose])), expected)
+    np.testing.assert_allclose(both._sensor(np.array([[*pose, 0.01]])), env._sensor(np.array([[*pose, 0.01 + shift]])))
+    assert shifted.state_space.shape == (4,)
+    (_, first), (_, second) = PandaGraspEnv().reset(seed=3), shifted.reset(seed=3)
+    np.testing.assert_array_equal(first["state"], second["state"])
+    for each in (shifted, both):
+        each.close()
+
+
+@pytest.mark.parametrize(("shift", "camera_range"), [(0.11, None), (np.nan, None), (0.08, (-0.03, 0.03))], ids=str)
+def test_a_camera_out_of_reach_is_refused(shift, camera_range):
+    with pytest.raises(ValueError, match=r"camera_shift=.* must leave the camera within 0.1 m of its usual height"):
+        PandaGraspEnv(camera_shift=shift, camera_range=camera_range)

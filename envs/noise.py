@@ -1,0 +1,27 @@
+"""Noise on the pixels of images, in the two modes of the ball-catching problem."""
+
+from __future__ import annotations
+
+import numpy as np
+
+NOISE_MODES = ("minmax", "clip")
+
+
+def noisy_pixels(images: np.ndarray, std: float, mode: str, rng: np.random.Generator) -> np.ndarray:
+    """
+    Add normal noise to every pixel, and bring the images back to [0, 1].
+
+    :param images: ``(N, C, H, W)`` float32 in [0, 1]
+    :param std: Standard deviation of the noise.
+    :param mode: ``"minmax"``, as in the paper: of each image its minimum is subtracted, and it is divided by its
+        maximum. ``"clip"``: what is outside [0, 1] is cut off.
+    :param rng: Where the noise comes from.
+    :return: a new array of the same shape, float32
+    """
+    noisy: np.ndarray = std * rng.standard_normal(images.shape, dtype=np.float32) + images
+    if mode == "minmax":
+        noisy -= noisy.min(axis=(1, 2, 3), keepdims=True)
+        noisy /= noisy.max(axis=(1, 2, 3), keepdims=True)
+    else:
+        np.clip(noisy, 0, 1, out=noisy)
+    return noisy

@@ -1,0 +1,50 @@
+"""
+Perturbations of the scene, which only the environment itself can make: by keywords of its constructor.
+
+A texture is painted on a wall and a camera stands elsewhere before an image is drawn. Each is a row of data, as a
+:class:`~sb3_tdpg.envs.scenarios.Scenario` is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_tdpg.robustness.registry import N_SEVERITIES
+
+Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each
+
+# The true state stays what it is, and with it the task: mugs that stand elsewhere are not among these.
+SCENES: dict[str, dict[str, Severities]] = {
+    "BallCatch-v0": {
+        # The training texture gives way to another one.
+        "texture": tuple(dict(texture=f"{share}%-turquoise_waves") for share in (20, 40, 60, 80, 100)),
+        # By default the camera is 2 m high and looks up by 30 degrees.
+        "camera_pose": tuple(
+            dict(camera_pitch=pitch, camera_height=height)
+            for pitch, height in ((31.0, 2.05), (32.0, 2.1), (34.0, 2.2), (37.0, 2.35), (40.0, 2.5))
+        ),
+    },
+    "PandaGrasp-v0": {
+        "camera_pose": tuple(dict(camera_shift=height) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
+    },
+}
+"""Keywords by environment, perturbation and severity; add those of your own environment."""
+
+
+def scene_perturbations(env_id: str) -> dict[str, Severities]:
+    """
+    Return the perturbations of an environment's scene: by name, the ``env_kwargs`` of the five severities.
+
+    :param env_id: A registered Gymnasium id, also in the ``module:id`` form. One that :data:`SCENES` does not have has
+        none.
+    :raises ValueError: if one of them has not five severities.
+    """
+    rows = SCENES.get(env_id.rpartition(":")[2], {})
+    for name, severities in rows.items():
+        if len(severities) != N_SEVERITIES:
+            raise ValueError(
+                f"SCENES[{env_id!r}][{name!r}] has {len(severities)} severities, expected {N_SEVERITIES}: "
+                "from the mildest to the strongest"
+            )
+    return dict(rows)

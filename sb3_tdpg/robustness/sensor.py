@@ -1,0 +1,116 @@
+"""
+What a perturbation must know of an observation space, so that one strength means the same on all of them.
+
+Dimension key: N environments, C channels, H and W rows and columns, D components of a vector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from gymnasium import spaces
+
+VAST = 1e6
+"""Bounds further apart than this are none: some environments write the largest float for "unbounded"."""
+
+
+def finite_range(space: spaces.Box) -> np.ndarray:
+    """Return the distance of the bounds of each component, in the space's shape; infinite where there are none."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = space.high.astype(np.float64) - space.low.astype(np.float64)
+    return np.where(distance <= VAST, distance, np.inf)
+
+
+def kind_of(space: spaces.Space) -> str | None:
+    """
+    Tell what is observed.
+
+    :return: ``"image"``: a ``Box`` of three dimensions, one of them the channels, or of two with bytes, and finite
+        bounds; ``"vector"``: any other ``Box``; ``None``: no ``Box``
+    """
+    if not isinstance(space, spaces.Box):
+        return None
+    has_pixels = len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)
+    return "image" if has_pixels and np.isfinite(finite_range(space)).all() else "vector"
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """
+    An observation space with the units that perturbations work in.
+
+    An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at its highest. A vector
+    becomes ``(N, D)`` float64 in multiples of its scale; a component with a scale of 0 never varies and is left alone.
+
+    :param space: The observation space.
+    :param scale: Of the components of a vector, in the space's shape; see :func:`.observation_scale`.
+    """
+
+    space: spaces.Box
+    scale: np.ndarray | None = None
+
+    @property
+    def is_image(self) -> bool:
+        """Whether there are pixels."""
+        return kind_of(self.space) == "image"
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether a pixel is one float: a distance, and no colour."""
+        return self.is_image and np.issubdtype(self.space.dtype, np.floating) and self.shape[0] == 1
+
+    @property
+    def channel_axis(self) -> int | None:
+        """Where an image has its channels: as for Stable-Baselines3, the shortest side, if this is not the middle."""
+        if len(self.space.shape) == 2:
+            return None
+        return 0 if int(np.argmin(self.space.shape)) == 0 else 2
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """``(C, H, W)`` or ``(D,)``, whatever order the space has."""
+        shape = self.space.shape
+        if not self.is_image:
+            return (int(np.prod(shape)),)
+        if self.channel_axis is None:
+            return (1, *shape)
+        return shape if self.channel_axis == 0 else (shape[2], *shape[:2])
+
+    def to_units(self, observations: np.ndarray) -> np.ndarray:
+        """``(N, *obs)`` to a new array ``(N, C, H, W)`` or ``(N, D)``."""
+        if not self.is_image:
+            assert self.scale is not None
+            scale = np.where(self.scale > 0, self.scale, 1.0)
+            return (observations / scale).reshape(len(observations), -1)
+        low, high = float(self.space.low.min()), float(self.space.high.max())
+        units = np.multiply(observations, np.float32(1 / (high - low)), dtype=np.float32)
+        if low != 0:
+            units -= np.float32(low / (high - low))
+        if self.channel_axis is None:
+            return units[:, None]
+        return units if self.channel_axis == 0 else np.moveaxis(units, 3, 1)
+
+    def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        """
+        Return to the space: its order, bounds and type.
+
+        :param units: ``(N, C, H, W)`` or ``(N, D)``
+        :param observations: What they were before, ``(N, *obs)``.
+        :return: ``(N, *obs)``, a new array
+        """
+        low, high = self.space.low, self.space.high
+        if self.is_image:
+            units = units.reshape(observations.shape) if self.channel_axis is None else units
+            units = np.moveaxis(units, 1, 3) if self.channel_axis == 2 else units
+            if (low == low.flat[0]).all() and (high == high.flat[0]).all():
+                low, high = low.flat[0], high.flat[0]  # much faster than arrays
+            lowest, highest = float(np.min(low)), float(np.max(high))
+            values = lowest + np.float32(highest - lowest) * units
+        else:
+            assert self.scale is not None
+            values = np.where(self.scale > 0, units.reshape(observations.shape) * self.scale, observations)
+        # Bounds before a cast to integers, which wraps around, but after one to floats, which rounds.
+        if np.issubdtype(self.space.dtype, np.integer):
+            return np.rint(np.clip(values, low, high)).astype(self.space.dtype)
+        return np.clip(values.astype(self.space.dtype), low, high)

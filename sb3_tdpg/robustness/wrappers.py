@@ -1,0 +1,136 @@
+"""
+The two faces of a perturbation: a Gymnasium wrapper for one environment, and an SB3 wrapper for many.
+
+Dimension key: N environments side by side.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_tdpg.robustness.core import Perturber
+from sb3_tdpg.robustness.registry import find
+from sb3_tdpg.robustness.scale import default_scale
+
+Scale = float | np.ndarray | None
+
+
+class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
+    """
+    Perturb what one environment shows.
+
+    State, reward and info stay what they are, and so do the environment's random numbers. ``reset(seed=...)`` seeds the
+    perturbation, too.
+
+    :param env: Any environment with a suitable observation space.
+    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`.
+    :param severity: 1 (mild) to 5 (strong).
+    :param seed: Of the perturbation; together with the one that ``reset`` is given. ``None``: that one alone, and if
+        there is none either, another perturbation every time.
+    :param scale: Of the components of a vector; default: from the bounds of the space, and where they are infinite,
+        measured in a short roll-out; see :func:`~sb3_tdpg.robustness.observation_scale`.
+    :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
+    """
+
+    def __init__(
+        self, env: gym.Env, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
+    ) -> None:
+        RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
+        gym.ObservationWrapper.__init__(self, env)
+        horizon = env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
+        self._perturber = _perturber(perturbation, severity, env, 1, seed, scale, horizon)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, and show its first observation perturbed."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._perturber.reseed(seed)
+        self._perturber.begin(np.arange(1))
+        return self.observation(observation), info
+
+    def observation(self, observation: Any) -> Any:
+        """Perturb the next observation of the episode."""
+        (perturbed,) = self._perturber(np.asarray(observation)[None])
+        return perturbed
+
+
+class PerturbedVecEnv(VecEnvWrapper):
+    """
+    Perturb what N environments show, in one call for all of them.
+
+    Each environment has its own draw for its own episode, also of episodes that begin by an automatic reset;
+    ``info["terminal_observation"]`` is perturbed as the last observation of the episode that has ended. State, reward
+    and the rest of info stay what they are, and so do the environments' random numbers. ``env.seed(...)`` seeds the
+    perturbation, too. It goes inside a ``VecNormalize`` or a ``VecFrameStack``.
+
+    :param venv: The environments.
+    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`.
+    :param severity: 1 (mild) to 5 (strong).
+    :param seed: Of the perturbation; together with the environments'. ``None``: theirs alone, and if they have none
+        either, another perturbation every time.
+    :param scale: See :class:`PerturbedObservation`.
+    :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
+    """
+
+    def __init__(
+        self, venv: VecEnv, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
+    ) -> None:
+        if isinstance(venv, VecNormalize) and venv.norm_obs:
+            raise ValueError(
+                "a sensor is perturbed before its observations are normalised: "
+                "VecNormalize(PerturbedVecEnv(env, ...)), and not the other way round"
+            )
+        super().__init__(venv)
+        horizon = venv.get_attr("horizon", [0])[0] if venv.has_attr("horizon") else None
+        self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale, horizon)
+
+    def reset(self) -> np.ndarray:
+        """Start N episodes, and show their first observations perturbed."""
+        (env_seed, *_) = self.unwrapped._seeds  # the reset takes it
+        observations = self.venv.reset()
+        assert isinstance(observations, np.ndarray)
+        if env_seed is not None:
+            self._perturber.reseed(env_seed)
+        self._perturber.begin(np.arange(self.num_envs))
+        self.reset_infos = self.unwrapped.reset_infos
+        return self._perturber(observations)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step, and show the observations perturbed."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(observations, np.ndarray)
+        ended = np.flatnonzero(dones)
+        if not len(ended):
+            return self._perturber(observations), rewards, dones, infos
+        # First what the running episodes show, to their very end, then the beginning of the next ones.
+        last = observations.copy()
+        for i in ended:
+            last[i] = infos[i].get("terminal_observation", observations[i])
+        perturbed = self._perturber(last)
+        infos = list(infos)
+        for i in ended:
+            if "terminal_observation" in infos[i]:
+                infos[i] = {**infos[i], "terminal_observation": perturbed[i].copy()}
+        self._perturber.begin(ended)
+        perturbed[ended] = self._perturber(observations[ended], ended)
+        self.reset_infos = self.unwrapped.reset_infos
+        return perturbed, rewards, dones, infos
+
+
+def _perturber(
+    name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale, horizon: int | None
+) -> Perturber:
+    perturbation, space = find(name), env.observation_space
+    perturbation.value(severity)
+    # Asked before the calibration, which takes its time.
+    if (objection := perturbation.objection(space, horizon)) is not None:
+        raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
+    if seed is not None and (isinstance(seed, bool) or seed < 0):
+        raise ValueError(f"seed={seed} must be None or an integer of at least 0")
+    return Perturber(perturbation, severity, space, n_envs, seed=seed, scale=default_scale(space, env, scale))  # type: ignore[arg-type]

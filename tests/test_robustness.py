@@ -1,0 +1,599 @@
+"""Every perturbation reaches the policy, in every episode, and never touches the state."""
+
+import functools
+from collections import namedtuple
+from itertools import pairwise
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from small_problems import CountdownEnv, lava_env, tiny_tdpg, toy_vec_env, train_epochs
+from stable_baselines3.common.env_checker import check_env as sb3_check
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_tdpg import BatchedVecEnv, make_episodes_env
+from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.textures import random_texture
+from sb3_tdpg.robustness import (
+    PERTURBATIONS,
+    Perturbation,
+    PerturbedObservation,
+    PerturbedVecEnv,
+    applicable,
+    observation_scale,
+    register,
+)
+
+SEVERITIES = (1, 2, 3, 4, 5)
+HORIZON = 8
+
+
+class PictureEnv(gym.Env):
+    """A camera that looks at another part of a picture at every step; the episodes of a name last 8, 9, ... steps."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, name=0, layout="HWC", side=24):
+        self.lengths = 8 + name
+        self.layout, self.side = layout, side
+        shape = dict(HWC=(side, side, 3), CHW=(3, side, side), HW=(side, side))[layout]
+        self.observation_space = spaces.Box(0, 255, shape, np.uint8)
+        self.picture = random_texture(3)
+
+    def _observe(self):
+        at = int(self.x) % (128 - self.side)
+        image = self.picture[at : at + self.side, 3 * self.t : 3 * self.t + self.side]
+        return dict(HWC=image, CHW=image.transpose(2, 0, 1), HW=image[..., 0])[self.layout].copy()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.x = 0, self.np_random.uniform(0, 100)
+        return self._observe(), {"state": np.array([self.x])}
+
+    def step(self, action):
+        self.t += 1
+        self.x += float(action[0]) + self.np_random.normal()
+        info = {"state": np.array([self.x]), "cost": abs(self.x)}
+        return self._observe(), -info["cost"], self.t == self.lengths, False, info
+
+
+def dummy(make, n):
+    return DummyVecEnv([functools.partial(make, i) for i in range(n)])
+
+
+def pendulum(_=0):
+    return gym.make("Pendulum-v1", max_episode_steps=HORIZON)
+
+
+PROBLEMS = {
+    "colour": lambda n: BatchedVecEnv(BallCatchEnv(renderer="fast", horizon=HORIZON), n),
+    "channels last": lambda n: dummy(PictureEnv, n),
+    "grey": lambda n: dummy(lambda i: PictureEnv(i, "HW"), n),
+    "depth": lambda n: make_episodes_env("PandaGrasp-v0", n, use_processes=False),
+    "unbounded vector": lambda n: make_episodes_env("Lava-v0", n, env_kwargs=dict(horizon=HORIZON)),
+    "bounded vector": lambda n: dummy(pendulum, n),
+}
+
+
+def applying():
+    """Name every problem with every perturbation that applies to it."""
+    for problem, make in PROBLEMS.items():
+        env = make(1)
+        horizon = env.get_attr("horizon")[0] if env.has_attr("horizon") else None
+        for name in applicable(env.observation_space, horizon):
+            yield pytest.param(problem, name, id=f"{name}, {problem}")
+        env.close()
+
+
+APPLYING = list(applying())
+
+Run = namedtuple("Run", "observations starts states rewards dones terminal")
+
+
+def run(env, n_steps=None, seed=0):
+    """Roll out with fixed actions; everything as arrays ``(T + 1, N, ...)``, the start of an episode at its place."""
+    if n_steps is None:  # two episodes and the beginning of a third
+        n_steps = 2 if getattr(env.unwrapped, "env", None) is not None and env.unwrapped.env.horizon == 1 else 20
+    env.seed(seed)
+    rng = np.random.default_rng(1)
+    observations, starts = [env.reset()], [np.ones(env.num_envs, dtype=bool)]
+    kept = observations[0].copy()
+    states = [[info.get("state") for info in env.unwrapped.reset_infos]]
+    rewards, all_dones, terminal = [], [], []
+    for _ in range(n_steps):
+        actions = rng.uniform(-0.3, 0.3, (env.num_envs, *env.action_space.shape)).astype(np.float32)
+        seen, reward, dones, infos = env.step(actions)
+        observations.append(seen.copy())
+        starts.append(dones)
+        reset_infos = env.unwrapped.reset_infos
+        states.append([(reset_infos if done else infos)[i].get("state") for i, done in enumerate(dones)])
+        states.append([info.get("state") for info in infos])
+        rewards.append(reward)
+        all_dones.append(dones)
+        terminal.extend((i, info["terminal_observation"]) for i, info in enumerate(infos) if dones[i])
+    np.testing.assert_array_equal(observations[0], kept)  # what was handed out is not overwritten
+    return Run(np.stack(observations), np.stack(starts), states, np.array(rewards), np.array(all_dones), terminal)
+
+
+def perturbed(env, name, severity=3, seed=5, **kwargs):
+    return PerturbedVecEnv(env, name, severity, seed=seed, **kwargs)
+
+
+def differs(first, second):
+    """Whether observations ``(T, N, *obs)`` differ: ``(T, N)``."""
+    return (first != second).reshape(*first.shape[:2], -1).any(axis=2)
+
+
+def episodes(starts):
+    """Steps of the policy in each complete episode of each environment: (environment, slice)."""
+    for i in range(starts.shape[1]):
+        begins = np.flatnonzero(starts[:, i])
+        for begin, end in pairwise(begins):
+            yield i, slice(begin, end)
+
+
+# -- conformance -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Unperturbed runs by problem."""
+    return functools.cache(lambda problem: run(PROBLEMS[problem](3)))
+
+
+@pytest.mark.parametrize(("problem", "name"), APPLYING)
+def test_it_reaches_the_policy_in_every_episode_and_never_touches_the_state(problem, name, clean):
+    expected = clean(problem)
+    for severity in (1, 5):
+        env = perturbed(PROBLEMS[problem](3), name, severity)
+        seen = run(env)
+
+        changed = differs(seen.observations, expected.observations)
+        assert expected.starts[1:].any(axis=0).all()  # every environment has been reset by itself
+        if PERTURBATIONS[name].later_only:
+            assert not changed[expected.starts].any()
+            assert all(changed[steps, i].any() for i, steps in episodes(expected.starts))
+        elif name == "vector_dropout":  # at even distances, whether or not it is the first
+            assert all(changed[steps, i].any() for i, steps in episodes(expected.starts))
+        else:
+            assert changed.all()
+
+        for ours, theirs in zip(seen.states, expected.states, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        np.testing.assert_array_equal(seen.rewards, expected.rewards)
+        np.testing.assert_array_equal(seen.dones, expected.dones)
+        space = env.observation_space
+        assert seen.observations.dtype == space.dtype
+        assert all(space.contains(observation) for step in seen.observations for observation in step)
+        assert all(space.contains(observation) for _, observation in seen.terminal)
+        env.close()
+
+
+@pytest.mark.parametrize(("problem", "name"), APPLYING)
+def test_the_same_seeds_give_the_same_and_other_seeds_something_else(problem, name):
+    def observations(seed, env_seed):
+        return run(perturbed(PROBLEMS[problem](2), name, seed=seed), seed=env_seed).observations
+
+    first = observations(5, 0)
+    np.testing.assert_array_equal(observations(5, 0), first)
+    if name not in ("contrast", "blur", "delay", "vector_delay"):  # nothing is drawn
+        assert (observations(6, 0) != first).any()
+        assert (observations(None, 0) != first).any()
+
+
+@pytest.mark.parametrize("name", ["noise", "occlusion"])
+def test_a_seed_of_the_environment_is_enough(name):
+    first, second, other = (run(perturbed(PROBLEMS["colour"](2), name, seed=None), seed=s) for s in (0, 0, 1))
+    np.testing.assert_array_equal(first.observations, second.observations)
+    assert (first.observations != other.observations).any()
+
+
+def test_a_seed_that_was_given_before_wrapping_counts():
+    def observations():
+        env = PROBLEMS["colour"](2)
+        env.seed(3)
+        return PerturbedVecEnv(env, "noise").reset()
+
+    np.testing.assert_array_equal(observations(), observations())
+
+
+# Smooth enough that what is later is further away; several episodes of many environments.
+SMOOTH = {
+    "colour": lambda: make_episodes_env("BallCatch-v0", 6, env_kwargs=dict(renderer="fast", horizon=14)),
+    "depth": lambda: make_episodes_env("PandaGrasp-v0", 12, use_processes=False),
+    "bounded vector": lambda: dummy(lambda i: gym.make("Pendulum-v1", max_episode_steps=14), 12),
+}
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    """Each problem with what it shows in a run, by name."""
+
+    @functools.cache
+    def recorded(problem):
+        env = SMOOTH[problem]()
+        # Of a grasp, the policy sees what there was before it.
+        return env, run(env, n_steps=0 if problem == "depth" else 29).observations
+
+    return recorded
+
+
+@pytest.mark.parametrize(("problem", "name"), [
+    pytest.param(*p.values, id=p.id) for p in APPLYING if p.values[0] in SMOOTH
+])  # fmt: skip
+def test_a_higher_severity_changes_more(problem, name, smooth):
+    env, expected = smooth(problem)
+    distances = [
+        np.abs(run(perturbed(env, name, severity), len(expected) - 1).observations - expected.astype(float)).mean()
+        for severity in SEVERITIES
+    ]
+    assert distances[0] > 0
+    assert (np.diff(distances) > 0).all(), distances
+
+
+def single(problem):
+    return {
+        "channels last": PictureEnv,
+        "colour": lambda: gym.make("sb3_tdpg:BallCatch-v0", renderer="fast", horizon=HORIZON),
+        "bounded vector": pendulum,
+        "unbounded vector": lambda: gym.make("sb3_tdpg:Lava-v0", horizon=HORIZON),
+    }[problem]()
+
+
+SINGLE = [p for p in APPLYING if p.values[0] in ("channels last", "bounded vector", "unbounded vector")]
+
+
+@pytest.mark.parametrize(("problem", "name"), SINGLE)
+def test_the_wrapper_of_one_environment_shows_what_the_one_of_many_shows(problem, name):
+    many = PerturbedVecEnv(DummyVecEnv([lambda: single(problem)]), name, 4, seed=2)
+    one = PerturbedObservation(single(problem), name, 4, seed=2)
+    many.seed(7)
+    np.testing.assert_array_equal(one.reset(seed=7)[0], many.reset()[0])
+    for action in np.random.default_rng(0).uniform(-0.3, 0.3, (20, 1)).astype(np.float32):
+        observation, reward, terminated, truncated, info = one.step(action)
+        (seen,), (expected_reward,), (done,), (expected_info,) = many.step(action[None])
+        assert terminated or truncated if done else not (terminated or truncated)
+        assert reward == pytest.approx(expected_reward)
+        if done:
+            np.testing.assert_array_equal(observation, expected_info["terminal_observation"])
+            observation, _ = one.reset()
+        np.testing.assert_array_equal(observation, seen)
+        assert observation.dtype == one.observation_space.dtype
+        if "state" in info and not done:
+            np.testing.assert_array_equal(info["state"], expected_info["state"])
+
+
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")
+@pytest.mark.parametrize(("problem", "name"), SINGLE)
+def test_both_checkers_accept_the_wrapped_environment(problem, name):
+    sb3_check(PerturbedObservation(single(problem), name, 5))
+    gymnasium_check(PerturbedObservation(single(problem), name, 5), skip_render_check=True)
+
+
+def test_a_wrapped_environment_can_be_made_anew_from_its_spec():
+    env = PerturbedObservation(single("bounded vector"), "vector_bias", 2, seed=3)
+    again = gym.make(env.spec)
+    assert isinstance(again, PerturbedObservation)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
+
+
+def test_environments_in_processes_show_the_same_as_in_this_one():
+    runs = []
+    for env in (dummy(PictureEnv, 2), SubprocVecEnv([PictureEnv, functools.partial(PictureEnv, 1)], "fork")):
+        runs.append(run(perturbed(env, "occlusion")))
+        env.close()
+    np.testing.assert_array_equal(runs[0].observations, runs[1].observations)
+    np.testing.assert_array_equal(*([observation for _, observation in each.terminal] for each in runs))
+
+
+# -- episodes --------------------------------------------------------------------------------------------------------
+
+
+def countdown(lengths=((4, 3), (2, 4))):
+    return DummyVecEnv([lambda i=i: CountdownEnv(i, lengths[i]) for i in range(len(lengths))])
+
+
+@pytest.mark.parametrize("severity", [1, 3])
+def test_a_delay_shows_what_was_some_steps_ago_and_nothing_of_an_earlier_episode(severity):
+    plain, late = countdown(), PerturbedVecEnv(countdown(), "vector_delay", severity, scale=1.0)
+    seen, shown = run(plain, 15), run(late, 15)
+    name, episode, t = np.moveaxis(seen.observations, 2, 0)
+    expected = np.stack([name, episode, np.maximum(t - severity, 0)], axis=2)
+    np.testing.assert_array_equal(shown.observations, expected)
+    for (_, last), (_, delayed) in zip(seen.terminal, shown.terminal, strict=True):
+        np.testing.assert_array_equal(delayed, [*last[:2], max(last[2] - severity, 0)])
+
+
+def test_a_lost_frame_leaves_the_last_one_that_arrived():
+    expected = run(PROBLEMS["channels last"](3), 40)
+    shown = run(perturbed(PROBLEMS["channels last"](3), "dropped_frames", 3), 40)
+    n_lost, n_frames = 0, 0
+    for i, steps in episodes(expected.starts):
+        frames, seen = expected.observations[steps, i], shown.observations[steps, i]
+        for t in range(1, len(frames)):
+            is_lost = (seen[t] != frames[t]).any()
+            np.testing.assert_array_equal(seen[t], seen[t - 1] if is_lost else frames[t])
+            n_lost += is_lost
+            n_frames += 1
+    assert n_lost / n_frames == pytest.approx(0.5, abs=0.05)
+
+
+def square_of(image, original):
+    rows, columns = np.nonzero((image != original).any(axis=0))
+    return rows.min(), columns.min(), *image[:, rows[0], columns[0]]
+
+
+def test_an_occluder_stays_for_an_episode_and_is_another_one_in_the_next_and_beside_it():
+    expected, shown = (run(make(PROBLEMS["colour"](3))) for make in (lambda e: e, lambda e: perturbed(e, "occlusion")))
+    squares = []
+    for i, steps in episodes(expected.starts):
+        of_episode = [
+            square_of(*images)
+            for images in zip(shown.observations[steps, i], expected.observations[steps, i], strict=True)
+        ]
+        assert len(set(of_episode)) == 1
+        squares.append(of_episode[0])
+    assert len(set(squares)) == len(squares) == 6
+
+
+def test_a_bias_is_constant_in_an_episode_and_the_terminal_observation_has_it_too():
+    env = PerturbedVecEnv(countdown(), "vector_bias", 5, scale=1.0, seed=0)
+    biases = {}
+    plain, shown = run(countdown(), 30), run(env, 30)
+    for i, steps in episodes(plain.starts):
+        offsets = shown.observations[steps, i] - plain.observations[steps, i]
+        np.testing.assert_allclose(np.abs(offsets), 0.8, atol=1e-5)
+        assert (np.abs(offsets - offsets[0]) < 1e-5).all()
+        biases.setdefault(i, []).append(offsets[0])
+    assert all(len(np.unique(np.round(of_env, 3), axis=0)) > 1 for of_env in biases.values())
+    seen = {0: 0, 1: 0}
+    for (i, last), (_, biased) in zip(plain.terminal, shown.terminal, strict=True):
+        if seen[i] < len(biases[i]):
+            np.testing.assert_allclose(biased - last, biases[i][seen[i]], atol=1e-5)
+        seen[i] += 1
+
+
+def test_reset_infos_can_be_read_from_the_wrapper():
+    env = perturbed(PROBLEMS["unbounded vector"](3), "vector_noise")
+    env.reset()
+    for _ in range(HORIZON):
+        _, _, dones, _ = env.step(np.zeros((3, 1), np.float32))
+        assert env.reset_infos == env.unwrapped.reset_infos
+    assert dones.all()
+
+
+def test_a_second_reset_begins_new_episodes():
+    env = PerturbedVecEnv(countdown(), "vector_delay", 5, scale=1.0)
+    env.reset()
+    env.step(np.zeros((2, 1), np.float32))
+    np.testing.assert_array_equal(env.reset(), [[0, 1, 0], [1, 1, 0]])
+
+
+def test_perturbations_can_be_nested():
+    both = run(perturbed(perturbed(PROBLEMS["colour"](2), "hue"), "occlusion"))
+    hue_only = run(perturbed(PROBLEMS["colour"](2), "hue"))
+    inside = (both.observations != hue_only.observations).any(axis=2).mean(axis=(2, 3))
+    assert (inside > 0.1).all()
+    assert (inside < 0.2).all()  # a square of 40 % of a side
+
+
+def test_tdpg_trains_on_perturbed_observations_with_the_true_states():
+    model = tiny_tdpg(PerturbedVecEnv(lava_env(20), "vector_bias", 5, seed=0))
+    plain = tiny_tdpg(lava_env(20))
+    for each in (model, plain):
+        train_epochs(each, 1)
+    np.testing.assert_array_equal(model.rollout_buffer.states[0], plain.rollout_buffer.states[0])
+    assert (model.rollout_buffer.observations[0] != plain.rollout_buffer.observations[0]).all()
+
+
+# -- what each one does ----------------------------------------------------------------------------------------------
+
+
+def images_under(name, severity, images, **kwargs):
+    """Perturb a batch of images in one call."""
+    env = toy_vec_env(len(images), observation_space=spaces.Box(0, 255, images.shape[1:], np.uint8))
+    wrapped = perturbed(env, name, severity, **kwargs)
+    return wrapped._perturber(images)
+
+
+GREY = np.full((2, 3, 32, 32), 100, np.uint8)
+
+
+def test_noise_has_the_standard_deviation_of_its_severity():
+    for severity, std in enumerate((0.05, 0.10, 0.15, 0.20, 0.25), start=1):
+        residual = images_under("noise", severity, GREY.repeat(8, 0)).astype(float) - 100
+        # What is cut off lies beyond the median.
+        assert np.median(np.abs(residual)) / 0.6745 == pytest.approx(255 * std, rel=0.1)
+
+
+@pytest.mark.parametrize("name", [name for name, row in PERTURBATIONS.items() if row.kind == "image"])
+def test_what_it_is_given_stays_what_it_was_and_what_it_returns_is_new(name):
+    images = np.random.default_rng(0).integers(0, 256, (4, 3, 20, 20), dtype=np.uint8)
+    original = images.copy()
+    env = perturbed(toy_vec_env(4, observation_space=spaces.Box(0, 255, (3, 20, 20), np.uint8)), name)
+    for _ in range(4):
+        shown = env._perturber(images)
+        assert not np.shares_memory(shown, images)
+        kept = shown.copy()
+        env._perturber(images[::-1])
+        np.testing.assert_array_equal(shown, kept)
+    np.testing.assert_array_equal(images, original)
+
+
+def test_a_large_batch_has_as_many_draws_as_images():
+    images = images_under("occlusion", 3, np.zeros((150, 3, 32, 32), np.uint8))
+    assert len(np.unique(images, axis=0)) == 150
+
+
+def test_what_is_brighter_than_white_is_white():
+    images = images_under("brightness", 5, np.full((12, 3, 8, 8), 250, np.uint8))
+    assert set(np.unique(images)) == {250 - 102, 255}
+
+
+def test_minmax_noise_stretches_each_image_to_the_bounds():
+    images = images_under("noise_minmax", 1, GREY)
+    assert (images.min(axis=(1, 2, 3)) == 0).all()
+    assert (images.max(axis=(1, 2, 3)) == 255).all()
+
+
+def test_a_change_of_brightness_is_one_offset():
+    offsets = images_under("brightness", 3, GREY.repeat(8, 0)).astype(int) - 100
+    assert set(np.unique(offsets)) == {-51, 51}
+    assert (offsets == offsets[:, :1, :1, :1]).all()
+
+
+def test_turning_hues_leaves_grey_as_it_is_and_takes_red_to_green():
+    np.testing.assert_array_equal(images_under("hue", 4, GREY), GREY)
+    red = np.zeros_like(GREY)
+    red[:, 0] = 200
+    turned = images_under("hue", 4, red)  # 120 degrees
+    assert all((image.max(axis=(1, 2)) >= 199).sum() == 1 and image[0].max() <= 1 for image in turned)
+
+
+def test_a_blur_keeps_the_mean_and_is_as_wide_for_any_resolution():
+    for side in (40, 80):
+        step = np.zeros((1, 3, side, side), np.uint8)
+        step[..., side // 2 :] = 200
+        blurred = images_under("blur", 5, step)
+        assert blurred.mean() == pytest.approx(100, abs=1)
+        width = (
+            np.diff(blurred[0, 0, 0].astype(float)) * (np.arange(side - 1) + 0.5 - side / 2 + 0.5) ** 2
+        ).sum() / 200
+        assert np.sqrt(width) == pytest.approx(0.06 * side, rel=0.05)
+
+
+def test_dropped_pixels_are_black_in_all_channels():
+    share = (images_under("dropped_pixels", 5, GREY) == 0).all(axis=1).mean()
+    assert share == pytest.approx(0.4, abs=0.05)
+    assert set(np.unique(images_under("dropped_pixels", 5, GREY))) == {0, 100}
+
+
+def test_a_shifted_image_is_the_image_elsewhere():
+    image = PictureEnv(layout="CHW", side=64)
+    image.reset(seed=0)
+    original = image._observe()[None]
+    shifted = images_under("camera_shift", 3, original)
+    matches = [
+        (down, right)
+        for down in range(-6, 7)
+        for right in range(-6, 7)
+        if np.array_equal(
+            shifted[0, :, 8:-8, 8:-8], original[0, :, 8 + down : 56 + down, 8 + right : 56 + right]
+        )
+    ]  # fmt: skip
+    assert len(matches) == 1
+    assert np.hypot(*matches[0]) == pytest.approx(0.07 * 64, abs=1)
+
+
+@pytest.mark.parametrize("layout", ["HWC", "CHW"])
+def test_the_order_of_the_channels_makes_no_difference(layout):
+    for name in ("noise", "hue", "blur", "occlusion", "texture_overlay", "camera_shift"):
+        both = {}
+        for each in ("HWC", "CHW"):
+            both[each] = run(perturbed(DummyVecEnv([lambda each=each: PictureEnv(layout=each)]), name)).observations
+        np.testing.assert_array_equal(both["HWC"], both["CHW"].transpose(0, 1, 3, 4, 2))
+
+
+# -- scales of vectors -----------------------------------------------------------------------------------------------
+
+
+def test_vectors_are_perturbed_in_multiples_of_their_scale():
+    scale = np.array([0.0, 1.0, 10.0])
+    shown = run(PerturbedVecEnv(countdown(), "vector_bias", 4, scale=scale, seed=0), 5).observations
+    offsets = np.abs(shown - run(countdown(), 5).observations)
+    np.testing.assert_allclose(offsets, np.broadcast_to([0.0, 0.4, 4.0], offsets.shape), atol=1e-5)
+
+
+def test_bounds_give_the_scale_where_there_are_some():
+    env = perturbed(dummy(pendulum, 2), "vector_bias", 1)
+    np.testing.assert_allclose(env._perturber.sensor.scale, np.array([2, 2, 16]) / np.sqrt(12))
+
+
+def test_without_bounds_the_scale_is_measured_and_the_episodes_stay_what_they_were():
+    env, plain = lava_env(50), lava_env(50)
+    for each in (env, plain):
+        each.seed(4)
+    wrapped = PerturbedVecEnv(env, "vector_bias", 1)
+    scale = wrapped._perturber.sensor.scale
+    assert scale[0] == pytest.approx(1.7, abs=0.4)  # the robot is anywhere between 0 and 5 m
+    wrapped.reset(), plain.reset()
+    for first, second in zip(env.reset_infos, plain.reset_infos, strict=True):
+        np.testing.assert_array_equal(first["state"], second["state"])
+
+
+def test_the_measurement_leaves_no_trace_in_unseeded_environments_either():
+    for make in (lambda: lava_env(3), lambda: dummy(lambda i: gym.make("CartPole-v1"), 2)):
+        first, second = make(), make()
+        for env in (first, second):
+            env.seed(0)
+            env.reset()
+        scale = observation_scale(first)
+        assert scale.shape == first.observation_space.shape
+        assert (scale > 0).all()
+        np.testing.assert_array_equal(first.reset(), second.reset())
+        np.testing.assert_array_equal(observation_scale(first), scale)
+
+
+def test_a_model_can_act_in_the_measurement():
+    env = lava_env(50)
+    model = tiny_tdpg(VecNormalize(lava_env(), norm_reward=False))
+    calls = []
+    predict = model.predict
+    model.predict = lambda *args, **kwargs: calls.append(args) or predict(*args, **kwargs)
+    assert observation_scale(env, model).shape == (2,)
+    assert len(calls) >= 5
+    assert calls[1][1] is not None  # the recurrent state of the step before
+
+
+def test_bounds_that_mean_none_are_none():
+    vast = float(np.finfo(np.float32).max)
+    env = toy_vec_env(observation_space=spaces.Box(-vast, vast, (2,), np.float32))
+    scale = perturbed(env, "vector_noise")._perturber.sensor.scale
+    assert (scale < 2).all()
+
+
+# -- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("problem", "arguments", "fragment"), [
+    ("colour", dict(perturbation="fog"), r"'fog' is unknown: use one of \['noise'"),
+    ("colour", dict(perturbation="blur", severity=0), "severity=0 of 'blur' must be an integer from 1 to 5"),
+    ("colour", dict(perturbation="blur", severity=2.5), "severity=2.5"),
+    ("colour", dict(perturbation="blur", severity=True), "severity=True"),
+    ("colour", dict(perturbation="blur", seed=-1), "seed=-1 must be None or an integer of at least 0"),
+    ("colour", dict(perturbation="vector_noise"), "it is for vectors"),
+    ("colour", dict(perturbation="noise", scale=1.0), "scale=1.0 is for vectors"),
+    ("bounded vector", dict(perturbation="noise"), "it is for images"),
+    ("bounded vector", dict(perturbation="vector_noise", scale=[1.0, 2.0]), r"must be a number, or an array of shape"),
+    ("bounded vector", dict(perturbation="vector_noise", scale=-1.0), "not negative"),
+    ("bounded vector", dict(perturbation="vector_noise", scale=0.0), "no component"),
+    ("grey", dict(perturbation="hue"), "needs images of 3 channels, and these have 1"),
+    ("depth", dict(perturbation="texture_overlay"), "in a depth image"),
+    ("depth", dict(perturbation="hue"), "needs images of 3 channels"),
+    ("depth", dict(perturbation="delay"), "with a horizon of 1 there is no other"),
+])  # fmt: skip
+def test_what_does_not_fit_is_refused(problem, arguments, fragment):
+    with pytest.raises(ValueError, match=fragment):
+        PerturbedVecEnv(PROBLEMS[problem](2), **arguments)
+
+
+def test_a_space_that_is_no_box_is_refused():
+    with pytest.raises(ValueError, match="is no Box"):
+        PerturbedObservation(gym.make("FrozenLake-v1"), "vector_noise")
+
+
+def test_observations_must_not_be_normalised_before_they_are_perturbed():
+    with pytest.raises(ValueError, match=r"VecNormalize\(PerturbedVecEnv"):
+        PerturbedVecEnv(VecNormalize(lava_env()), "vector_noise")
+
+
+def test_a_row_of_the_table_must_be_complete_and_new():
+    blur = PERTURBATIONS["blur"]
+    with pytest.raises(ValueError, match="expected 5"):
+        Perturbation("fog", "image", "opacity", (0.1, 0.2), blur.apply)
+    with pytest.raises(ValueError, match="must be one of"):
+        Perturbation("fog", "sound", "opacity", (0.1, 0.2, 0.3, 0.4, 0.5), blur.apply)
+    with pytest.raises(ValueError, match="already"):
+        register(blur)
