@@ -6,6 +6,7 @@ Dimension key: B environments of one actor.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -95,8 +96,7 @@ class EnvActor:
     """
     B environments. All methods but :meth:`call` return the observations, or None, and what else there is to tell.
 
-    Observations go through Ray's object store, without a copy until they are joined. All else is pickled here, since
-    Ray would make every array in it read-only.
+    Both are pickled here: Ray takes about 0.1 ms longer over an array than over bytes, and would make it read-only.
     """
 
     def __init__(self) -> None:
@@ -104,11 +104,11 @@ class EnvActor:
         self._envs: list[gym.Env] = []
         self._keep_starts = False
 
-    def call(self, message: bytes) -> tuple[Any, bytes]:
+    def call(self, message: bytes) -> tuple[bytes, bytes]:
         """Call a method: ``(name, arguments)``, pickled."""
         method, arguments = cloudpickle.loads(message)
         observations, rest = getattr(self, method)(*arguments)
-        return observations, cloudpickle.dumps(rest)
+        return pickle.dumps(observations, pickle.HIGHEST_PROTOCOL), cloudpickle.dumps(rest)
 
     def make(self, env_fns: Sequence[Callable[[], gym.Env]], keep_starts: bool) -> tuple[None, tuple]:
         """Make the environments and return their spaces. Not in the constructor, whose errors Ray does not hand on."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
+import pickle
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cloudpickle
@@ -63,10 +65,14 @@ class ActorPool:
             # choice, and the actors of a second RayVecEnv, for evaluation, would wait for ever.
             self._options = {"num_cpus": 0 if SESSION.is_local else 1, **actor_options}
             n_actors = n_actors or min(len(env_fns), max(1, int(self._ray.cluster_resources().get("CPU", 1))))
-            # Two objects, since Ray sends one of up to 100 kB with the answer itself, and a larger one by a detour.
+            # Two objects, since Ray sends one of up to 100 kB with the answer itself, and a larger one by a detour
+            # through the object store, which takes about 1 ms longer.
             self._ray.method(num_returns=2)(EnvActor.call)
-            # Ray's own restart would give an actor without environments.
-            self._actor_class = self._ray.remote(EnvActor).options(**self._options, max_restarts=0, max_task_retries=0)
+            # Ray's own restart would give an actor without environments. Task events tell Ray's dashboard of every
+            # step, which costs each about 0.1 ms.
+            self._actor_class = self._ray.remote(EnvActor).options(
+                **{"enable_task_events": False, **self._options}, max_restarts=0, max_task_retries=0
+            )
             bounds = [len(env_fns) * i // n_actors for i in range(n_actors + 1)]
             self.shares = [range(*pair) for pair in itertools.pairwise(bounds)]
             self._n_restarts = [0] * n_actors
@@ -126,7 +132,7 @@ class ActorPool:
         except self._ray.exceptions.RayTaskError as error:
             # What an environment raised, as itself: callers look for AttributeError, say.
             raise (error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))) from error
-        return observations, cloudpickle.loads(rest)
+        return pickle.loads(observations), cloudpickle.loads(rest)
 
     # -- starting, replacing, ending ----------------------------------------------------------------------------------
 
@@ -229,7 +235,10 @@ class Session:
         if not ray.is_initialized():
             self.n_users, self.is_ours, self.is_local = 0, True, not os.environ.get("RAY_ADDRESS")
             if self.is_local:
-                ray.init("local", num_cpus=max(1, math.ceil(n_actors * num_cpus)), include_dashboard=False)
+                # Ray would give the actors nice 15: next to other programs they would hardly run. As SubprocVecEnv's
+                # processes they are as nice as this one, unless the user has said otherwise.
+                with _default_variable("RAY_worker_niceness", "0"):
+                    ray.init("local", num_cpus=max(1, math.ceil(n_actors * num_cpus)), include_dashboard=False)
             else:
                 ray.init()
         elif self.n_users == 0:
@@ -244,6 +253,19 @@ class Session:
 
 
 SESSION = Session()
+
+
+@contextlib.contextmanager
+def _default_variable(name: str, value: str) -> Iterator[None]:
+    """Set an environment variable that is not set, for a while."""
+    if name in os.environ:
+        yield
+        return
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        del os.environ[name]
 
 
 def import_ray() -> Any:

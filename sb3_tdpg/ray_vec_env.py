@@ -34,8 +34,9 @@ class RayVecEnv(VecEnv):
         make_vec_env("PandaGrasp-v0", n_envs=32, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=8))
 
     If Ray has not been initialised (``ray.init``), the cluster that the variable ``RAY_ADDRESS`` names is joined;
-    without one, an instance is started on this machine, and shut down with the last ``RayVecEnv`` that uses it. Every
-    machine of a cluster needs this package.
+    without one, an instance is started on this machine, and shut down with the last ``RayVecEnv`` that uses it. Its
+    actors have the priority of this process, unless the variable ``RAY_worker_niceness`` is set; elsewhere Ray lets
+    all other programs go first (nice 15). Every machine of a cluster needs this package.
 
     An exception of an environment is raised here as it is. An actor that dies (killed, crashed, its machine lost) never
     makes a call wait for ever: it is reported by a :class:`DeadActorError`, or, with ``max_restarts``, replaced, of

@@ -470,11 +470,18 @@ def test_without_ray_the_error_names_the_extra(monkeypatch):
 
 
 OWN_INSTANCE = """
+import os
+import gymnasium as gym
 import ray
 from stable_baselines3.common.env_util import make_vec_env
 from sb3_tdpg.ray_vec_env import RayVecEnv
 
-train = make_vec_env("Lava-v0", 2, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=1))
+class Polite(gym.Wrapper):
+    niceness = property(lambda self: os.nice(0))
+
+train = make_vec_env("Lava-v0", 2, wrapper_class=Polite, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=1))
+assert train.get_attr("niceness") == [os.nice(0)] * 2  # as SubprocVecEnv's processes; Ray's default is 15
+assert "RAY_worker_niceness" not in os.environ
 assert ray.is_initialized() and ray.cluster_resources()["CPU"] == 1
 evaluate = make_vec_env("Lava-v0", 1, vec_env_cls=RayVecEnv)  # is given a place, too
 train.reset()

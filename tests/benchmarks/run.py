@@ -1,8 +1,9 @@
 """
 ``make bench``: what batching is worth, as ratios measured in this run on one thread.
 
-Every ratio compares two ways to do the same thing, run in turn (A B A B ...), by the medians of their CPU times; where
-several processes work, of their elapsed times.
+Every ratio compares two ways to do the same thing, run in turn (A B B A ...), by their CPU times; where several
+processes work, by their elapsed times. It is the median of the ratios of neighbours: what slows down both for a while
+drops out.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +28,7 @@ sys.path.insert(0, str(REPOSITORY))
 import numpy as np  # noqa: E402
 import torch as th  # noqa: E402
 from sb3_contrib import RecurrentPPO  # noqa: E402
+from scipy.stats import quantile_test  # noqa: E402
 from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
 from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv  # noqa: E402
@@ -60,11 +62,12 @@ class Sizes(NamedTuple):
     n_episodes: int
     repetitions: int
     loop_repetitions: int  # of the per-sample loop, which takes many seconds
+    process_repetitions: int  # of several processes: what else runs on the machine disturbs elapsed times
     epochs: int  # policy epochs in one measurement of a batched algorithm
 
 
-FULL = Sizes(n_episodes=500, repetitions=7, loop_repetitions=3, epochs=10)
-QUICK = Sizes(n_episodes=100, repetitions=3, loop_repetitions=1, epochs=3)
+FULL = Sizes(n_episodes=500, repetitions=7, loop_repetitions=3, process_repetitions=150, epochs=10)
+QUICK = Sizes(n_episodes=100, repetitions=3, loop_repetitions=1, process_repetitions=10, epochs=3)
 
 
 class Row(NamedTuple):
@@ -73,19 +76,26 @@ class Row(NamedTuple):
     what: str
     ours: float
     reference: float
-    lowest: float  # ratio of a repetition
+    ratio: float  # how many times faster ours is
+    lowest: float  # of the interval of the ratio
     highest: float
     goal: float | None
-
-    @property
-    def ratio(self) -> float:
-        """How many times faster ours is."""
-        return self.reference / self.ours
 
     @property
     def met(self) -> str:
         """Whether the goal is met."""
         return "-" if self.goal is None else "yes" if self.ratio >= self.goal else "no"
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float]:
+    """
+    Return two of the values that have the true median between them with a confidence of at least 95 %.
+
+    It assumes no distribution (inverts a sign test), but independent values. There is no such pair of fewer than 6:
+    then the lowest and the highest are returned; of n values they hold it with ``1 - 2**(1 - n)``.
+    """
+    low, high = quantile_test(values, p=0.5).confidence_interval(confidence_level=0.95)
+    return (low, high) if np.isfinite([low, high]).all() else (min(values), max(values))
 
 
 def compare(
@@ -96,18 +106,27 @@ def compare(
     goal: float | None = None,
 ) -> Row:
     """
-    Measure two functions in turn, after one call of each that does not count.
+    Measure two functions in turn, each as often the first of a pair, after one call of each that does not count.
 
     :param ours: returns its cost in seconds for each unit of work
     :param reference: likewise
     """
     ours()
     reference()
-    times = [(ours(), reference()) for _ in range(repetitions)]
-    our_time, reference_time = (statistics.median(column) for column in zip(*times, strict=True))
-    ratios = [theirs / mine for mine, theirs in times]
-    row = Row(what, our_time, reference_time, min(ratios), max(ratios), goal)
-    print(f"{row.what}: {format_ratio(row.ratio)}x", flush=True)
+    our_times, reference_times = [], []
+    for i in range(repetitions):
+        for function, times in ((ours, our_times), (reference, reference_times))[:: 1 if i % 2 == 0 else -1]:
+            times.append(function())
+    ratios = [theirs / mine for mine, theirs in zip(our_times, reference_times, strict=True)]
+    row = Row(
+        what,
+        statistics.median(our_times),
+        statistics.median(reference_times),
+        statistics.median(ratios),
+        *median_interval(ratios),
+        goal,
+    )
+    print(f"{row.what}: {format_interval(row)}", flush=True)
     return row
 
 
@@ -410,20 +429,20 @@ def grasping_of_two(vec_env_class: Callable[..., VecEnv], n_steps: int) -> tuple
 
 
 def bench_processes(sizes: Sizes) -> Iterable[Row]:
-    """Compare Ray's actors with SB3's processes, two of each."""
+    """Compare Ray's actors with SB3's processes, two of each, in the same trials."""
     try:
         from sb3_tdpg.ray_vec_env import RayVecEnv
 
-        ours, run_ours = grasping_of_two(RayVecEnv, sizes.n_episodes // 50)
+        ours, run_ours = grasping_of_two(RayVecEnv, sizes.n_episodes // 100)
     except ImportError as e:
         print(f"left out: {e}")
         return
-    reference, run_reference = grasping_of_two(SubprocVecEnv, sizes.n_episodes // 50)
+    reference, run_reference = grasping_of_two(SubprocVecEnv, sizes.n_episodes // 100)
     yield compare(
         "trial of PandaGrasp, elapsed time: RayVecEnv with 2 actors against SubprocVecEnv with 2 processes",
         run_ours,
         run_reference,
-        5 * sizes.repetitions,  # short ones: what else runs on the machine disturbs elapsed times
+        sizes.process_repetitions,
         goal=0.9,
     )
     for env in (ours, reference):
@@ -446,15 +465,18 @@ def format_ratio(value: float) -> str:
     return f"{value:.2f}" if value < 2 else f"{value:.1f}"
 
 
+def format_interval(row: Row) -> str:
+    """Print the ratio of a row, and its interval."""
+    return f"{format_ratio(row.ratio)}x ({format_ratio(row.lowest)}-{format_ratio(row.highest)})"
+
+
 def format_table(rows: Iterable[Row]) -> str:
     """Lay out the rows as a Markdown table."""
-    lines = ["| what | ours | reference | ratio (lowest-highest) | goal | met |", "|---|---|---|---|---|---|"]
+    lines = ["| what | ours | reference | ratio (interval) | goal | met |", "|---|---|---|---|---|---|"]
     for row in rows:
         goal = "-" if row.goal is None else f"{row.goal:g}x"
-        ratio = f"{format_ratio(row.ratio)}x ({format_ratio(row.lowest)}-{format_ratio(row.highest)})"
-        lines.append(
-            f"| {row.what} | {format_time(row.ours)} | {format_time(row.reference)} | {ratio} | {goal} | {row.met} |"
-        )
+        times = f"{format_time(row.ours)} | {format_time(row.reference)}"
+        lines.append(f"| {row.what} | {times} | {format_interval(row)} | {goal} | {row.met} |")
     return "\n".join(lines)
 
 
@@ -501,9 +523,11 @@ def main() -> None:
     title = "# Speed" + (" (--quick: not the paper's sizes)" if arguments.quick else "")
     notes = (
         "CPU time of one thread (elapsed time where the row says so), medians over repetitions in which both sides "
-        "take turns; the ratio is that of the medians. The first policy epoch, with the critics' warm-up, is not "
-        "counted. "
-        f"{sizes.repetitions} repetitions ({sizes.loop_repetitions} of the loop over samples), {elapsed:.0f} s in all."
+        "take turns; the ratio is the median of the ratios of neighbours, and its interval holds the true median with "
+        "a confidence of at least 95 % (75 % with 3 repetitions, which have the lowest and the highest instead). The "
+        "first policy epoch, with the critics' warm-up, is not counted. "
+        f"{sizes.repetitions} repetitions ({sizes.loop_repetitions} of the loop over samples and of the paper's grasp, "
+        f"{sizes.process_repetitions} of several processes), {elapsed:.0f} s in all."
     )
     report = "\n\n".join([title, describe_machine(), format_table(rows), split, notes]) + "\n"
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
