@@ -28,11 +28,6 @@ class EpisodeBatch(NamedTuple):
     costs: th.Tensor  # (T, N), zero after the end
     alive: th.Tensor  # (T, N), 1.0 while the episode lasts
 
-    @property
-    def prev_trvs(self) -> th.Tensor:
-        """x~_{t-1}, which is zero at t = 0: ``(T, N, Z)``."""
-        return th.cat([th.zeros_like(self.trvs[:1]), self.trvs[:-1]])
-
     def select(self, episodes: th.Tensor | slice) -> EpisodeBatch:
         """Only some episodes, by their columns."""
         return EpisodeBatch(*(x[:, episodes] for x in self))
@@ -76,12 +71,12 @@ class EpisodeBuffer(RolloutBuffer):
         self.alive = np.zeros(shape, np.float32)
         self.full = False
 
-    def add_step(self, t: np.ndarray, episode: np.ndarray, **values: np.ndarray) -> None:
+    def add_step(self, t: np.ndarray | int, episode: np.ndarray | slice, **values: np.ndarray) -> None:
         """
         Store one step of some episodes.
 
-        :param t: time step of each, ``(n,)``
-        :param episode: column of each, ``(n,)``
+        :param t: time step of each, ``(n,)``, or of all
+        :param episode: column of each, ``(n,)``, or a slice of them
         :param values: ``observations``, ``states``, ``noise``, ``trvs``, ``means``, ``stds``, ``actions``, ``costs``,
             each ``(n, ...)``
         """

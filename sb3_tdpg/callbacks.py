@@ -34,8 +34,8 @@ class MINECallback(_TDPGCallback):
     Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of alg:trv-policy).
 
     :class:`TDPG` installs it by itself, before the callbacks of the user, so that those find ``model.information``
-    up to date. It does nothing in an epoch without a penalty (``beta = inf``): no critic is trained for plain policy
-    gradient.
+    up to date; one that is in the user's list takes its place. It does nothing in an epoch without a penalty
+    (``beta = inf``): no critic is trained for plain policy gradient.
     """
 
     def _on_rollout_end(self) -> None:
@@ -43,16 +43,21 @@ class MINECallback(_TDPGCallback):
         if model.mi_coef == 0.0 and model.auto_weight is None:
             model.information = None
             return
-        batch = model.rollout_buffer.episode_batch().information_batch()
-        diagnostics = model.estimator.fit(batch)
-        with th.no_grad():
-            information = model.estimator(batch).cpu().numpy()
+        diagnostics, information = self._fit()
         model.information = information
         self.logger.record("mi/total", float(information.sum()))
         for name, value in diagnostics.items():
             self.logger.record(f"mi/{name}", value)
         for t, value in enumerate(information):
             self.logger.record(f"mi/t{t:02d}", float(value), exclude=("stdout", "log", "json", "csv"))
+
+    def _fit(self) -> tuple[dict[str, float], np.ndarray]:
+        """Fit the critics; return their diagnostics, and I[x_t; x~_t] in nats ``(T,)``."""
+        model = self.tdpg
+        batch = model.rollout_buffer.episode_batch().information_batch()
+        diagnostics = model.estimator.fit(batch)
+        with th.no_grad():
+            return diagnostics, model.estimator(batch).cpu().numpy()
 
 
 class Candidate(NamedTuple):

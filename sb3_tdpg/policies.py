@@ -234,15 +234,25 @@ class TRVPolicy(BasePolicy):
             mean = th.tanh(mean)
         if self.squash_trv_log_var:
             log_var = th.tanh(log_var)
-        return mean, _variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor).sqrt()
+        variance = self._variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor)
+        return mean, variance.sqrt()
 
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
         """Distribution of the action from the head's outputs, ``(n, ...)``: one dimension of samples only."""
         if isinstance(self.action_dist, DiagGaussianDistribution):
             mean, log_var = parameters.chunk(2, dim=-1)
-            variance = _variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
+            variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
             return self.action_dist.proba_distribution(mean, 0.5 * th.log(variance))
         return self.action_dist.proba_distribution(parameters)
+
+    def _variance(self, log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
+        # exp(log_var), bounded: observations unlike any in training would drive it to inf, and a TRV that is all noise
+        # drowns the action head. Bounded softly: a clamp has no gradient to come back on.
+        return maximum * self._sigmoid(log_var - math.log(maximum)) + floor
+
+    @staticmethod
+    def _sigmoid(x: th.Tensor) -> th.Tensor:
+        return th.sigmoid(x)
 
     # -- one step, for rollouts and predict -------------------------------------------------------------------
 
@@ -283,6 +293,11 @@ class TRVPolicy(BasePolicy):
         features = self.extract_features(observations, self.features_extractor)
         return features.unflatten(0, batch.observations.shape[:2])
 
+    @staticmethod
+    def prev_trvs(trvs: th.Tensor) -> th.Tensor:
+        """x~_{t-1}, which is zero at t = 0: ``(T, N, Z) -> (T, N, Z)``."""
+        return th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
+
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
         Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (eq:grad phi).
@@ -291,7 +306,7 @@ class TRVPolicy(BasePolicy):
 
         :return: ``(T, N)``
         """
-        mean, std = self._encoder_density(self.encoder(th.cat([batch.prev_trvs, features], dim=-1)))
+        mean, std = self._encoder_density(self.encoder(th.cat([self.prev_trvs(batch.trvs), features], dim=-1)))
         return th.distributions.Normal(mean, std, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
@@ -315,16 +330,45 @@ class TRVPolicy(BasePolicy):
         :param noise: eps_t, ``(T, N, Z)``
         :param start: x~_{-1}, ``(N, Z)``; default: zero
         """
+        # Not features[t]: the gradient of each would be as large as all features.
+        return RebuiltTRVs(*(th.stack(x) for x in self._unroll(features.unbind(), noise.unbind(), start)))
+
+    def _unroll(
+        self, features: Sequence[th.Tensor], noise: Sequence[th.Tensor], start: th.Tensor | None = None
+    ) -> tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]:
+        """Return TRVs, means and standard deviations of each step, from the features and the noise of each."""
         trv = th.zeros_like(noise[0]) if start is None else start
         trvs, means, stds = [], [], []
-        # Not features[t]: the gradient of each would be as large as all features.
-        for t, features_t in enumerate(features.unbind()):
+        for t, (features_t, noise_t) in enumerate(zip(features, noise, strict=True)):
             mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features_t], dim=-1), t))
-            trv = mean + std * noise[t]
+            trv = mean + std * noise_t
             trvs.append(trv)
             means.append(mean)
             stds.append(std)
-        return RebuiltTRVs(th.stack(trvs), th.stack(means), th.stack(stds))
+        return trvs, means, stds
+
+    def evaluate_episodes(
+        self, batch: EpisodeBatch, encoder_gradient: str, bptt_steps: int | None = None, rebuild: bool = False
+    ) -> tuple[th.Tensor, RebuiltTRVs | None]:
+        """
+        Compute the log-probability of what was sampled, as the chosen gradient of the encoder takes it.
+
+        :param encoder_gradient: ``"score"`` or ``"pathwise"``, see :class:`~sb3_tdpg.TDPG`.
+        :param bptt_steps: See :class:`~sb3_tdpg.TDPG`.
+        :param rebuild: Return the TRVs rebuilt from the noise also where the gradient does not need them.
+        :return: ``(T, N)``, and the rebuilt TRVs
+        """
+        features = self.episode_features(batch)
+        rebuilt = None
+        if rebuild or encoder_gradient == "pathwise":
+            if bptt_steps is None or bptt_steps >= self.horizon:
+                rebuilt = self.rebuild_trvs(features, batch.noise)
+            else:
+                rebuilt = self.rebuild_trvs_in_parts(features, batch, bptt_steps)
+        if encoder_gradient == "pathwise":
+            assert rebuilt is not None
+            return self.action_log_prob(rebuilt.trvs, batch), rebuilt
+        return self.trv_log_prob(features, batch) + self.action_log_prob(batch.trvs, batch), rebuilt
 
     def rebuild_trvs_in_parts(self, features: th.Tensor, batch: EpisodeBatch, n_steps: int) -> RebuiltTRVs:
         """
@@ -344,7 +388,7 @@ class TRVPolicy(BasePolicy):
             padded = th.cat([x, x.new_zeros(n_parts * n_steps - horizon, *x.shape[1:])])
             return padded.unflatten(0, (n_parts, n_steps)).transpose(0, 1).flatten(1, 2)
 
-        rebuilt = self.rebuild_trvs(split(features), split(batch.noise), split(batch.prev_trvs)[0])
+        rebuilt = self.rebuild_trvs(split(features), split(batch.noise), split(self.prev_trvs(batch.trvs))[0])
         return RebuiltTRVs(
             *(x.unflatten(1, (n_parts, n_episodes)).transpose(0, 1).flatten(0, 1)[:horizon] for x in rebuilt)
         )
@@ -412,12 +456,6 @@ class TRVPolicy(BasePolicy):
 
 def _default(value: float | None, default: float) -> float:
     return default if value is None else value
-
-
-def _variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
-    # exp(log_var), bounded: observations unlike any in training would drive it to inf, and a TRV that is all noise
-    # drowns the action head. Bounded softly: a clamp has no gradient to come back on.
-    return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
 
 def _check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:

@@ -4,32 +4,38 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import multiprocessing as mp
 import shutil
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from tqdm import tqdm
 
-from sb3_tdpg.callbacks import TrainingCheckpointCallback
+from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.provenance import jsonable
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
+from sb3_tdpg.training_batch import Member, MemberDivergedError, TrainingBatch, batch_key
 from sb3_tdpg.vec_env import usable_cores
 
 # A checkpoint resets the environments, so that how often it is made belongs to the run.
 MAX_CHECKPOINT_EPOCHS = 50
+# More make no run cheaper, and Ctrl-C would cost more.
+MAX_BATCH = 10
 # Attempts must not share their seeds with other runs.
 SEEDS_BETWEEN_ATTEMPTS = 1000
 
@@ -84,6 +90,10 @@ class Run:
         )
 
 
+Task = tuple[Run, Path, Sequence[Scenario]]
+"""A run, its folder, and what it is evaluated on."""
+
+
 def complete_run(
     run: Run,
     folder: Path,
@@ -109,17 +119,8 @@ def complete_run(
     :raises ValueError: if the folder holds a run with other settings, or there is no policy to start from; nothing is
         touched.
     """
-    rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
-    if run.start is not None and not (run.start / "model.zip").exists():
-        raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
-    config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
-    _check_same_run(folder / "config.json", config)
-    if (folder / "episodes.csv").exists():
+    if not _begin(run, folder, scenarios, n_eval_episodes):
         return folder
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "config.json").exists():
-        write_run_config(folder / "config.json", config)
-
     for attempt in range(run.max_attempts):
         attempt_folder = folder / f"attempt{attempt}"
         model, selected = _train(run, attempt, attempt_folder, progress_bar)
@@ -137,6 +138,21 @@ def complete_run(
     write_frame_atomically(records, folder / "episodes.csv")
     shutil.rmtree(attempt_folder)
     return folder
+
+
+def _begin(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episodes: int) -> bool:
+    """Make the folder of a run and say in it what the run is; False if the run is finished."""
+    rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
+    if run.start is not None and not (run.start / "model.zip").exists():
+        raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
+    config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
+    _check_same_run(folder / "config.json", config)
+    if (folder / "episodes.csv").exists():
+        return False
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "config.json").exists():
+        write_run_config(folder / "config.json", config)
+    return True
 
 
 def _digest(path: Path) -> str:
@@ -163,14 +179,28 @@ def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TD
 
     ``folder`` keeps what a later call goes on from, and in the end ``model.zip``, ``selected.json`` and the log.
     """
-    selected_path, checkpoint, result = (folder / name for name in ("selected.zip", "checkpoint.zip", "model.zip"))
-    if result.exists():
-        return TDPG.load(result, device="cpu"), selected_path.with_suffix(".json").exists()
+    result = folder / "model.zip"
+    if not result.exists():
+        member = _prepare(run, attempt, folder)
+        member.model.learn(
+            member.n_timesteps,
+            list(member.callbacks),
+            reset_num_timesteps=member.reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+        _finish(member, folder)
+    return TDPG.load(result, device="cpu"), (folder / "selected.json").exists()
+
+
+def _prepare(run: Run, attempt: int, folder: Path) -> Member:
+    """Make the training of one attempt, or take it up where it was interrupted."""
+    checkpoint = folder / "checkpoint.zip"
     training = make_training(run.env_id, run.settings, seed=run.seed + SEEDS_BETWEEN_ATTEMPTS * attempt, device="cpu")
     n_timesteps, model = training.n_timesteps, training.model
     epochs = n_timesteps // (model.n_episodes * model.horizon)
     checkpoint_epochs = max(1, min(MAX_CHECKPOINT_EPOCHS, epochs // 4))
-    if checkpoint.exists():
+    resumes = checkpoint.exists()
+    if resumes:
         model = TDPG.load(checkpoint, env=model.env, device="cpu")
         n_timesteps = model.remaining_timesteps
     elif run.start is not None:
@@ -180,18 +210,60 @@ def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TD
     log = make_output_format("csv", str(folder), log_suffix=f"_{model.num_timesteps:08d}")
     model.set_logger(Logger(str(folder), [log]))
     callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, checkpoint_epochs)]
-    selection = training.selection
-    if selection is not None:
-        selection.save_path = selected_path
-    model.learn(n_timesteps, callbacks, reset_num_timesteps=not checkpoint.exists(), progress_bar=progress_bar)
+    if _EPOCHS is not None:
+        callbacks.append(_CountEpochs(_EPOCHS))
+    if training.selection is not None:
+        training.selection.save_path = folder / "selected.zip"
+    return Member(model, n_timesteps, callbacks, reset_num_timesteps=not resumes)
+
+
+def _finish(member: Member, folder: Path) -> None:
+    """Leave the selected policy behind, or the last one, and no checkpoint."""
+    model = member.model
     model.logger.close()
-    selected = selection is not None and selection.best is not None
-    if selection is not None and selected:
+    selection = next((c for c in member.callbacks if isinstance(c, SelectionCallback)), None)
+    if selection is not None and selection.best is not None:
         selection.restore(model)
-    model.save(result)
-    checkpoint.unlink(missing_ok=True)
-    selected_path.unlink(missing_ok=True)
-    return model, selected
+    model.save(folder / "model.zip")
+    for name in ("checkpoint.zip", "selected.zip"):
+        (folder / name).unlink(missing_ok=True)
+
+
+def train_together(tasks: Sequence[Task], n_eval_episodes: int = 1000) -> None:
+    """
+    Train runs as one batch, as far as they fit into one; what is left over is for :func:`complete_run`.
+
+    Each comes out as it does alone, and one that was interrupted goes on from its own checkpoint.
+
+    :param tasks: See :func:`complete_runs`; none starts from the policy of another one.
+    :param n_eval_episodes: Episodes of each scenario.
+    """
+    runs = {}
+    for run, folder, scenarios in tasks:
+        attempt_folder = folder / "attempt0"
+        if _begin(run, folder, scenarios, n_eval_episodes) and not (attempt_folder / "model.zip").exists():
+            runs[attempt_folder] = run
+    left = dict(runs)
+    while left:
+        batches: dict[Hashable, dict[Path, Member]] = {}
+        for folder, run in left.items():
+            member = _prepare(run, 0, folder)
+            key = batch_key(member.model)
+            if key is None:
+                return
+            batches.setdefault((key, member.n_timesteps), {})[folder] = member
+        left = {}
+        for batch in batches.values():
+            if len(batch) == 1:
+                continue
+            try:
+                TrainingBatch(list(batch.values())).learn()
+            except MemberDivergedError as e:
+                # complete_run() will come to the same end and tell it; the others go on from their checkpoints.
+                left.update({folder: runs[folder] for i, folder in enumerate(batch) if i != e.index})
+            else:
+                for folder, member in batch.items():
+                    _finish(member, folder)
 
 
 def read_progress(folder: Path) -> pd.DataFrame:
@@ -205,7 +277,7 @@ def read_progress(folder: Path) -> pd.DataFrame:
 
 
 def complete_runs(
-    tasks: Sequence[tuple[Run, Path, Sequence[Scenario]]],
+    tasks: Sequence[Task],
     *,
     n_eval_episodes: int = 1000,
     jobs: int | None = None,
@@ -213,34 +285,45 @@ def complete_runs(
     """
     Complete runs in parallel processes, with a progress bar; Ctrl-C keeps what is finished.
 
+    Runs that differ in seed and beta only are trained as one batch where they fit into one
+    (:mod:`sb3_tdpg.training_batch`), which changes nothing but the time.
+
     :param tasks: Runs, their folders and what to evaluate, see :func:`complete_run`. One that starts from the policy of
         another one waits for it.
     :param n_eval_episodes: Episodes of each scenario.
-    :param jobs: Runs at a time; default: the number of cores.
+    :param jobs: Runs or batches at a time; default: the number of cores.
     """
     jobs = jobs or usable_cores()
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
-    running: dict[Future[Path], Path] = {}
+    batches = _batches(tasks, jobs)
+    in_batch = {folder for batch in batches for _, folder, _ in batch}
+    running: dict[Future[Any], list[Path]] = {}
+    context = mp.get_context("spawn")
+    epochs = context.Value("L", 0)
     with (
         tqdm(total=len(tasks), unit="run", smoothing=0.1) as progress,
-        ProcessPoolExecutor(jobs, mp.get_context("spawn"), initializer=_init_worker) as pool,
+        ProcessPoolExecutor(jobs, context, initializer=_init_worker, initargs=(epochs,)) as pool,
     ):
         try:
+            for batch in batches:
+                running[pool.submit(train_together, batch, n_eval_episodes)] = [folder for _, folder, _ in batch]
             while waiting or running:
                 # No more than are at work, so that what has to wait keeps its place in the order.
-                ready = [task for task in waiting if task[0].start not in unfinished]
-                for task in ready[: jobs - len(running)]:
+                ready = [t for t in waiting if t[0].start not in unfinished and t[1] not in in_batch]
+                for task in ready[: max(0, jobs - len(running))]:
                     waiting.remove(task)
-                    running[pool.submit(complete_run, *task, n_eval_episodes=n_eval_episodes)] = task[1]
+                    running[pool.submit(complete_run, *task, n_eval_episodes=n_eval_episodes)] = []
                 if not running:
                     raise ValueError(f"these runs wait for each other: {[task[0].folder_name for task in waiting]}")
                 # With a timeout, so that Ctrl-C is seen at once.
                 finished, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+                progress.set_postfix_str(f"{epochs.value:,} epochs of training")
                 for future in finished:
                     folder = future.result()
-                    running.pop(future)
+                    in_batch.difference_update(running.pop(future))
+                    if folder is None:  # a batch: its runs are evaluated next
+                        continue
                     unfinished.remove(folder)
-                    progress.set_postfix_str(folder.name, refresh=False)
                     progress.update()
         except BaseException:
             workers = list(getattr(pool, "_processes", {}).values())  # shutdown() forgets them
@@ -251,7 +334,43 @@ def complete_runs(
             raise
 
 
-def _init_worker() -> None:
+def _batches(tasks: Sequence[Task], jobs: int) -> list[list[Task]]:
+    """Divide what may fit together into batches, as many as there are processes or a multiple of that."""
+    alike: dict[Hashable, list[Task]] = {}
+    for task in tasks:
+        run, folder, _ = task
+        if run.start is None and not (folder / "episodes.csv").exists():
+            settings = run.settings
+            is_free = settings.pop("beta", None) == math.inf
+            alike.setdefault((run.env_id, is_free, repr(sorted(settings.items()))), []).append(task)
+    batches = []
+    for group in alike.values():
+        n = jobs * math.ceil(len(group) / (jobs * MAX_BATCH))
+        batches += [list(group[i::n]) for i in range(n)]
+    return [batch for batch in batches if len(batch) > 1]
+
+
+class _CountEpochs(BaseCallback):
+    """Let the process that shows the progress know that there is some."""
+
+    def __init__(self, epochs: Synchronized[int]) -> None:
+        super().__init__()
+        self._epochs = epochs
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        with self._epochs.get_lock():
+            self._epochs.value += 1
+
+
+_EPOCHS: Synchronized[int] | None = None  # in a worker: the count that all of them share
+
+
+def _init_worker(epochs: Synchronized[int]) -> None:
+    global _EPOCHS
+    _EPOCHS = epochs
     th.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
 

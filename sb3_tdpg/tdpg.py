@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -41,6 +41,17 @@ SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
 
 class TrainingDivergedError(ValueError):
     """A loss is NaN or infinite. The model keeps the last good parameters."""
+
+
+class PolicyUpdate(NamedTuple):
+    """What an update of the policy works with."""
+
+    batch: EpisodeBatch
+    mi_coef: float
+    advantages: th.Tensor  # (T, N)
+    cost_scale: th.Tensor  # scalar, what the advantages were divided by
+    clip_range: float
+    old_log_prob: th.Tensor | None  # (T, N) of the policy that made the rollouts; None without a clip_range
 
 
 class TDPG(OnPolicyAlgorithm):
@@ -421,6 +432,22 @@ class TDPG(OnPolicyAlgorithm):
 
     def train(self) -> None:
         """Update encoder and action head (line 6 of alg:trv-policy)."""
+        update = self.begin_update()
+        for _ in range(self.n_epochs):
+            for episodes in self._minibatches():
+                part = update.batch.select(episodes)
+                log_prob, rebuilt = self._evaluate(part, rebuild=update.mi_coef > 0.0)
+                information = None
+                if rebuilt is not None and update.mi_coef > 0.0:
+                    information = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
+                loss = self.loss(update, episodes, log_prob, information)
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                self.descend()
+        self.end_update(update)
+
+    def begin_update(self) -> PolicyUpdate:
+        """Prepare the update of the policy: what stays the same however often the rollouts are passed through."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         batch = self.rollout_buffer.episode_batch()
@@ -429,7 +456,6 @@ class TDPG(OnPolicyAlgorithm):
             assert self.information is not None
             self._check_finite({"information": th.as_tensor(self.information)})
             self.auto_weight.update(batch.costs.sum(0).mean().item(), float(self.information.sum()))
-        mi_coef = self.mi_coef
         advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
         cost_scale = th.ones(())
         if self.normalize_advantage:
@@ -442,53 +468,57 @@ class TDPG(OnPolicyAlgorithm):
             with th.no_grad():
                 old_log_prob = th.empty_like(batch.costs)
                 for episodes in self._minibatches():
-                    old_log_prob[:, episodes] = self._log_prob(batch.select(episodes))[0]
-        for _ in range(self.n_epochs):
-            for episodes in self._minibatches():
-                part = batch.select(episodes)
-                log_prob, rebuilt = self._log_prob(part, rebuild=mi_coef > 0.0)
-                if old_log_prob is None:
-                    policy_loss = policy_gradient_loss(log_prob, advantages[:, episodes], part.alive)
-                else:
-                    old = old_log_prob[:, episodes]
-                    policy_loss = clipped_policy_loss(log_prob, old, advantages[:, episodes], part.alive, clip_range)
-                    self._record_distance(log_prob.detach() - old, part.alive, clip_range)
-                loss = policy_loss
-                if rebuilt is not None and mi_coef > 0.0:
-                    information = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
-                    penalty = mi_coef * information_loss(information)
-                    loss = loss + penalty / cost_scale
-                    self.logger.record_mean("train/mi_loss", penalty.item())
-                self._check_finite({"policy loss": policy_loss, "loss": loss})
-                self._step_optimizer(loss)
-                self.logger.record_mean("train/policy_loss", policy_loss.item())
-                self.logger.record_mean("train/loss", loss.item())
+                    part = batch.select(episodes)
+                    old_log_prob[:, episodes] = self._evaluate(part)[0]
+        return PolicyUpdate(batch, self.mi_coef, advantages, cost_scale, clip_range, old_log_prob)
+
+    def loss(
+        self,
+        update: PolicyUpdate,
+        episodes: th.Tensor | slice,
+        log_prob: th.Tensor,
+        information: th.Tensor | None,
+    ) -> th.Tensor:
+        """
+        Compute the loss of some episodes, and log it: their cost, and the penalty on the information.
+
+        :param update: What :meth:`begin_update` returned.
+        :param episodes: Their columns.
+        :param log_prob: of what was sampled, ``(T, n)``
+        :param information: I[x_t; x~_t] in nats, ``(T,)``; None without a penalty
+        :return: scalar
+        :raises TrainingDivergedError: if it is NaN or infinite.
+        """
+        advantages, alive = update.advantages[:, episodes], update.batch.alive[:, episodes]
+        if update.old_log_prob is None:
+            policy_loss = policy_gradient_loss(log_prob, advantages, alive)
+        else:
+            old = update.old_log_prob[:, episodes]
+            policy_loss = clipped_policy_loss(log_prob, old, advantages, alive, update.clip_range)
+            self._record_distance(log_prob.detach() - old, alive, update.clip_range)
+        loss = policy_loss
+        if information is not None:
+            penalty = update.mi_coef * information_loss(information)
+            loss = loss + penalty / update.cost_scale
+            self.logger.record_mean("train/mi_loss", penalty.item())
+        self._check_finite({"policy loss": policy_loss, "loss": loss})
+        self.logger.record_mean("train/policy_loss", policy_loss.item())
+        self.logger.record_mean("train/loss", loss.item())
+        return loss
+
+    def end_update(self, update: PolicyUpdate) -> None:
+        """Count the policy epoch, and log it."""
         self.epoch += 1
         self._n_updates += self.n_epochs
-        mean_cost = batch.costs.sum(0).mean().item()
+        mean_cost = update.batch.costs.sum(0).mean().item()
         total = 0.0 if self.information is None else float(self.information.sum())
-        self.logger.record("train/objective", mean_cost + mi_coef * total)
-        self.logger.record("train/mi_coef", mi_coef)
-        self.logger.record("train/trv_std", batch.stds.mean().item())
+        self.logger.record("train/objective", mean_cost + update.mi_coef * total)
+        self.logger.record("train/mi_coef", update.mi_coef)
+        self.logger.record("train/trv_std", update.batch.stds.mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _log_prob(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
-        """
-        Log-probability of what was sampled, ``(T, N)``, as the chosen gradient of the encoder takes it.
-
-        :param rebuild: Return the TRVs rebuilt from the noise also where the gradient does not need them.
-        """
-        features = self.policy.episode_features(batch)
-        if self.encoder_gradient == "pathwise":
-            rebuilt = self._rebuild_trvs(features, batch)
-            return self.policy.action_log_prob(rebuilt.trvs, batch), rebuilt
-        log_prob = self.policy.trv_log_prob(features, batch) + self.policy.action_log_prob(batch.trvs, batch)
-        return log_prob, self._rebuild_trvs(features, batch) if rebuild else None
-
-    def _rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> RebuiltTRVs:
-        if self.bptt_steps is None or self.bptt_steps >= self.horizon:
-            return self.policy.rebuild_trvs(features, batch.noise)
-        return self.policy.rebuild_trvs_in_parts(features, batch, self.bptt_steps)
+    def _evaluate(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
+        return self.policy.evaluate_episodes(batch, self.encoder_gradient, self.bptt_steps, rebuild)
 
     def _minibatches(self) -> Sequence[th.Tensor | slice]:
         """Columns of the episodes of each minibatch: a random partition into nearly equal parts, or one of all."""
@@ -513,10 +543,8 @@ class TDPG(OnPolicyAlgorithm):
             if not bool(th.isfinite(value).all()):
                 raise self._diverged(name)
 
-    def _step_optimizer(self, loss: th.Tensor) -> None:
-        """Make one step, unless the gradient is not finite: then the parameters stay as they are."""
-        self.policy.optimizer.zero_grad()
-        loss.backward()
+    def descend(self) -> None:
+        """Make one step along the gradients, unless they are not finite: then the parameters stay as they are."""
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not bool(th.isfinite(grad_norm)):
             raise self._diverged("gradient")
@@ -558,13 +586,15 @@ class TDPG(OnPolicyAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        callbacks: list[BaseCallback] = [MINECallback()]
+        callbacks: list[BaseCallback] = []
         if isinstance(callback, list):
             callbacks += callback
         elif isinstance(callback, BaseCallback):
             callbacks.append(callback)
         else:
             callbacks.append(ConvertCallback(cast("Callable[[dict[str, Any], dict[str, Any]], bool]", callback)))
+        if not any(isinstance(given, MINECallback) for given in callbacks):
+            callbacks.insert(0, MINECallback())
         if progress_bar:
             callbacks.append(TDPGProgressBar())
         return super()._init_callback(CallbackList(callbacks))

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_tdpg.defaults import defaults_for
-from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.envs.base import BatchStep, POMDPEnv
 
 
 class BatchedVecEnv(VecEnv):
@@ -74,12 +74,18 @@ class BatchedVecEnv(VecEnv):
         """Store the actions, ``(N, U)``."""
         self._actions = actions
 
+    def advance(self, actions: np.ndarray) -> BatchStep:
+        """Step like ``step``, but without the infos; not for the last step of an episode."""
+        self._time += 1
+        step = self.env.step_batch(self._state, actions, is_last=self._time == self.env.horizon)
+        self._state = step.state
+        self._returns -= step.cost
+        return step
+
     def step_wait(self) -> VecEnvStepReturn:
         """Apply the stored actions; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
-        self._time += 1
+        _, observation, cost, details = self.advance(self._actions)
         is_last = self._time == self.env.horizon
-        self._state, observation, cost, details = self.env.step_batch(self._state, self._actions, is_last=is_last)
-        self._returns -= cost
         infos: list[dict[str, Any]] = [
             {"state": state, "cost": c} for state, c in zip(self._state.copy(), cost.tolist(), strict=True)
         ]

@@ -9,6 +9,8 @@ import torch as th
 from torch import nn
 from torch.optim.adam import adam
 
+VECTOR = 64  # a multiple of what any processor computes at a time
+
 
 class FlatAdam:
     """
@@ -31,7 +33,10 @@ class FlatAdam:
         To be called again whenever the parameters may have been moved or replaced (``to``, a loaded file).
         """
         parameters = list(module.parameters())
-        self._vector = th.cat([parameter.detach().flatten() for parameter in parameters])
+        # Filled up: torch computes the last few numbers of a vector in another way than the others, and which these are
+        # must not depend on the module being alone or part of a larger one.
+        padding = parameters[0].new_zeros(-sum(parameter.numel() for parameter in parameters) % VECTOR)
+        self._vector = th.cat([*(parameter.detach().flatten() for parameter in parameters), padding])
         self._gradient = th.zeros_like(self._vector)
         ends = list(accumulate(parameter.numel() for parameter in parameters))
         for parameter, end in zip(parameters, ends, strict=True):
