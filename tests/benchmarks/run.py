@@ -50,6 +50,7 @@ from sb3_tdpg.envs.panda_grasp import (  # noqa: E402
 )
 from sb3_tdpg.envs.panda_scene import TABLE_FILE, TABLE_POSITION  # noqa: E402
 from sb3_tdpg.information import InformationBatch, Mine  # noqa: E402
+from sb3_tdpg.training_batch import Member, TrainingBatch  # noqa: E402
 from tests.reference_loop import LoopTDPG, draw_randomness, unbatch  # noqa: E402
 
 PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
@@ -167,6 +168,28 @@ def bench_epoch(sizes: Sizes) -> Iterable[Row]:
         sizes.loop_repetitions,
         goal=100,
     )
+
+
+def bench_batch(sizes: Sizes) -> Iterable[Row]:
+    """Compare eight trainings as one batch with one alone, for each training; the critics' warm-up counts."""
+    n_timesteps = 5 * sizes.n_episodes * 4 * sizes.epochs
+
+    def models(n: int, estimator: str) -> list[TDPG]:
+        return [
+            TDPG("TRVPolicy", "Lava-v0", mi_estimator=estimator, n_episodes=sizes.n_episodes, seed=seed, device="cpu")
+            for seed in range(n)
+        ]
+
+    for estimator in ("logdet", "mine"):
+        yield compare(
+            f"training on Lava, N={sizes.n_episodes}, {4 * sizes.epochs} epochs, {estimator}: eight seeds as one batch "
+            "against one by one, for each seed",
+            lambda name=estimator: seconds(
+                TrainingBatch([Member(model, n_timesteps) for model in models(8, name)]).learn, units=8
+            ),
+            lambda name=estimator: seconds(lambda: models(1, name)[0].learn(n_timesteps)),
+            sizes.loop_repetitions,
+        )
 
 
 # -- (b) the critics --------------------------------------------------------------------------------------------------
@@ -510,6 +533,7 @@ def main() -> None:
     start = time.perf_counter()
     benches = (
         bench_epoch,
+        bench_batch,
         bench_critics,
         bench_training,
         bench_environment,
