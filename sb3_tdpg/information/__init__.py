@@ -7,6 +7,7 @@ A new estimator is a file of its own here and a row in :data:`ESTIMATORS`.
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.infonce import InfoNCE
+from sb3_tdpg.information.interval import InformationInterval, information_interval
 from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
@@ -45,11 +46,13 @@ __all__ = [
     "InfoNCE",
     "InformationBatch",
     "InformationEstimator",
+    "InformationInterval",
     "LeaveOneOut",
     "LogDet",
     "Mine",
     "Nwj",
     "Smile",
     "get_estimator_class",
+    "information_interval",
     "own_sample_bound",
 ]
