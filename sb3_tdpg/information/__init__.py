@@ -13,6 +13,7 @@ from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.information.smile import Smile
+from sb3_tdpg.information.trust import TrustBadge, TrustCheck, trust_checks
 
 ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "mine": Mine,
@@ -52,7 +53,10 @@ __all__ = [
     "Mine",
     "Nwj",
     "Smile",
+    "TrustBadge",
+    "TrustCheck",
     "get_estimator_class",
     "information_interval",
     "own_sample_bound",
+    "trust_checks",
 ]

@@ -14,14 +14,7 @@ import numpy as np
 LOG_FLOOR = math.log(0.01)  # of the critic: a share of a in r, against outliers
 LENGTHS = (0.3, 1.0)  # of the kernel, times the median distance
 RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # of the regressions, times the number of episodes
-SMOOTHINGS = (
-    0.0,
-    0.01,
-    0.03,
-    0.1,
-    0.3,
-    1.0,
-)  # of the marginal: from the mixture of the encoder's densities to a Gaussian
+SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 the mixture of the encoder's densities, 1 a Gaussian
 CONSTANT = 1e-9  # a component that varies by less than this, relative to its size, is constant
 LOG_2_PI = math.log(2 * math.pi)
 
@@ -89,12 +82,15 @@ class DensityCritic:
         :param trvs: ``(M, Z)``
         """
         means, log_stds = np.split(self._regression.predict(states), 2, axis=1)  # (n, Z) each
+        log_stds = np.clip(log_stds, *self._log_std_range)  # no extrapolation
         variances = np.exp(2 * log_stds) @ self._noise_rotation.T**2 + self._residual_variance
         log_density = log_gaussians(trvs @ self._noise_rotation.T, means @ self._noise_rotation.T, variances)
         return log_density + self._noise_log_volume
 
     def _fit_conditional(self, train: Encoded) -> None:
-        targets = np.concatenate([train.means, np.log(train.stds)], axis=1)
+        log_stds = np.log(train.stds)
+        self._log_std_range = log_stds.min(axis=0), log_stds.max(axis=0)
+        targets = np.concatenate([train.means, log_stds], axis=1)
         self._regression = Regression(train.states, targets)
         residuals = self._regression.residuals[:, : train.means.shape[1]]
         # Coordinates in which both the encoder's variance and the covariance of the residuals are diagonal.
@@ -134,6 +130,11 @@ class DensityCritic:
         return log_mean_exp(log_density, n)
 
 
+def varies(inputs: np.ndarray) -> np.ndarray:
+    """Tell which columns are more than a constant and its rounding errors: ``(n, X) -> (X,)``, bool."""
+    return inputs.std(axis=0) > CONSTANT * (1 + np.abs(inputs.mean(axis=0)))
+
+
 class Regression:
     """
     A ridge regression, and a kernel ridge regression of its residuals, for each target by itself.
@@ -143,20 +144,18 @@ class Regression:
     """
 
     def __init__(self, inputs: np.ndarray, targets: np.ndarray) -> None:
-        self._centre, scale = inputs.mean(axis=0), inputs.std(axis=0)
-        varies = scale > CONSTANT * (1 + np.abs(self._centre))
-        self._scale = np.where(varies, scale, np.inf)
+        self._centre = inputs.mean(axis=0)
+        self._scale = np.where(varies(inputs), inputs.std(axis=0), np.inf)
         self._inputs = self._standardize(inputs)
         self._intercept = targets.mean(axis=0)
-        left = targets - self._intercept
-
+        n, centred = len(inputs), targets - self._intercept
         u, s, vt = np.linalg.svd(self._inputs, full_matrices=False)
         keep = s > 1e-7 * max(s.max(initial=0.0), 1e-300)
         u, s, vt = u[:, keep], s[keep], vt[keep]
-        shrinkage, left = _choose_ridge(u, s**2, left)
-        self._coefficients = vt.T @ (shrinkage * (u.T @ (targets - self._intercept)) / s[:, None])
+        shrinkage, left = _choose_ridge(u, s**2, centred, otherwise=centred * n / (n - 1), leverage=1 / n)
+        self._coefficients = vt.T @ (shrinkage * (u.T @ centred) / s[:, None])
 
-        linear = targets - self._intercept - self._inputs @ self._coefficients
+        linear = centred - self._inputs @ self._coefficients
         square = self._distances(self._inputs)
         self._widths = np.square(LENGTHS) * (np.median(square) or 1.0)
         self._weights = np.zeros((len(LENGTHS), *targets.shape))  # of at most one kernel for each target
@@ -189,7 +188,7 @@ class Regression:
 
 
 def _choose_ridge(
-    basis: np.ndarray, values: np.ndarray, targets: np.ndarray, otherwise: np.ndarray | None = None
+    basis: np.ndarray, values: np.ndarray, targets: np.ndarray, otherwise: np.ndarray, leverage: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     Choose a ridge for each target by the leave-one-out error, which has a closed form.
@@ -197,18 +196,20 @@ def _choose_ridge(
     :param basis: Orthonormal columns, ``(n, R)``.
     :param values: Squared singular values that belong to them, ``(R,)``.
     :param targets: ``(n, Y)``
-    :param otherwise: Residuals of leaving the targets as they are, which is one of the choices, too.
+    :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices, too.
+    :param leverage: Of each episode on the regression that the targets are the residuals of.
     :return: the factors ``(R, Y)`` by which the projections are shrunk, and the leave-one-out residuals ``(n, Y)``
     """
     n = len(targets)
-    projections, leverages = basis.T @ targets, basis**2
-    choices = [values / (values + ridge * n) for ridge in RIDGES]  # (R,) each
-    residuals = [
-        (targets - basis @ (factor[:, None] * projections)) / np.maximum(1 - 1 / n - leverages @ factor, 1e-3)[:, None]
-        for factor in choices
-    ]
-    residuals.append(targets * n / (n - 1) if otherwise is None else otherwise)
-    choices.append(np.zeros_like(values))
+    projections, leverages = basis.T @ targets, np.square(basis)
+    # What the basis does not reach. By complements, since a kernel that interpolates leaves hardly any digits of 1 - h.
+    beyond, spare = targets - basis @ projections, np.maximum(1 - leverage - leverages.sum(axis=1), 1e-12)
+    choices, residuals = [np.zeros_like(values)], [otherwise]
+    for ridge in RIDGES:
+        complement = ridge * n / (values + ridge * n)  # (R,)
+        left = beyond + basis @ (complement[:, None] * projections)
+        choices.append(1 - complement)
+        residuals.append(left / (spare + leverages @ complement)[:, None])
     best = np.argmin([np.square(r).sum(axis=0) for r in residuals], axis=0)  # (Y,)
     columns = np.arange(targets.shape[1])
     return np.stack(choices)[best].T, np.stack(residuals)[best, :, columns].T

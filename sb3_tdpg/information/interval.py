@@ -15,11 +15,19 @@ import numpy as np
 import torch as th
 
 from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.information.density_critic import LOG_2_PI, DensityCritic, Encoded, log_gaussians, log_mean_exp
+from sb3_tdpg.information.density_critic import (
+    LOG_2_PI,
+    DensityCritic,
+    Encoded,
+    log_gaussians,
+    log_mean_exp,
+    varies,
+)
 
 MIN_EPISODES = 20
 MAX_DRAWS = 16  # of the TRVs, for each episode
 MAX_VALUES = 1_000_000  # densities of all draws under all episodes; bounds the memory
+MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
 MIN_HITS = 10  # pairs of a state with another episode's TRVs at the clip, to estimate the critic's denominator from
 
 LOWER_BOUNDS = ("critic",)
@@ -143,7 +151,36 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
         named[0][t] = "critic" if lower > 0 else "zero"  # also where it is NaN
         upper = max(upper, 0.0)
         limits[:, t] = min(lower, upper) if lower > 0 else 0.0, upper
-    return InformationInterval(*limits, tuple(named[0]), tuple(named[1]), estimates, errors, n_episodes, confidence)
+    lower_limits, upper_limits = limits
+    return InformationInterval(
+        lower_limits, upper_limits, tuple(named[0]), tuple(named[1]), estimates, errors, n_episodes, confidence
+    )
+
+
+def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    r"""
+    Bound from below what the TRVs know of each component of the state by itself, I[x^k_t; x~_t].
+
+    The bound is the critic's of :func:`information_interval`, with one component of the state in place of the state.
+
+    :param batch: As for :func:`information_interval`.
+    :param seed: Of the division into halves and of the noise.
+    :return: the estimates and their standard errors, ``(T, X)`` each, nats; NaN where a component is constant and where
+        too few episodes are alive
+    :raises ValueError: if the batch is not fit for an interval.
+    """
+    check_batch(batch)
+    horizon, _, n_components = batch.states.shape
+    values = np.full((2, horizon, n_components), np.nan)
+    for t in range(horizon):
+        at_t = batch.at(t)
+        if at_t.trvs.shape[1] < min_episodes(at_t.trvs.shape[2]):
+            continue
+        rng = np.random.default_rng((seed, t))
+        step = draw_trvs(at_t, rng)
+        for k in np.flatnonzero(varies(step.states)):
+            values[:, t, k], _ = critic_bounds(step._replace(states=step.states[:, [k]]), rng)
+    return values[0], values[1]
 
 
 def check_batch(batch: InformationBatch) -> None:
@@ -195,7 +232,7 @@ def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Es
     halves = np.array_split(rng.permutation(n), 2)
     bounds = []
     for train, fresh in (halves, halves[::-1]):
-        critic, evaluated = DensityCritic(step.select(train)), step.select(fresh)
+        critic, evaluated = DensityCritic(step.select(train[:MAX_TRAINING])), step.select(fresh)
         points = evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])
         log_marginal = critic.log_marginal(points)
         scores = critic.scores(evaluated.states, points, log_marginal)
