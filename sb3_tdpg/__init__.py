@@ -9,7 +9,7 @@ if not (_package / "envs").is_dir() and (_package.parent / "envs" / "__init__.py
     __path__.append(str(_package.parent))
 
 from sb3_tdpg import envs
-from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
+from sb3_tdpg.callbacks import InformationCallback, MINECallback, SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
 from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
@@ -19,6 +19,7 @@ __version__ = "0.1.0"
 __all__ = [
     "TDPG",
     "BatchedVecEnv",
+    "InformationCallback",
     "MINECallback",
     "SelectionCallback",
     "TRVPolicy",

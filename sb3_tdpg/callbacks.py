@@ -13,6 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_tdpg.files import write_atomically
+from sb3_tdpg.information import InformationInterval, information_interval
+from sb3_tdpg.information.interval import component_estimates
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
@@ -58,6 +60,51 @@ class MINECallback(_TDPGCallback):
         diagnostics = model.estimator.fit(batch)
         with th.no_grad():
             return diagnostics, model.estimator(batch).cpu().numpy()
+
+
+class InformationCallback(_TDPGCallback):
+    """
+    Write an interval that holds the information to the log, beside the estimate that the policy is trained with.
+
+    It is made from the epoch's rollouts, which are fresh for it: they were made with the policy as it is, and each
+    critic is fitted to other episodes than those that it is evaluated on. It needs no penalty, and changes nothing in
+    the training. The keys are ``mi/lower`` and ``mi/upper``, the limits summed over time; for TensorBoard
+    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_x0``, ..., what the TRVs know at least of
+    each component of the state, averaged over the time steps at which it varies.
+
+    :param eval_freq: Epochs from one interval to the next, beginning with the first.
+    :param confidence: With which the interval of a time step holds the truth.
+    :param components: Whether the components of the state are measured, too; it takes as long again for each.
+    :raises ValueError: if ``eval_freq`` is below 1.
+    """
+
+    def __init__(self, eval_freq: int = 10, *, confidence: float = 0.95, components: bool = True) -> None:
+        super().__init__()
+        if eval_freq < 1:
+            raise ValueError(f"eval_freq={eval_freq} must be at least 1 (epochs)")
+        self.eval_freq = eval_freq
+        self.confidence = confidence
+        self.components = components
+        self.interval: InformationInterval | None = None  # the last one
+
+    def _on_rollout_end(self) -> None:
+        model = self.tdpg
+        if model.epoch % self.eval_freq != 0:
+            return
+        batch = model.rollout_buffer.episode_batch().information_batch()
+        self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
+        lower, upper = self.interval.total
+        self.logger.record("mi/lower", lower)
+        self.logger.record("mi/upper", upper)
+        for limit in ("lower", "upper"):
+            for t, value in enumerate(getattr(self.interval, limit).tolist()):
+                if np.isfinite(value):
+                    self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))
+        if self.components:
+            estimates, _ = component_estimates(batch, seed=model.epoch)
+            for k, values in enumerate(estimates.T):
+                if np.isfinite(values).any():
+                    self.logger.record(f"mi/knows_x{k}", float(np.nanmean(values.clip(min=0))))
 
 
 class Candidate(NamedTuple):

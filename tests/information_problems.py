@@ -29,6 +29,21 @@ def gaussian_batch(n, gains, noise_std=1.0, generator=None):
     return InformationBatch(states, means + stds * th.randn(means.shape, generator=generator), means, stds)
 
 
+def gaussian_channels(nats, dim, n, n_channels, rng):
+    """
+    Channels x~ = A x + noise, one a time step, each with an information of ``nats`` and a random A.
+
+    How the information is shared among the directions is uniform on the simplex.
+    """
+    nats_of_each = nats * rng.dirichlet(np.ones(dim), n_channels)
+    left, right = (np.linalg.qr(rng.standard_normal((n_channels, dim, dim)))[0] for _ in range(2))
+    gains = left * np.sqrt(np.expm1(2 * nats_of_each))[:, None, :] @ right  # A
+    states = rng.standard_normal((n_channels, n, dim))
+    means = states @ gains.transpose(0, 2, 1)
+    trvs = means + rng.standard_normal(means.shape)
+    return InformationBatch(*map(th.as_tensor, (states, trvs, means, np.ones_like(means))))
+
+
 def gaussian_information(gains, noise_std=1.0):
     return 0.5 * np.log1p(np.square(np.asarray(gains) / noise_std)).sum(axis=1)
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette, which readers with any colour vision can tell apart: vermillion, blue, green, ...
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK = "#333333"
+# Of the bounds that the limits of an information interval come from: marker and name.
+LOWER_MARKERS = {"critic": ("^", "frozen critic"), "zero": ("_", "never negative")}
+UPPER_MARKERS = {"logdet": ("v", "log-det"), "loo": ("s", "leave-one-out"), "marginal": ("D", "fitted marginal")}
+MAX_ANNOTATED_STEPS = 15
 WIDTH = 9.0  # inches: about as wide as a README is shown, so that 9 points stay readable
 
 
@@ -128,6 +132,76 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
         axes.grid(alpha=0.25)
         _tidy(axes)
     _legend_above(figure, cost)
+    return figure
+
+
+def information_timeline(frame: pd.DataFrame) -> Figure:
+    """
+    Draw the interval that holds I[x_t; x~_t] over the time steps, with the bounds that its limits come from.
+
+    :param frame: From :func:`~sb3_tdpg.evaluation.information.interval_frame`.
+    """
+    figure = _new_figure(WIDTH * 0.75, 3.4)
+    axes = figure.add_subplot()
+    _tidy(axes)
+    t, lower, upper = frame["t"], frame["lower"], frame["upper"]
+    axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
+    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # the only ones there are
+    axes.plot(t, lower, color=PALETTE[1], linewidth=0.8)
+    axes.plot(t, upper, color=PALETTE[1], linewidth=0.8)
+    for limit, markers in (("lower", LOWER_MARKERS), ("upper", UPPER_MARKERS)):
+        for name, (marker, label) in markers.items():
+            rows = frame[frame[f"{limit}_name"] == name]
+            if len(rows):
+                axes.plot(rows["t"], rows[limit], marker, color=PALETTE[1], markersize=6, label=f"{limit}: {label}")
+    cap = np.log(frame["n_episodes"].max())
+    if upper.max() > 0.7 * cap:
+        axes.axhline(cap, color=INK, linestyle=(0, (4, 3)), linewidth=1, label=r"$\ln N$: lower limits fall behind")
+    axes.set_ylim(bottom=0, top=max(1.05 * upper.max(), 0.1))
+    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True))
+    axes.set_xlabel("time step $t$", fontsize=9)
+    axes.set_ylabel(r"$I[x_t; \tilde{x}_t]$ (nat)", fontsize=9)
+    _legend_above(figure, axes)
+    return figure
+
+
+def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats") -> Figure:
+    """
+    Draw what the TRVs know of each component of the state at each time step, as a heat map.
+
+    Grey where a component is constant. A value in brackets is not distinguishable from nothing.
+
+    :param frame: From :func:`~sb3_tdpg.evaluation.knowledge.state_knowledge`.
+    :param quantity: What the colour shows.
+    :raises ValueError: if the frame has no component.
+    """
+    if len(frame) == 0:
+        raise ValueError("the frame has no component: every one is constant, or too few episodes are alive")
+    components = frame["component"].unique()
+    table = {name: frame.pivot(index="component", columns="t", values=name).loc[components] for name in
+             (quantity, "nats_lower")}  # fmt: skip
+    values = table[quantity].to_numpy()  # (X, T)
+    n_rows, n_columns = values.shape
+    figure = _new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 14.0), 1.3 + 0.5 * n_rows)
+    axes = figure.add_subplot()
+    top = 1.0 if quantity == "r2" else max(float(np.nanmax(values)), 0.1)
+    axes.set_facecolor("#DDDDDD")
+    image = axes.imshow(values, cmap="viridis", vmin=0, vmax=top, aspect="auto")
+    for row, column in np.ndindex(values.shape) if n_columns <= MAX_ANNOTATED_STEPS else ():
+        value = values[row, column]
+        if np.isfinite(value):
+            is_known = table["nats_lower"].to_numpy()[row, column] > 0
+            color = "white" if value < 0.6 * top else INK
+            text = f"{value:.2f}" if is_known else f"({value:.2f})"
+            axes.text(column, row, text, color=color, fontsize=8, ha="center", va="center")
+    axes.set_yticks(range(n_rows), components, fontsize=9)
+    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True))
+    axes.tick_params(labelsize=8, length=0)
+    axes.set_xlabel("time step $t$", fontsize=9)
+    axes.spines[:].set_visible(False)
+    bar = figure.colorbar(image, pad=0.02)
+    bar.set_label(r"$I[x^k_t; \tilde{x}_t]$ (nat), at least" if quantity == "nats" else "$R^2$", fontsize=9)
+    bar.ax.tick_params(labelsize=8)
     return figure
 
 

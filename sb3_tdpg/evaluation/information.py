@@ -7,9 +7,12 @@ Dimension key: T horizon, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import contextlib
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import obs_as_tensor
@@ -17,9 +20,22 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
+from sb3_tdpg.evaluation.knowledge import state_knowledge
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
-from sb3_tdpg.information import InformationBatch, LogDet, own_sample_bound
+from sb3_tdpg.information import (
+    InformationBatch,
+    InformationInterval,
+    LogDet,
+    TrustBadge,
+    information_interval,
+    own_sample_bound,
+    trust_checks,
+)
 from sb3_tdpg.problem import read_problem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class EncodedEpisodes(NamedTuple):
@@ -34,6 +50,89 @@ class InformationBounds(NamedTuple):
 
     upper: float  # on I[x_t; x~_t]: the log-det bound
     lower: float  # on what the encoder's input tells of x~_t, which is I[x_t; x~_t] without memory and sensor noise
+
+
+@dataclass(frozen=True)
+class InformationReport:
+    """What the TRVs of a policy know, and how far the numbers can be trusted."""
+
+    interval: InformationInterval
+    """Of I[x_t; x~_t], for each time step."""
+    knowledge: pd.DataFrame
+    """What the TRVs know of each component of the state: see
+    :func:`~sb3_tdpg.evaluation.knowledge.state_knowledge`."""
+    badge: TrustBadge
+    """Checks of the interval."""
+    costs: np.ndarray
+    """``(N,)``: of the episodes."""
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """The interval as a frame: see :func:`interval_frame`."""
+        return interval_frame(self.interval)
+
+    def figures(self) -> dict[str, Figure]:
+        """Draw ``"timeline"``, the interval over time, and ``"knowledge"``, the map of the components."""
+        return dict(timeline=information_timeline(self.frame), knowledge=knowledge_map(self.knowledge))
+
+    def __str__(self) -> str:
+        lower, upper = self.interval.total
+        return (
+            f"I[x_t; x~_t], summed over time: {lower:.2f} to {upper:.2f} nat "
+            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes); {self.badge}"
+        )
+
+
+def information_report(
+    model: Any, env: VecEnv, n_episodes: int = 500, seed: int = 0, *, names: Sequence[str] | None = None
+) -> InformationReport:
+    """
+    Run fresh episodes, and tell what the policy's TRVs know of the state, when, and how sure that is.
+
+    :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
+    :param env: Any number of environments.
+    :param n_episodes: N; with fewer environments they are run in rounds.
+    :param seed: Of the episodes, the policy's sampling and the estimates.
+    :param names: Of the components of the state; default: ``x0``, ``x1``, ...
+    :raises ValueError: if there are too few episodes for an interval at any time step.
+    """
+    batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
+    interval = information_interval(batch, seed=seed)
+    return InformationReport(
+        interval, state_knowledge(batch, names, seed=seed), trust_checks(batch, interval, seed=seed), costs
+    )
+
+
+def interval_frame(interval: InformationInterval) -> pd.DataFrame:
+    """
+    Make a frame with a row for each time step.
+
+    Its columns are ``t``, the limits ``lower`` and ``upper`` in nats and the bounds ``lower_name`` and ``upper_name``
+    that they come from, the estimate of each bound (``critic``, ``logdet``, ``loo``, ``marginal``) and ``n_episodes``.
+    """
+    return pd.DataFrame(
+        dict(
+            t=np.arange(len(interval.lower)),
+            lower=interval.lower,
+            upper=interval.upper,
+            lower_name=interval.lower_name,
+            upper_name=interval.upper_name,
+            **interval.estimates,
+            n_episodes=interval.n_episodes,
+        )
+    )
+
+
+def _encode_in_rounds(model: Any, env: VecEnv, n_episodes: int, seed: int) -> EncodedEpisodes:
+    """Run :func:`encode_episodes` until there are enough episodes, each round with a seed of its own."""
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes={n_episodes} must be at least 1")
+    n_rounds = -(-n_episodes // env.num_envs)
+    seeds = [seed, *np.random.SeedSequence([seed, n_rounds]).generate_state(n_rounds)[1:].tolist()]
+    rounds = [encode_episodes(model, env, seed=each) for each in seeds]
+    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*(each.batch for each in rounds), strict=True)))
+    costs = np.concatenate([each.costs for each in rounds])
+    return EncodedEpisodes(batch.select(th.arange(n_episodes)), costs[:n_episodes])
 
 
 def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisodes:

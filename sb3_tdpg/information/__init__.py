@@ -7,11 +7,13 @@ A new estimator is a file of its own here and a row in :data:`ESTIMATORS`.
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.infonce import InfoNCE
+from sb3_tdpg.information.interval import InformationInterval, information_interval
 from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.information.smile import Smile
+from sb3_tdpg.information.trust import TrustBadge, TrustCheck, trust_checks
 
 ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "mine": Mine,
@@ -45,11 +47,16 @@ __all__ = [
     "InfoNCE",
     "InformationBatch",
     "InformationEstimator",
+    "InformationInterval",
     "LeaveOneOut",
     "LogDet",
     "Mine",
     "Nwj",
     "Smile",
+    "TrustBadge",
+    "TrustCheck",
     "get_estimator_class",
+    "information_interval",
     "own_sample_bound",
+    "trust_checks",
 ]

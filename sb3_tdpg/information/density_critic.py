@@ -1,0 +1,248 @@
+"""
+A critic in closed form: the logarithm of a fitted conditional density over a fitted marginal density.
+
+Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode, M points.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+LOG_FLOOR = math.log(0.01)  # of the critic: a share of a in r, against outliers
+LENGTHS = (0.3, 1.0)  # of the kernel, times the median distance
+RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # of the regressions, times the number of episodes
+SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 the mixture of the encoder's densities, 1 a Gaussian
+CONSTANT = 1e-9  # a component that varies by less than this, relative to its size, is constant
+LOG_2_PI = math.log(2 * math.pi)
+
+
+class Encoded(NamedTuple):
+    """Episodes at one time step, in float64."""
+
+    states: np.ndarray  # (n, X)
+    means: np.ndarray  # (n, Z) of q(x~ | e)
+    stds: np.ndarray  # (n, Z)
+    trvs: np.ndarray  # (n, K, Z): draws from q(x~ | e)
+
+    def select(self, episodes: np.ndarray) -> Encoded:
+        """Only some episodes, given by their indices."""
+        return Encoded(*(x[episodes] for x in self))
+
+
+class DensityCritic:
+    r"""
+    The critic :math:`F(x, \tilde x) = \log [r(\tilde x \mid x) / a(\tilde x) + 0.01]`, fitted to some of the episodes.
+
+    It takes no optimiser, and where the channel from the state to the TRVs is Gaussian it has the form of the best
+    critic that there is.
+
+    - r is a Gaussian about a regression of the encoder's means on the state: a ridge regression plus a kernel ridge
+      regression of what that leaves. Its covariance is that of the residuals plus the encoder's own variance, whose
+      logarithm is regressed alike.
+    - a is a mixture of the encoder's densities, smoothed: every mean is drawn towards the centre, and what this takes
+      from the covariance is added to each density. Smoothing 0 is the mixture itself, 1 a Gaussian.
+
+    Every ridge and the smoothing are those with the best leave-one-out error on the same episodes.
+
+    :param train: The episodes, with ``K >= 1`` draws each.
+    """
+
+    def __init__(self, train: Encoded) -> None:
+        self._fit_conditional(train)
+        self._fit_marginal(train)
+
+    def log_marginal(self, trvs: np.ndarray) -> np.ndarray:
+        """
+        Log a(x~), a normalised density: ``(M,)``.
+
+        :param trvs: ``(M, Z)``
+        """
+        points = (trvs - self._centre) @ self._rotation.T
+        return self._log_mixture(points, self._smoothing) + self._log_volume
+
+    def scores(self, states: np.ndarray, trvs: np.ndarray, log_marginal: np.ndarray) -> np.ndarray:
+        """
+        F of every x~ with every x: ``(M, n)``.
+
+        :param states: ``(n, X)``
+        :param trvs: ``(M, Z)``
+        :param log_marginal: ``(M,)``, of :meth:`log_marginal`
+        """
+        log_ratio = self._log_conditional(states, trvs) - log_marginal[:, None]
+        return np.logaddexp(log_ratio, LOG_FLOOR)
+
+    def _log_conditional(self, states: np.ndarray, trvs: np.ndarray) -> np.ndarray:
+        """
+        Log r(x~ | x) of every x~ under every x: ``(M, n)``.
+
+        :param states: ``(n, X)``
+        :param trvs: ``(M, Z)``
+        """
+        means, log_stds = np.split(self._regression.predict(states), 2, axis=1)  # (n, Z) each
+        log_stds = np.clip(log_stds, *self._log_std_range)  # no extrapolation
+        variances = np.exp(2 * log_stds) @ self._noise_rotation.T**2 + self._residual_variance
+        log_density = log_gaussians(trvs @ self._noise_rotation.T, means @ self._noise_rotation.T, variances)
+        return log_density + self._noise_log_volume
+
+    def _fit_conditional(self, train: Encoded) -> None:
+        log_stds = np.log(train.stds)
+        self._log_std_range = log_stds.min(axis=0), log_stds.max(axis=0)
+        targets = np.concatenate([train.means, log_stds], axis=1)
+        self._regression = Regression(train.states, targets)
+        residuals = self._regression.residuals[:, : train.means.shape[1]]
+        # Coordinates in which both the encoder's variance and the covariance of the residuals are diagonal.
+        self._noise_rotation, self._residual_variance, self._noise_log_volume = _whiten(
+            np.square(train.stds).mean(axis=0), residuals.T @ residuals / len(residuals)
+        )
+
+    def _fit_marginal(self, train: Encoded) -> None:
+        n, n_draws, dim = train.trvs.shape
+        self._centre = train.means.mean(axis=0)
+        centred = train.means - self._centre
+        self._rotation, self._spread, self._log_volume = _whiten(
+            np.square(train.stds).mean(axis=0), centred.T @ centred / (n - 1)
+        )
+        self._components = centred @ self._rotation.T  # (n, Z)
+        self._variances = np.square(train.stds) @ self._rotation.T**2
+        n_draws = min(n_draws, 2)
+        points = ((train.trvs[:, :n_draws] - self._centre) @ self._rotation.T).reshape(-1, dim)
+        own = np.repeat(np.arange(n), n_draws)
+        scores = [self._log_mixture(points, smoothing, own).mean() for smoothing in SMOOTHINGS]
+        self._smoothing = SMOOTHINGS[int(np.argmax(scores))]
+
+    def _log_mixture(self, points: np.ndarray, smoothing: float, own: np.ndarray | None = None) -> np.ndarray:
+        """
+        Log-density of the smoothed mixture: ``(M,)``.
+
+        :param points: ``(M, Z)``, rotated
+        :param own: The component to be left out for each point, ``(M,)``.
+        """
+        log_density = log_gaussians(
+            points, math.sqrt(1 - smoothing) * self._components, self._variances + smoothing * self._spread
+        )
+        n = log_density.shape[1]
+        if own is not None:
+            log_density[np.arange(len(points)), own] = -np.inf
+            n -= 1
+        return log_mean_exp(log_density, n)
+
+
+def varies(inputs: np.ndarray) -> np.ndarray:
+    """Tell which columns are more than a constant and its rounding errors: ``(n, X) -> (X,)``, bool."""
+    return inputs.std(axis=0) > CONSTANT * (1 + np.abs(inputs.mean(axis=0)))
+
+
+class Regression:
+    """
+    A ridge regression, and a kernel ridge regression of its residuals, for each target by itself.
+
+    :param inputs: ``(n, X)``; constant components are left out.
+    :param targets: ``(n, Y)``
+    """
+
+    def __init__(self, inputs: np.ndarray, targets: np.ndarray) -> None:
+        self._centre = inputs.mean(axis=0)
+        self._scale = np.where(varies(inputs), inputs.std(axis=0), np.inf)
+        self._inputs = self._standardize(inputs)
+        self._intercept = targets.mean(axis=0)
+        n, centred = len(inputs), targets - self._intercept
+        u, s, vt = np.linalg.svd(self._inputs, full_matrices=False)
+        keep = s > 1e-7 * max(s.max(initial=0.0), 1e-300)
+        u, s, vt = u[:, keep], s[keep], vt[keep]
+        shrinkage, left = _choose_ridge(u, s**2, centred, otherwise=centred * n / (n - 1), leverage=1 / n)
+        self._coefficients = vt.T @ (shrinkage * (u.T @ centred) / s[:, None])
+
+        linear = centred - self._inputs @ self._coefficients
+        square = self._distances(self._inputs)
+        self._widths = np.square(LENGTHS) * (np.median(square) or 1.0)
+        self._weights = np.zeros((len(LENGTHS), *targets.shape))  # of at most one kernel for each target
+        for i, width in enumerate(self._widths):
+            values, vectors = np.linalg.eigh(np.exp(-square / width))
+            values = np.maximum(values, 1e-12)
+            shrinkage, residuals = _choose_ridge(vectors, values, linear, otherwise=left)
+            better = np.any(shrinkage > 0, axis=0)
+            self._weights[:, :, better] = 0
+            self._weights[i] += vectors @ (shrinkage * (vectors.T @ linear) / values[:, None])
+            left = np.where(better, residuals, left)
+        self.residuals = left  # (n, Y), each of a regression without that episode
+
+    def predict(self, inputs: np.ndarray) -> np.ndarray:
+        """Predict the targets: ``(n, Y)``."""
+        inputs = self._standardize(inputs)
+        predicted = self._intercept + inputs @ self._coefficients
+        for width, weights in zip(self._widths, self._weights, strict=True):
+            if weights.any():
+                predicted += np.exp(-self._distances(inputs) / width) @ weights
+        return predicted
+
+    def _standardize(self, inputs: np.ndarray) -> np.ndarray:
+        return (inputs - self._centre) / self._scale
+
+    def _distances(self, inputs: np.ndarray) -> np.ndarray:
+        """Squared distances from the episodes of the fit: ``(M, n)``."""
+        square = (inputs**2).sum(axis=1)[:, None] - 2 * inputs @ self._inputs.T + (self._inputs**2).sum(axis=1)
+        return np.maximum(square, 0.0)
+
+
+def _choose_ridge(
+    basis: np.ndarray, values: np.ndarray, targets: np.ndarray, otherwise: np.ndarray, leverage: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Choose a ridge for each target by the leave-one-out error, which has a closed form.
+
+    :param basis: Orthonormal columns, ``(n, R)``.
+    :param values: Squared singular values that belong to them, ``(R,)``.
+    :param targets: ``(n, Y)``
+    :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices, too.
+    :param leverage: Of each episode on the regression that the targets are the residuals of.
+    :return: the factors ``(R, Y)`` by which the projections are shrunk, and the leave-one-out residuals ``(n, Y)``
+    """
+    n = len(targets)
+    projections, leverages = basis.T @ targets, np.square(basis)
+    # What the basis does not reach. By complements, since a kernel that interpolates leaves hardly any digits of 1 - h.
+    beyond, spare = targets - basis @ projections, np.maximum(1 - leverage - leverages.sum(axis=1), 1e-12)
+    choices, residuals = [np.zeros_like(values)], [otherwise]
+    for ridge in RIDGES:
+        complement = ridge * n / (values + ridge * n)  # (R,)
+        left = beyond + basis @ (complement[:, None] * projections)
+        choices.append(1 - complement)
+        residuals.append(left / (spare + leverages @ complement)[:, None])
+    best = np.argmin([np.square(r).sum(axis=0) for r in residuals], axis=0)  # (Y,)
+    columns = np.arange(targets.shape[1])
+    return np.stack(choices)[best].T, np.stack(residuals)[best, :, columns].T
+
+
+def _whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """
+    Find coordinates in which the noise has variance 1 and the covariance is diagonal.
+
+    :param noise: Variances of the noise, ``(Z,)``.
+    :param covariance: ``(Z, Z)``
+    :return: the matrix ``(Z, Z)`` that leads there, the diagonal ``(Z,)``, and the logarithm of the matrix' determinant
+    """
+    scale = 1 / np.sqrt(noise)
+    values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
+    return vectors.T * scale, np.maximum(values, 0.0), float(np.log(scale).sum())
+
+
+def log_gaussians(points: np.ndarray, means: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """
+    Log-density of every point under every diagonal Gaussian: ``(M, n)``.
+
+    :param points: ``(M, Z)``
+    :param means: ``(n, Z)``
+    :param variances: ``(n, Z)``
+    """
+    centre = means.mean(axis=0)  # the expansion of the square loses digits far from the origin
+    points, means, precision = points - centre, means - centre, 1 / variances
+    quadratic = points**2 @ precision.T - 2 * points @ (means * precision).T + (means**2 * precision).sum(axis=1)
+    return -0.5 * (quadratic + np.log(variances).sum(axis=1) + points.shape[1] * LOG_2_PI)
+
+
+def log_mean_exp(values: np.ndarray, n: int) -> np.ndarray:
+    """Logarithm of the sum of ``exp`` over the last axis divided by n: ``(M, n) -> (M,)``."""
+    top = values.max(axis=-1, keepdims=True)
+    return np.log(np.exp(values - top).sum(axis=-1)) + top[..., 0] - math.log(n)
