@@ -98,6 +98,8 @@ def _risk(values: np.ndarray, weights: np.ndarray, beta: float) -> float:
     # the exponential. This is scipy's logsumexp without its checks, which take ten times as long as the sum.
     exponents = beta * (values - mean)
     largest = float(exponents.max())
+    if largest < 1:  # so small a difference from 1 would be lost
+        return mean + math.log1p(float(weights @ np.expm1(exponents))) / beta
     return mean + (largest + math.log(float(weights @ np.exp(exponents - largest)))) / beta
 
 

@@ -20,7 +20,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from scipy.special import betaln, digamma
-from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.distributions import Normal, kl_divergence
 
@@ -28,16 +27,15 @@ from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.certificate import Certificate, CostDistribution, cost_distribution, worst_mean
 from sb3_tdpg.evaluation.environments import scenario_env
-from sb3_tdpg.evaluation.information import InformationBounds, information_bounds
 from sb3_tdpg.evaluation.randomness import isolated_randomness
-from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000
 """Episodes run side by side; a constant, because results depend on it."""
 
 INFORMATION_EPISODES = 4_000
-"""Episodes for the bounds on the information, of which one looks at all pairs."""
+"""Episodes for the bound on the information."""
 
 # Streams of random numbers.
 _START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)
@@ -248,8 +246,7 @@ class TrainingEpisodes:
         :param shift: Of the sensor.
         :param n_episodes: Use the first of them; default: all.
         :return: at each step that of the TRVs, D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] in nats, and in
-            a last row that of the last step's actions (that of its TRVs, where the actions are not continuous):
-            ``(T + 1, N)``
+            a last row that of the last step's actions: ``(T + 1, N)``
         """
         recorded = self.recorded.first(n_episodes)
         shifted = encode(self.model, _pomdp(self.model, self._shifted(shift)), recorded)
@@ -326,6 +323,7 @@ def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) ->
     :param seed: Of the start, the dynamics, the sensor and the policy.
     """
     policy, device, box = model.policy, model.device, env.action_space
+    assert isinstance(box, spaces.Box)  # of every environment of this plugin
     policy.set_training_mode(False)
     env.np_random = np.random.default_rng([*seed, _START])
     state, costs = env._initial_state(n), np.zeros(n)
@@ -340,13 +338,11 @@ def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) ->
             prev_trvs.append(trv)
             densities.append(Normal(step.means, step.stds))
             trv = step.trvs
-            action = step.actions.cpu().numpy().reshape((n, *box.shape))
-            if isinstance(box, spaces.Box):
-                action = np.clip(action, box.low, box.high)
+            action = np.clip(step.actions.cpu().numpy().reshape((n, *box.shape)), box.low, box.high)
             costs += env._cost(state, action)
             env.np_random = np.random.default_rng([*seed, _DYNAMICS, t])
             state = env._dynamics(state, action)
-        last = _action_density(policy, trv, densities[-1])
+        last = _action_density(policy, trv)
     costs += env._terminal_cost(state)
     return RecordedEpisodes(costs, np.stack(states), th.stack(prev_trvs), step.noise, [*densities, last], seed)
 
@@ -362,31 +358,30 @@ def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal
     """
     policy, n = model.policy, recorded.states.shape[1]
     policy.set_training_mode(False)
-    densities = []
+    densities: list[Normal] = []
     with th.no_grad():
         for t, (state, prev_trv) in enumerate(zip(recorded.states, recorded.prev_trvs, strict=True)):
             env.np_random = np.random.default_rng([*recorded.seed, _SENSOR, t])
             observation = obs_as_tensor(env._sensor(state), model.device)
             densities.append(Normal(*policy.encoder_density(observation, prev_trv, np.full(n, t))))
         trvs = densities[-1].mean + densities[-1].stddev * recorded.last_trv_noise
-        return [*densities, _action_density(policy, trvs, densities[-1])]
+        return [*densities, _action_density(policy, trvs)]
 
 
-def _action_density(policy: Any, trvs: th.Tensor, otherwise: Normal) -> Normal:
-    """Return the density of the last actions, where they have one."""
-    if not isinstance(policy.action_dist, DiagGaussianDistribution):
-        return otherwise
+def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
+    """Return the density of the last actions."""
     density = policy.action_density(trvs, np.full(len(trvs), policy.horizon - 1)).distribution
     return Normal(density.mean, density.stddev)
 
 
-def _information(recorded: RecordedEpisodes) -> InformationBounds:
-    """Bound the information in the TRVs."""
+def _information(recorded: RecordedEpisodes) -> float:
+    """Bound the sum over t of I[x_t; x~_t] from above, by the log-det bound."""
     means, stds = (th.stack([getattr(d, name) for d in recorded.densities[:-1]]).cpu() for name in ("mean", "stddev"))
     last = means[-1] + stds[-1] * recorded.last_trv_noise.cpu()
     trvs = th.cat([recorded.prev_trvs[1:].cpu(), last[None]])
     states = th.as_tensor(recorded.states, dtype=th.float32)
-    return information_bounds(InformationBatch(states, trvs, means, stds))
+    log_det = LogDet(len(trvs), states.shape[2], trvs.shape[2])
+    return float(log_det(InformationBatch(states, trvs, means, stds)).sum())
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
