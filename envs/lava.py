@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,9 @@ class LavaEnv(POMDPEnv):
     ``LavaEnv(**sb3_tdpg.envs.scenarios.LAVA_TABLE_READING)``.
 
     :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
+    :param sensor_bias: Added to every observation, in m and m/s; ``None``: nothing.
+    :param start_beta: ``(a, b)``: the robot starts at 5 m times a number from the Beta(a, b) distribution; ``None``:
+        uniformly, as (1, 1) would.
     :param action_cost: Weight of ``|u_t|`` in the stage cost (0 in the text, 1 in the table's reading).
     :param lava_stage_cost: Stage cost once in the lava; ``None``: the distance to the goal, which is 2 there.
     :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
@@ -48,6 +52,8 @@ class LavaEnv(POMDPEnv):
         self,
         *,
         sensor_noise_std: float = 0.01,
+        sensor_bias: Sequence[float] | None = None,
+        start_beta: Sequence[float] | None = None,
         action_cost: float = 0.0,
         lava_stage_cost: float | None = None,
         lava_terminal_cost: float | None = None,
@@ -60,6 +66,12 @@ class LavaEnv(POMDPEnv):
             raise ValueError(
                 f"sensor_noise_std={sensor_noise_std} must be finite and not negative (it is sigma, not sigma^2)"
             )
+        if sensor_bias is not None and not (np.shape(sensor_bias) == (2,) and np.isfinite(sensor_bias).all()):
+            raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, of m and m/s, or None")
+        if start_beta is not None and not (
+            np.shape(start_beta) == (2,) and np.isfinite(start_beta).all() and min(start_beta) > 0
+        ):
+            raise ValueError(f"start_beta={start_beta!r} must be two positive numbers, for instance (2, 1), or None")
         if not (np.isfinite(max_action) and max_action > 0):
             raise ValueError(f"max_action={max_action} must be finite and positive")
         for name, value in (("action_cost", action_cost), ("lava_stage_cost", lava_stage_cost),
@@ -67,6 +79,8 @@ class LavaEnv(POMDPEnv):
             if value is not None and not np.isfinite(value):
                 raise ValueError(f"{name}={value} must be finite")
         self.sensor_noise_std = float(sensor_noise_std)
+        self.sensor_bias = None if sensor_bias is None else np.array(sensor_bias, dtype=np.float64)
+        self.start_beta = None if start_beta is None else (float(start_beta[0]), float(start_beta[1]))
         self.action_cost = float(action_cost)
         self.lava_stage_cost = lava_stage_cost
         self.lava_terminal_cost = lava_terminal_cost
@@ -74,9 +88,26 @@ class LavaEnv(POMDPEnv):
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
 
+    @property
+    def cost_bound(self) -> float:
+        """
+        What the cost of no episode can exceed.
+
+        A robot that has not been stopped went from one place in [0, 5] m to another in the last step, so that its speed
+        was at most 5 m a step, and one control later it is at most that and ``max_action``.
+        """
+        assert isinstance(self.action_space, spaces.Box)
+        max_action = float(self.action_space.high[0])
+        farthest = float(np.hypot(GOAL[0] - WALL, LAVA - WALL + max_action))
+        stage = max(farthest, self.lava_stage_cost or 0.0) + self.action_cost * max_action
+        return self.horizon * stage + max(100.0 * farthest, self.lava_terminal_cost or 0.0)
+
     def _initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, 2))
-        state[:, 0] = self.np_random.uniform(WALL, LAVA, n)
+        if self.start_beta is None:
+            state[:, 0] = self.np_random.uniform(WALL, LAVA, n)
+        else:
+            state[:, 0] = WALL + (LAVA - WALL) * self.np_random.beta(*self.start_beta, n)
         return state
 
     def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
@@ -90,7 +121,8 @@ class LavaEnv(POMDPEnv):
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
         noise = self.sensor_noise_std * self.np_random.standard_normal(state.shape)
-        return (state + noise).astype(np.float32)
+        mean = state if self.sensor_bias is None else state + self.sensor_bias
+        return (mean + noise).astype(np.float32)
 
     def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         distance = np.linalg.norm(state - GOAL, axis=1)

@@ -93,6 +93,18 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
     )
 
 
+def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, **options: Any) -> None:
+    from sb3_tdpg.enjoy import parse_keywords
+    from sb3_tdpg.reproduction.certificate import certify_lava
+
+    if env != "Lava-v0":
+        raise ValueError(
+            f"certify knows the shifts of Lava-v0 only, and not of {env}: declare them in Python, see "
+            "sb3_tdpg.evaluation.shifts.TrainingEpisodes"
+        )
+    print(f"\n{certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)}\n\nresults are in {out}")
+
+
 def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_episodes: int) -> None:
     from sb3_tdpg.hub import push_to_hub, write_model_card
 
@@ -134,6 +146,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "reproduce": _reproduce,
     "enjoy": _enjoy,
     "sweep": _sweep,
+    "certify": _certify,
     "push": _push,
     "pull": _pull,
 }
@@ -187,6 +200,7 @@ def _make_parser() -> argparse.ArgumentParser:
     enjoy.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
     enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4")
     _add_sweep(commands)
+    _add_certify(commands)
     _add_hub(commands)
     return parser
 
@@ -217,6 +231,27 @@ def _add_sweep(commands: Any) -> None:
         "--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores; with --storage 1)"
     )
     _add_sizes(sweep)
+
+
+def _add_certify(commands: Any) -> None:
+    certify = commands.add_parser("certify", help="bound what saved lava policies cost when sensor and start change")
+    certify.add_argument("models", nargs="+", type=Path, help="the .zip files that model.save() wrote")
+    certify.add_argument("--env", required=True, help="id of the environment: Lava-v0")
+    certify.add_argument(
+        "--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        help="keywords of the training environment, the values in YAML",
+    )  # fmt: skip
+    certify.add_argument(
+        "--random-shifts", type=_positive, default=0, dest="n_random_shifts", help="beside the paper's shifts"
+    )
+    certify.add_argument("--n-episodes", type=_positive, default=1_000_000, help="recorded training episodes")
+    certify.add_argument("--n-test-episodes", type=_positive, default=2000, help="episodes in each random shift")
+    certify.add_argument("--confidence", type=float, default=0.95)
+    certify.add_argument(
+        "--cost-bound", type=float, default=None, help="clip the cost there (default: that of standing at the wall)"
+    )
+    certify.add_argument("--seed", type=int, default=0)
+    certify.add_argument("--out", type=Path, default=Path("results/certificate"), help="folder for the results")
 
 
 def _add_hub(commands: Any) -> None:

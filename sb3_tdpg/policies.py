@@ -267,12 +267,33 @@ class TRVPolicy(BasePolicy):
         :param t: time step of each episode, ``(N,)``
         :param deterministic: Means instead of samples, of the TRVs and of the action.
         """
-        inputs = th.cat([prev_trv, self.extract_features(observation, self.features_extractor)], dim=1)
-        mean, std = self._encoder_density(self._at_times(self.encoder, inputs, t))
+        mean, std = self.encoder_density(observation, prev_trv, t)
         noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
         trv = mean + std * noise
-        distribution = self._action_distribution(self._at_times(self.action_head, trv, t))
+        distribution = self.action_density(trv, t)
         return PolicyStep(distribution.get_actions(deterministic), trv, mean, std, noise)
+
+    def encoder_density(
+        self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Return mean and standard deviation of q(x~_t | x~_{t-1}, y_t), ``(N, Z)`` each.
+
+        :param observation: y_t, ``(N, *obs)``
+        :param prev_trv: x~_{t-1}, ``(N, Z)``; zero at the start of an episode
+        :param t: time step of each episode, ``(N,)``
+        """
+        inputs = th.cat([prev_trv, self.extract_features(observation, self.features_extractor)], dim=1)
+        return self._encoder_density(self._at_times(self.encoder, inputs, t))
+
+    def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
+        """
+        Return pi(u_t | x~_t), SB3's distribution; the next call changes it.
+
+        :param trv: x~_t, ``(N, Z)``
+        :param t: time step of each episode, ``(N,)``
+        """
+        return self._action_distribution(self._at_times(self.action_head, trv, t))
 
     @staticmethod
     def _at_times(network: TimeMLP, inputs: th.Tensor, t: np.ndarray) -> th.Tensor:
