@@ -11,6 +11,7 @@ from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
+from sb3_tdpg.information.pairs import InformationEstimate, estimate_information
 from sb3_tdpg.information.smile import Smile
 
 ESTIMATORS: dict[str, type[InformationEstimator]] = {
@@ -44,12 +45,14 @@ __all__ = [
     "CriticEstimator",
     "InfoNCE",
     "InformationBatch",
+    "InformationEstimate",
     "InformationEstimator",
     "LeaveOneOut",
     "LogDet",
     "Mine",
     "Nwj",
     "Smile",
+    "estimate_information",
     "get_estimator_class",
     "own_sample_bound",
 ]
