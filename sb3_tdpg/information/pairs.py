@@ -56,9 +56,9 @@ def estimate_information(
     Every component is first replaced by the normal quantile of its rank, which leaves the information as it is and
     takes away heavy tails. The critic is :math:`F = F_0 + \text{network}`. It starts once from the logarithmic density
     ratio :math:`F_0` of a Gaussian with the training folds' covariance, and once from :math:`F_0 = 0`. The covariance
-    is that of x and z or, where that does better on held-out pairs, of these and their radii (the normal quantile of
-    the rank of the Mahalanobis norm), with which it sees tails that come together. The network's inputs are all these
-    and three cosines of each rank.
+    is that of x and z or, where that does better on the held-out pairs of all folds, of these and their radii (the
+    normal quantile of the rank of the Mahalanobis norm), with which it sees tails that come together. The network's
+    inputs are all these and three cosines of each rank.
 
     Each of K folds is held out once. Which start, and after how many gradient steps, is decided for a fold by the
     estimates on the *other* folds, so that a fold's own luck is not chosen.
