@@ -12,6 +12,7 @@ from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
+from sb3_tdpg.information.pairs import InformationEstimate, estimate_information
 from sb3_tdpg.information.smile import Smile
 from sb3_tdpg.information.trust import TrustBadge, TrustCheck, trust_checks
 
@@ -46,6 +47,7 @@ __all__ = [
     "CriticEstimator",
     "InfoNCE",
     "InformationBatch",
+    "InformationEstimate",
     "InformationEstimator",
     "InformationInterval",
     "LeaveOneOut",
@@ -55,6 +57,7 @@ __all__ = [
     "Smile",
     "TrustBadge",
     "TrustCheck",
+    "estimate_information",
     "get_estimator_class",
     "information_interval",
     "own_sample_bound",
