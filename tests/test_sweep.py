@@ -244,6 +244,17 @@ def test_steps_without_living_episodes_know_nothing():
     assert information_bounds(batch) == information_bounds(InformationBatch(*(v[:1] for v in batch[:4])))
 
 
+def test_steps_with_few_living_episodes_know_as_much_as_the_last_with_enough():
+    x = th.randn(2, 500, 3)
+    alive = th.ones(2, 500, dtype=th.bool)
+    alive[1, 4:] = False  # 3 TRVs take 5 episodes
+    batch = InformationBatch(x, x, x, th.ones_like(x), alive)
+    first = information_bounds(InformationBatch(*(v[:1] for v in batch[:4])))
+    assert information_bounds(batch) == pytest.approx((2 * first.upper, 2 * first.lower))
+    with pytest.raises(ValueError, match="3 TRVs cannot be estimated from 4 episodes: it takes at least 5"):
+        information_bounds(InformationBatch(*(v[:, :4] for v in batch[:4])))
+
+
 def test_rollouts_for_the_information_are_those_of_the_policy():
     model = tiny_tdpg(n_episodes=400)
     model.learn(model.n_episodes * model.horizon)

@@ -184,15 +184,27 @@ def rollout_information(model: Any, scenario: Scenario, n_episodes: int = 1000, 
 
 def information_bounds(batch: InformationBatch) -> InformationBounds:
     """
-    Bound the information of a batch, summed over time; a step with too few living episodes counts as 0.
+    Bound the information of a batch, summed over time.
+
+    A step at which too few episodes live on for an estimate counts as much as the last one with enough: counted as
+    nothing, it would make policies with many TRVs, which need more episodes, look as if they knew less.
 
     :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
+    :raises ValueError: if there are too few episodes from the start.
     """
-    log_det = LogDet(1, batch.states.shape[2], batch.trvs.shape[2])
-    upper = lower = 0.0
+    n_episodes, trv_dim = batch.trvs.shape[1:]
+    if n_episodes < trv_dim + 2:
+        raise ValueError(
+            f"the information of {trv_dim} TRVs cannot be estimated from {n_episodes} episodes: it takes at least "
+            f"{trv_dim + 2}"
+        )
+    log_det = LogDet(1, batch.states.shape[2], trv_dim)
+    at_step = InformationBounds(0.0, 0.0)
+    total = np.zeros(2)
     for t in range(len(batch.trvs)):
         at_t = batch.at(t)
-        if at_t.trvs.shape[1] >= batch.trvs.shape[2] + 2:
-            upper += log_det(at_t).item()
-            lower += own_sample_bound(at_t).item()
-    return InformationBounds(upper, lower)
+        if at_t.trvs.shape[1] >= trv_dim + 2:
+            at_step = InformationBounds(log_det(at_t).item(), own_sample_bound(at_t).item())
+        if at_t.trvs.shape[1] > 0:
+            total += at_step
+    return InformationBounds(*total.tolist())
