@@ -188,9 +188,18 @@ def _check_dictionaries(arguments: Sequence[str]) -> None:
                 ) from e
 
 
-def _flags(program: str, arguments: Sequence[str]) -> contextlib.AbstractContextManager[None]:
-    """Let a program that reads ``sys.argv`` find these flags there."""
-    return _replaced(sys, "argv", [f"sb3-tdpg {program}", *arguments])
+@contextlib.contextmanager
+def _flags(program: str, arguments: Sequence[str]) -> Iterator[None]:
+    """Let a program that reads ``sys.argv`` find these flags there, and tell in one line which it does not know."""
+
+    def refuse(parser: argparse.ArgumentParser, message: str) -> None:
+        raise ValueError(f"{message} (sb3-tdpg {program} --help lists all flags)")
+
+    with (
+        _replaced(sys, "argv", [f"sb3-tdpg {program}", *arguments]),
+        _replaced(argparse.ArgumentParser, "error", refuse),
+    ):
+        yield
 
 
 @contextlib.contextmanager
