@@ -33,7 +33,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
     """
     Draw how often each model incurs which cost, as in the paper's Fig. 3: one panel for each scenario.
 
-    :param records: From :func:`~sb3_tdpg.evaluation.records.evaluate_scenarios`.
+    :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
     :param scenarios: The panels from left to right.
     :param n_bins: Bins, the same in all panels. They are equal on a logarithmic axis, since costs range over two
         decades, unless a cost is zero or negative.
