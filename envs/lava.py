@@ -41,8 +41,8 @@ class LavaEnv(POMDPEnv):
     :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
     :param horizon: Number of controls T.
     :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, SB3 needs
-        bounds: a large
-        one, since the cost does not depend on how far beyond its bound an action lies and gives no gradient there.
+        bounds: a large one, since the cost does not depend on how far beyond its bound an action lies and gives no
+        gradient there.
     :param render_mode: ``None`` or ``"rgb_array"``.
     """
 

@@ -229,7 +229,7 @@ class PandaGraspEnv(POMDPEnv):
 
     def film(self) -> Iterator[np.ndarray]:
         """
-        Draw the last grasp from beginning to end, 30 pictures for each second of it; see :meth:`render`.
+        Draw the last grasp from beginning to end, 30 pictures for each second of it; see ``render``.
 
         The depth image beside it stays the one that the grasp was chosen by.
 

@@ -13,10 +13,7 @@ from .textures import TEST_TEXTURES
 LAVA_TABLE_READING: Mapping[str, Any] = MappingProxyType(
     dict(action_cost=1.0, lava_stage_cost=3.0, lava_terminal_cost=300.0)
 )
-"""
-Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv` that fit the numbers of Table I better than the paper's text
-does.
-"""
+"""Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv` that fit the numbers of Table I better than the paper's text."""
 
 
 BALL_PUBLISHED_READING: Mapping[str, Any] = MappingProxyType(dict(control_gain=0.1, gravity=9.8, horizon=24))

@@ -175,7 +175,7 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
     """
     Turn a name, a path or an array into a texture.
 
-    :param texture: A built-in name (``"brick"`` or one of :data:`TEST_TEXTURES`), ``"random-<seed>"`` for
+    :param texture: A built-in name (``"brick"`` or one of ``TEST_TEXTURES``), ``"random-<seed>"`` for
         :func:`random_texture`, ``"<percent>%-<name>"`` for one of these laid over the brick with this opacity
         (``"40%-violet_dots"``), the path of an image file, or an array ``(H, W, 3)`` uint8.
     :return: ``(H, W, 3)`` uint8

@@ -50,9 +50,8 @@ def value_advantages(
     each step.
 
     With ``gae_lambda=1`` this is the cost to come less its regression on the state. The true state is known in training
-    only, and only the baseline sees it: the gradient stays unbiased, since x_t precedes the noise of step t. Each
-    half of
-    the episodes is predicted from the other half, so that no episode's own cost enters its baseline. A smaller
+    only, and only the baseline sees it: the gradient stays unbiased, since x_t precedes the noise of step t. Each half
+    of the episodes is predicted from the other half, so that no episode's own cost enters its baseline. A smaller
     ``gae_lambda`` replaces later costs by V, which removes their noise; V knows nothing of the policy's memory, so that
     what the TRVs carry from step to step is then credited less than it should be.
 

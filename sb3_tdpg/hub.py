@@ -59,7 +59,7 @@ def write_model_card(
     :param out: The folder; it must not exist, or be empty.
     :param repo_id: Where it will be: ``organization/name``.
     :param film_episodes: Episodes to show in ``replay.mp4``, which the Hub plays beside the card; 0: no film.
-    :param evaluation: For a folder of rl-zoo3, see :func:`~sb3_tdpg.publication.read_zoo_folder`.
+    :param evaluation: For a folder of rl-zoo3, see ``sb3_tdpg.publication.read_zoo_folder``.
     :return: ``out``
     :raises ValueError: if ``out`` holds something, the source is not finished, or the records are not those of one
         policy, with two or more episodes of each scenario.

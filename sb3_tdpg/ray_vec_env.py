@@ -43,7 +43,7 @@ class RayVecEnv(VecEnv):
     which a warning tells. The new actor makes its environments anew, and each repeats its unfinished episode from the
     ``np_random`` at its beginning, with the attributes set so far and the same actions. So come the numbers that would
     have come without the loss, provided that an episode depends on nothing else. Rewards and last observations are
-    compared; if they differ, or if :meth:`env_method` may have changed the environments, the death is reported after
+    compared; if they differ, or if ``env_method`` may have changed the environments, the death is reported after
     all. (Ray's own restart would make new episodes pass for the old ones.)
 
     :param env_fns: Each makes an environment.

@@ -33,7 +33,7 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
 
     :param config: The file. The policy that the run started from, if from any, must lie beside it:
         ``<name of that run>/model.zip``.
-    :param out: Folder of the new run, see :func:`~sb3_tdpg.runs.complete_run`.
+    :param out: Folder of the new run, see ``sb3_tdpg.runs.complete_run``.
     :param progress_bar: Show progress bars.
     :return: ``out``
     :raises ValueError: if the file does not describe a run, or the policy to start from is another one.

@@ -107,8 +107,8 @@ def complete_run(
 
     ``folder`` then holds ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information;
     missing if no epoch met the limits), ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings,
-    seeds, versions, commit) and,
-    written last, ``episodes.csv`` (a row for each evaluation episode). Attempts in vain stay as ``attempt<i>/``.
+    seeds, versions, commit) and, written last, ``episodes.csv`` (a row for each evaluation episode). Attempts in vain
+    stay as ``attempt<i>/``.
 
     :param run: What to train.
     :param folder: Where to.

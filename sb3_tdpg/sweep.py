@@ -62,7 +62,7 @@ def sweep(
         with which the environment is registered.
     :param out: Folder for ``summary.md``, ``runs.csv``, ``sweep.png``, ``selected.zip``, ``selected.json``,
         ``config.json`` and ``runs/``; default: ``results/sweep-<block>``.
-    :param storage: Shared by all workers, see :func:`~sb3_tdpg.storages.open_storage`; default: none, and this machine
+    :param storage: Shared by all workers, see :func:`~sb3_tdpg.studies.open_storage`; default: none, and this machine
         works alone.
     :param study_name: Name of the study in the storage; default: ``sweep-<block>``.
     :param jobs: Runs at a time on this machine; default: the number of cores, with a storage 1.

@@ -72,7 +72,7 @@ class TDPG(OnPolicyAlgorithm):
     environment without it is taken as fully observed if its observation is a vector.
 
     Where a default has two values below, the first is for vector observations and the second for images; depth images
-    (of floats) differ in a few more (:mod:`sb3_tdpg.defaults`).
+    (of floats) differ in a few more (``sb3_tdpg.defaults``).
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.policies.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``. An id is vectorised with ``n_envs``.
@@ -634,8 +634,7 @@ class TDPG(OnPolicyAlgorithm):
         Save the model with all random number generators, between two epochs.
 
         The environments are reset, here and after loading, so that their generators are all there is to know of
-        them. See
-        :class:`~sb3_tdpg.callbacks.TrainingCheckpointCallback`.
+        them. See :class:`~sb3_tdpg.callbacks.TrainingCheckpointCallback`.
         """
         assert self.env is not None
         self._last_obs = None

@@ -36,7 +36,7 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
 
     :param env_id: A registered id.
     :param block: The settings, as :func:`sb3_tdpg.hyperparams.load_hyperparams` gives them.
-    :param overrides: Settings that replace those of the block, or arguments of :class:`TDPG` beside them.
+    :param overrides: Settings that replace those of the block, or arguments of :class:`~sb3_tdpg.TDPG` beside them.
     """
     settings = {**block, **overrides}
     n_timesteps = int(settings.pop("n_timesteps"))

@@ -1,14 +1,19 @@
-"""The Python of the README and of the documentation runs, page by page."""
+"""
+The Python of the README, of the documentation and of its notebooks runs; what the map of the paper names is there.
+"""
 
+import importlib
+import json
 import re
 import warnings
 from pathlib import Path
 
 import gymnasium as gym
+import matplotlib
 import pytest
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.information import CriticEstimator
+from sb3_tdpg.information import ESTIMATORS, CriticEstimator
 from sb3_tdpg.robustness import PERTURBATIONS
 
 ROOT = Path(__file__).parents[1]
@@ -16,6 +21,17 @@ PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if
 
 # A block after <!-- no-run --> is not run; what stands in an indented or quoted block is not one.
 BLOCK = re.compile(r"^(?P<skip><!-- no-run -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+PAPER_MAP = ROOT / "docs" / "paper_map.md"
+
+# Every label of the paper's LaTeX source that is not one of a plain section.
+PAPER_LABELS = {
+    "eq:pomdp", "eq:mi", "eq:robust pomdp", "thm:robustness", "eq:entropic risk", "eq:KL condition", "eq:cost bound",
+    "eq:dv", "eq:kl mine", "eq:grad mine", "alg:mine", "eq:grad psi", "eq:grad phi", "eq:mine theta fixed", "eq:lg",
+    "alg:trv-policy", "ssec:lava", "fig:lava", "fig:lava results", "tab:lava", "ssec:ball", "fig:anchor",
+    "fig:textures", "tab:ball catching", "ssec:grasping", "fig:grasping", "tab:grasping",
+}  # fmt: skip
 
 MAX_EPOCHS = 2
 
@@ -49,26 +65,33 @@ def brief_training(monkeypatch):
 
 @pytest.fixture
 def registry(monkeypatch):
-    """Forget the environments and the perturbations that a page registers."""
+    """Forget the environments, the perturbations and the estimators that a page registers."""
     monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
-    perturbations = dict(PERTURBATIONS)
+    before = [(table, dict(table)) for table in (PERTURBATIONS, ESTIMATORS)]
     yield
-    PERTURBATIONS.clear()
-    PERTURBATIONS.update(perturbations)
+    for table, entries in before:
+        table.clear()
+        table.update(entries)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if any(python_blocks(p))], ids=name_of)
-def test_the_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch, brief_training, registry):
-    monkeypatch.chdir(tmp_path)
+def run_in_order(blocks, source):
+    """Run blocks of code, given with their first line, as one program that must not warn; return what they define."""
     namespace = {"__name__": "__main__"}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what a page shows must not warn
         # Not of the page's making: tqdm.rich, which SB3's progress bar uses, calls itself experimental.
         warnings.filterwarnings("ignore", message="rich is experimental")
         warnings.filterwarnings("ignore", module=r"torch\.")
-        for line, code in python_blocks(page):
+        for line, code in blocks:
             # Blank lines in front, so that a traceback shows the line of the page.
-            exec(compile("\n" * (line - 1) + code, str(page), "exec"), namespace)
+            exec(compile("\n" * (line - 1) + code, str(source), "exec"), namespace)
+    return namespace
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if any(python_blocks(p))], ids=name_of)
+def test_the_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch, brief_training, registry):
+    monkeypatch.chdir(tmp_path)
+    run_in_order(python_blocks(page), page)
 
 
 def test_the_block_pattern_finds_what_the_pages_have():
@@ -82,3 +105,98 @@ def test_links_between_pages_point_to_files(page):
     links = re.findall(r"\]\(([^)#:\s]+\.md)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if not (page.parent / link).is_file()]
     assert not missing
+
+
+# -- notebooks -------------------------------------------------------------------------------------------------
+
+
+def code_cells(notebook):
+    """Code of each cell, in order; a notebook is JSON, and its code plain Python."""
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            yield 1, "".join(cell["source"])
+
+
+@pytest.fixture
+def no_window(monkeypatch):
+    """Draw figures into memory."""
+    backend = matplotlib.get_backend()
+    matplotlib.use("Agg")
+    yield
+    matplotlib.pyplot.close("all")
+    matplotlib.use(backend)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=name_of)
+def test_a_notebook_runs_from_top_to_bottom(notebook, tmp_path, monkeypatch, brief_training, no_window):
+    monkeypatch.chdir(tmp_path)
+    run_in_order(code_cells(notebook), notebook)
+
+
+@pytest.mark.slow
+def test_the_quickstart_notebook_shows_what_it_says(tmp_path, monkeypatch, no_window):
+    monkeypatch.chdir(tmp_path)
+    table = run_in_order(code_cells(ROOT / "docs" / "notebooks" / "quickstart.ipynb"), "quickstart.ipynb")["table"]
+    ratio = table[table["scenario"] == "Sensor noise 1e0"].set_index("model")["ratio"]
+    assert ratio["TDPG"] < 1.05
+    assert ratio["policy gradient"] > 5
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=name_of)
+def test_a_notebook_is_kept_without_outputs(notebook):
+    content = json.loads(notebook.read_text(encoding="utf-8"))
+    assert (content["nbformat"], len(content["cells"]) > 5) == (4, True)
+    for cell in content["cells"]:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == [] and cell["execution_count"] is None
+
+
+# -- the map of the paper --------------------------------------------------------------------------------------
+
+
+def test_the_map_of_the_paper_names_every_label_and_no_other():
+    text = PAPER_MAP.read_text(encoding="utf-8")
+    assert set(re.findall(r"`((?:eq|thm|alg|tab|fig|ssec):[^`]+)`", text)) == PAPER_LABELS
+    before_the_errata = text[: text.index("## What the paper prints otherwise")]
+    missing = {label for label in PAPER_LABELS if f"`{label}`" not in before_the_errata}
+    assert not missing
+
+
+def test_every_function_in_the_map_of_the_paper_can_be_imported():
+    roles = re.findall(r"\{(func|class|meth|data)\}`(?:[^`<]*<)?~?([\w.]+)>?`", PAPER_MAP.read_text(encoding="utf-8"))
+    assert len(roles) > 40
+    for kind, target in roles:
+        names = target.split(".")
+        depth = 2 if kind == "meth" else 1
+        found = importlib.import_module(".".join(names[:-depth]))
+        for name in names[-depth:]:
+            found = getattr(found, name)
+
+
+def test_every_test_in_the_map_of_the_paper_is_there():
+    named = re.findall(r"`(test_\w+\.py)::(test_\w+)`", PAPER_MAP.read_text(encoding="utf-8"))
+    assert len(named) > 60
+    missing = [
+        f"{file}::{name}"
+        for file, name in named
+        if f"\ndef {name}(" not in (ROOT / "tests" / file).read_text(encoding="utf-8")
+    ]
+    assert not missing
+
+
+def test_every_row_of_the_map_of_the_paper_names_a_test():
+    before_the_deviations = PAPER_MAP.read_text(encoding="utf-8").partition("## Where this implementation deviates")[0]
+    rows = [line for line in before_the_deviations.splitlines() if line.startswith("| ") and "| tests |" not in line]
+    without = [row for row in rows if "::test_" not in row]
+    assert len(rows) > 30 and not without
+
+
+def test_a_label_of_the_paper_that_the_code_cites_is_in_the_map():
+    sources = [path for folder in ("sb3_tdpg", "envs") for path in sorted((ROOT / folder).rglob("*.py"))]
+    cited = [
+        text[match.start() :]
+        for text in (path.read_text(encoding="utf-8") for path in sources)
+        for match in re.finditer(r"\b(eq|thm|alg|tab|fig):(?=[a-zA-Z])", text)
+    ]
+    unknown = [rest.splitlines()[0] for rest in cited if not any(rest.startswith(label) for label in PAPER_LABELS)]
+    assert len(cited) > 15 and not unknown

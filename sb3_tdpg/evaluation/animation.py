@@ -91,7 +91,7 @@ def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *,
     :param path: ``.gif`` or ``.mp4``. Folders are made, and at no time a half-written file is there.
     :param horizon: Controls in an episode T.
     :param fps: Frames a second. A GIF counts in hundredths of a second.
-    :raises ValueError: see :func:`check_animation_path`.
+    :raises ValueError: if the film cannot be written there, see ``check_animation_path``.
     """
     check_animation_path(path)
     path = Path(path)

@@ -33,7 +33,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
     """
     Draw how often each model incurs which cost, as in the paper's Fig. 3: one panel for each scenario.
 
-    :param records: From :func:`~sb3_tdpg.evaluation.records.evaluate_scenarios`.
+    :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
     :param scenarios: The panels from left to right.
     :param n_bins: Bins, the same in all panels. They are equal on a logarithmic axis, since costs range over two
         decades, unless a cost is zero or negative.
@@ -139,7 +139,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     """
     Draw the interval that holds I[x_t; x~_t] over the time steps, with the bounds that its limits come from.
 
-    :param frame: From :func:`~sb3_tdpg.evaluation.information.interval_frame`.
+    :param frame: From :func:`~sb3_tdpg.evaluation.interval_frame`.
     """
     figure = _new_figure(WIDTH * 0.75, 3.4)
     axes = figure.add_subplot()
@@ -171,7 +171,7 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
 
     Grey where a component is constant. A value in brackets is not distinguishable from nothing.
 
-    :param frame: From :func:`~sb3_tdpg.evaluation.knowledge.state_knowledge`.
+    :param frame: From :func:`~sb3_tdpg.evaluation.state_knowledge`.
     :param quantity: What the colour shows.
     :raises ValueError: if the frame has no component.
     """

@@ -262,7 +262,7 @@ class TrainingEpisodes:
 
         :param shift: Of sensor and start.
         :param n_episodes: Use the first of the recorded episodes; default: all.
-        :return: for each cap of :data:`EXCEEDANCE_LEVELS`; all hold at once
+        :return: for each cap of ``EXCEEDANCE_LEVELS``; all hold at once
         """
         divergences = self.divergences(shift, n_episodes)
         share = None if self.confidence is None else 1 - (1 - self.confidence) / (2 * len(divergences))

@@ -15,7 +15,7 @@ def summary_table(records: pd.DataFrame, by: Sequence[str] = ("model", "scenario
     """
     Summarise the cost over the episodes of each model in each scenario.
 
-    :param records: What :func:`~sb3_tdpg.evaluation.records.evaluate_scenarios` returned.
+    :param records: What :func:`~sb3_tdpg.evaluation.evaluate_scenarios` returned.
     :param by: The columns that tell the rows apart. A column ``train_seed`` is put in front by itself.
     :return: the columns of ``by`` and ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem`` (standard error of the
         mean), ``median``; ``failure_share`` if the records tell of failures; ``seed`` and ``deterministic``

@@ -39,7 +39,7 @@ class InformationInterval:
     """
     Where I[x_t; x~_t] lies at every time step, in nats.
 
-    NaN where too few episodes are alive: see :func:`min_episodes`.
+    NaN where too few episodes are alive: see ``min_episodes``.
     """
 
     lower: np.ndarray

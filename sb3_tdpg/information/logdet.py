@@ -16,9 +16,8 @@ class LogDet(InformationEstimator):
         \le \tfrac12 \log\det \mathrm{Cov}(\tilde x_t) - E[\textstyle\sum_i \log \sigma_i(e_t)].
 
     The first step is the data-processing inequality: x_t tells no more of x~_t than the encoder's input does.
-    Exact when
-    x~_t is Gaussian, loose when it has several modes. The covariance is taken by the law of total covariance,
-    ``Cov(mean) + E[diag(std^2)]``: without the sampling noise of the TRVs, and never negative.
+    Exact when x~_t is Gaussian, loose when it has several modes. The covariance is taken by the law of total
+    covariance, ``Cov(mean) + E[diag(std^2)]``: without the sampling noise of the TRVs, and never negative.
     """
 
     bound = "upper"

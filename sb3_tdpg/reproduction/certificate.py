@@ -60,7 +60,7 @@ def certify_lava(
     :param n_episodes: Recorded training episodes.
     :param n_test_episodes: Episodes in each random shift; ten times as many in each of the paper's.
     :param confidence: Of each certificate.
-    :param cost_bound: Certify the cost clipped there; default: :func:`wall_cost`.
+    :param cost_bound: Certify the cost clipped there; default: ``wall_cost``.
     :param seed: Of the episodes and of the shifts.
     :return: the summary, as Markdown
     """
