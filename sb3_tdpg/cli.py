@@ -105,6 +105,17 @@ def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: P
     print(f"\n{certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)}\n\nresults are in {out}")
 
 
+def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:
+    from sb3_tdpg.enjoy import parse_keywords
+    from sb3_tdpg.report import parse_models, robustness_report
+    from sb3_tdpg.vec_env import usable_cores
+
+    out = out or Path("results", f"report-{env.rpartition(':')[2]}")
+    options["jobs"] = options["jobs"] or usable_cores()
+    robustness_report(parse_models(models, env), env, env_kwargs=parse_keywords(env_kwargs), out=out, **options)
+    print(f"the page is {out / 'report.html'}, and {out / 'report.md'} in Markdown")
+
+
 def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_episodes: int) -> None:
     from sb3_tdpg.hub import push_to_hub, write_model_card
 
@@ -147,6 +158,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "enjoy": _enjoy,
     "sweep": _sweep,
     "certify": _certify,
+    "report": _report,
     "push": _push,
     "pull": _pull,
 }
@@ -201,6 +213,7 @@ def _make_parser() -> argparse.ArgumentParser:
     enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4")
     _add_sweep(commands)
     _add_certify(commands)
+    _add_report(commands)
     _add_hub(commands)
     return parser
 
@@ -252,6 +265,32 @@ def _add_certify(commands: Any) -> None:
     )
     certify.add_argument("--seed", type=int, default=0)
     certify.add_argument("--out", type=Path, default=Path("results/certificate"), help="folder for the results")
+
+
+def _add_report(commands: Any) -> None:
+    report = commands.add_parser(
+        "report", help="run models under every perturbation, and write a page on which method is more robust, and where"
+    )
+    report.add_argument(
+        "models", nargs="+", metavar="[LABEL=]MODEL",
+        help="files that model.save() wrote, or patterns: 'PG=runs/pg-seed*/model.zip'; without a label a method is "
+        "called as its file or folder, less the seed. The others are compared with the first",
+    )  # fmt: skip
+    report.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
+    report.add_argument(
+        "--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        help="keywords of the environment, the values in YAML",
+    )  # fmt: skip
+    report.add_argument("--perturbations", nargs="+", default=None, metavar="NAME", help="default: all that apply")
+    report.add_argument("--severities", nargs="+", type=int, default=(1, 2, 3, 4, 5), metavar="N", help="1 to 5")
+    report.add_argument(
+        "--episodes", dest="n_episodes", type=_positive, default=None,
+        help="of each model in each row (default: 100 with images, 500 with vectors)",
+    )  # fmt: skip
+    report.add_argument("--seed", type=int, default=0)
+    report.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
+    report.add_argument("--out", type=Path, default=None, help="folder for the report (default: results/report-<env>)")
+    report.add_argument("--jobs", type=_positive, default=None, help="processes (default: the number of cores)")
 
 
 def _add_hub(commands: Any) -> None:

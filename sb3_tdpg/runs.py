@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import multiprocessing as mp
 import shutil
@@ -25,7 +24,7 @@ from tqdm import tqdm
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios, write_frame_atomically, write_run_config
-from sb3_tdpg.evaluation.provenance import jsonable
+from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
@@ -146,7 +145,7 @@ def _begin(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episode
     if run.start is not None and not (run.start / "model.zip").exists():
         raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
     config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
-    _check_same_run(folder / "config.json", config)
+    check_same_config(folder / "config.json", config, "run")
     if (folder / "episodes.csv").exists():
         return False
     folder.mkdir(parents=True, exist_ok=True)
@@ -158,19 +157,6 @@ def _begin(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episode
 def _digest(path: Path) -> str:
     """A name for the content of a file, if there is one."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.exists() else "not trained yet"
-
-
-def _check_same_run(path: Path, config: Mapping[str, Any]) -> None:
-    if not path.exists():
-        return
-    found = json.loads(path.read_text())
-    found.pop("provenance")
-    wanted = jsonable(config)
-    changed = sorted(key for key in found if found[key] != wanted.get(key))
-    if changed:
-        raise ValueError(
-            f"{path.parent} holds a run with another {', '.join(changed)}: choose another folder or remove it"
-        )
 
 
 def _train(run: Run, attempt: int, folder: Path, progress_bar: bool) -> tuple[TDPG, bool]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gymnasium import spaces
@@ -15,7 +15,14 @@ from sb3_tdpg.problem import read_problem
 from sb3_tdpg.vec_env import make_episodes_env
 
 
-def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int | None = None) -> VecEnv:
+def scenario_env(
+    scenario: Scenario,
+    model: Any,
+    *,
+    n_episodes: int,
+    n_envs: int | None = None,
+    sensor: Callable[[VecEnv], VecEnv] | None = None,
+) -> VecEnv:
     """
     Make a fresh environment of a scenario, wrapped as the model needs it.
 
@@ -24,10 +31,13 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
         the same statistics, frozen.
     :param n_episodes: Episodes that are to be run at a time.
     :param n_envs: Number of environments; default: see :func:`~sb3_tdpg.vec_env.make_episodes_env`.
+    :param sensor: Wraps the environment inside the model's own wrappers: perturbs what is observed, say.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
     )
+    if sensor is not None:
+        env = sensor(env)
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
         normalize = copy.copy(normalize)  # its copy comes without an environment

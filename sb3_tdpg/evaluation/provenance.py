@@ -60,6 +60,26 @@ def write_run_config(path: str | os.PathLike[str], config: Mapping[str, Any]) ->
     write_atomically(_with_folder(path), json.dumps(content, indent=2) + "\n")
 
 
+def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
+    """
+    Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
+
+    :param path: The file; if there is none, all is well.
+    :param config: What it must hold.
+    :param what: What lies in its folder, for the message.
+    """
+    if not path.exists():
+        return
+    found = json.loads(path.read_text())
+    found.pop("provenance")
+    wanted = jsonable(config)
+    changed = sorted(key for key in found if found[key] != wanted.get(key))
+    if changed:
+        raise ValueError(
+            f"{path.parent} holds a {what} with another {', '.join(changed)}: choose another folder or remove it"
+        )
+
+
 def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) -> None:
     """
     Write a frame as CSV without its index, so that at no time a half-written file is there.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from sb3_tdpg.envs.scenarios import Scenario
@@ -70,7 +71,9 @@ def evaluate_scenarios(
         for label, each in models.items():
             for scenario in rows:
                 progress.set_description(f"{label}, {scenario.name}")
-                frame = _evaluate(each, scenario, n_episodes, seed, deterministic, progress)
+                frame = run_episodes(
+                    each, scenario, n_episodes, seed=seed, deterministic=deterministic, at_end=progress.update
+                )
                 frames.append(frame.assign(model=label, scenario=scenario.name, env_id=scenario.env_id))
     records = pd.concat(frames, ignore_index=True)
     records = records.assign(**labels, seed=seed, deterministic=deterministic)
@@ -78,10 +81,28 @@ def evaluate_scenarios(
     return records[[*labels, *COLUMNS[:6], *final, *COLUMNS[6:]]]
 
 
-def _evaluate(
-    model: Any, scenario: Scenario, n_episodes: int, seed: int, deterministic: bool, progress: Any
+def run_episodes(
+    model: Any,
+    scenario: Scenario,
+    n_episodes: int,
+    *,
+    seed: int,
+    deterministic: bool = False,
+    sensor: Callable[[VecEnv], VecEnv] | None = None,
+    at_end: Callable[[], Any] | None = None,
 ) -> pd.DataFrame:
-    """Run one model in one scenario."""
+    """
+    Run one model in one scenario that it fits, see :func:`evaluate_scenarios`.
+
+    :param model: An SB3 model.
+    :param scenario: Where.
+    :param n_episodes: How many.
+    :param seed: Of the environments and of the policy's sampling.
+    :param deterministic: Act without noise.
+    :param sensor: Wraps the environments inside the model's own wrappers.
+    :param at_end: Called at the end of each episode.
+    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``
+    """
     final_infos: list[dict[str, float]] = []
 
     def at_step(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
@@ -89,10 +110,11 @@ def _evaluate(
         info = local_variables["info"]
         if local_variables["done"] and ("episode" in info or not local_variables["is_monitor_wrapped"]):
             final_infos.append(_final_columns(info))
-            progress.update()
+            if at_end is not None:
+                at_end()
 
     seeds = evaluation_seeds(seed)
-    env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES))
+    env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES), sensor=sensor)
     try:
         with isolated_randomness(seeds.policy, model):
             env.seed(seeds.env)

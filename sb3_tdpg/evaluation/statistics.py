@@ -138,10 +138,65 @@ def paired_difference(
     return float(value), float(low), float(high)
 
 
+def interquartile_means(
+    scores: np.ndarray, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Return the interquartile mean over seeds of each of many rows, as :func:`aggregate_seeds` does, but all at once.
+
+    :param scores: ``(seeds, rows)``
+    :param level: Coverage of the intervals; each row is resampled by itself.
+    :param n_bootstrap: Resamples.
+    :param seed: Seed of the resampling.
+    :return: the means and the ends of their intervals, each ``(rows,)``
+    """
+    rliable, _ = _import_rliable()
+    cut = len(scores) // 4
+
+    def means(x: np.ndarray) -> np.ndarray:  # scipy.stats.trim_mean, at a tenth of the time
+        return np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0)
+
+    points, (low, high) = _intervals(rliable, scores, means, level, n_bootstrap, seed)
+    return points, low, high
+
+
+def probabilities_of_improvement(
+    costs: np.ndarray, of_control: np.ndarray, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Return how likely a seed has a lower cost than a seed of the control, row by row; ties count half.
+
+    It is what :func:`probability_of_improvement` tells, of many rows at once.
+
+    :param costs: ``(seeds, rows)``
+    :param of_control: ``(seeds of the control, rows)``
+    :param level: Coverage of the intervals; each row is resampled by itself.
+    :param n_bootstrap: Resamples.
+    :param seed: Seed of the resampling.
+    :return: the probabilities and the ends of their intervals, each ``(rows,)``
+    """
+    rliable, _ = _import_rliable()
+
+    def share(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = x[:, None], y[None]
+        return ((x < y) + 0.5 * (x == y)).mean(axis=(0, 1))
+
+    points, (low, high) = _intervals(rliable, (costs, of_control), share, level, n_bootstrap, seed)
+    return points, low, high
+
+
 def _interval(
     rliable: Any, scores: Any, statistic: Callable[..., np.ndarray], level: float, n_bootstrap: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Point estimate and percentile interval of a statistic under resampled seeds."""
+    """Point estimate and percentile interval of a statistic of one number under resampled seeds."""
+    points, intervals = _intervals(rliable, scores, statistic, level, n_bootstrap, seed)
+    return points, intervals[:, 0]
+
+
+def _intervals(
+    rliable: Any, scores: Any, statistic: Callable[..., np.ndarray], level: float, n_bootstrap: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Point estimates ``(k,)`` and percentile intervals ``(2, k)`` of a statistic under resampled seeds."""
     # rliable draws from NumPy's global generator, whatever random_state it is given.
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
@@ -151,7 +206,7 @@ def _interval(
         )
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    return points["scores"], intervals["scores"][:, 0]
+    return points["scores"], intervals["scores"]
 
 
 def _import_rliable() -> tuple[Any, Any]:

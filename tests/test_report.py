@@ -1,0 +1,303 @@
+"""The robustness report: its page, its numbers, what is kept, and what is refused."""
+
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import mannwhitneyu, trim_mean
+from small_problems import tiny_tdpg
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_tdpg.cli import main
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.report import load_model, parse_models, robustness_report
+from sb3_tdpg.report.html import to_html
+from sb3_tdpg.report.models import label_of
+from sb3_tdpg.report.numbers import ALL, make_numbers
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("rliable")
+pytest.importorskip("markdown_it")
+
+N_EPISODES = 12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two methods of three models each, named as a reproduction names them."""
+    folder = tmp_path_factory.mktemp("runs")
+    for method, offset in (("pg", 0), ("tdpg", 10)):
+        for seed in range(3):
+            tiny_tdpg(seed=seed + offset).save(folder / f"{method}-seed{seed}" / "model.zip")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(folder, tmp_path_factory):
+    """Arguments of the command, and the folder of a report of two perturbations."""
+    out = tmp_path_factory.mktemp("report") / "lava"
+    arguments = ["report", f"PG={folder}/pg-seed*/model.zip", f"{folder}/tdpg-seed*/model.zip", "--env", "Lava-v0"]
+    arguments += ["--perturbations", "vector_noise", "vector_delay", "--severities", "2", "5"]
+    arguments += ["--episodes", str(N_EPISODES), "--jobs", "1", "--out", str(out)]
+    assert main(arguments) == 0
+    return arguments, out
+
+
+def test_the_page_and_its_files(report):
+    _, out = report
+    page = (out / "report.md").read_text()
+    for words in ("3 models of **PG** and 3 models of **tdpg**", "## In short", "**tdpg against PG**", "vector_delay"):
+        assert words in page
+    for words in ("about the state", "shuffled pairs", "Sensor noise 1e0", "pg-seed2/model.zip", "Made by `"):
+        assert words in page
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", page)
+    assert {"figures/degradation.png", "figures/examples.png", "figures/comparison.png"} < set(pictures)
+    assert all((out / picture).stat().st_size > 1000 for picture in pictures)
+    assert not list(out.rglob("*.partial"))
+
+
+def test_the_html_needs_no_other_file(report):
+    _, out = report
+    html = (out / "report.html").read_text()
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", (out / "report.md").read_text())
+    sources = re.findall(r'src="(.{22})', html)
+    assert len(sources) == len(pictures)
+    assert set(sources) == {"data:image/png;base64,"}
+    assert not re.search(r"https?://|<script|<link|@import|url\(|file:", re.sub(r'src="[^"]*"', "", html))
+    assert html.count("<table>") == (out / "report.md").read_text().count("| --- |\n") + html.count("shuffled pairs")
+
+
+def test_what_is_html_in_a_name_is_shown_and_not_used(tmp_path):
+    assert "<b>" not in to_html("# A <b>bold</b> claim", tmp_path, "<b>")
+
+
+def test_the_numbers_are_those_of_the_records(report):
+    _, out = report
+    records = pd.read_csv(out / "episodes.csv.xz")
+    assert len(records) == 6 * N_EPISODES * (1 + 4 + 2 * 2)
+    means = records.groupby(["perturbation", "severity", "model", "train_seed"])["cost"].mean()
+    levels = pd.read_csv(out / "levels.csv").set_index(["model", "perturbation", "severity"])
+    assert len(levels) == 2 * 9
+    for (model, perturbation, severity), row in levels.iterrows():
+        of_seeds = means[perturbation, severity, model].to_numpy()
+        assert row["iqm"] == pytest.approx(trim_mean(of_seeds, 0.25))
+        assert of_seeds.min() - 1e-9 <= row["low"] <= row["iqm"] <= row["high"] <= of_seeds.max() + 1e-9
+
+    groups = pd.read_csv(out / "perturbations.csv").set_index(["model", "perturbation"])
+    comparisons = pd.read_csv(out / "comparisons.csv").set_index("perturbation")
+    plain, noisy = means["unperturbed", 0], means["vector_noise"].groupby(["model", "train_seed"]).mean()
+    assert groups.loc[("tdpg", "vector_noise"), "iqm"] == pytest.approx(trim_mean(noisy["tdpg"], 0.25))
+    added = noisy - plain
+    assert groups.loc[("PG", "vector_noise"), "added"] == pytest.approx(trim_mean(added["PG"], 0.25))
+    for column, values in (("p_cost", noisy), ("p_added", added)):
+        expected = mannwhitneyu(values["PG"], values["tdpg"]).statistic / 9
+        assert comparisons.loc["vector_noise", column] == pytest.approx(expected)
+    every = means.drop(index=[name for name in means.index.levels[0] if not name.startswith("vector")], level=0)
+    overall = every.groupby(["model", "train_seed"]).mean()
+    assert groups.loc[("PG", ALL), "iqm"] == pytest.approx(trim_mean(overall["PG"], 0.25))
+
+
+def test_the_table_shows_the_numbers(report):
+    _, out = report
+    levels = pd.read_csv(out / "levels.csv").set_index(["model", "perturbation", "severity"])
+    row = levels.loc[("tdpg", "vector_delay", 5)]
+    page = (out / "report.md").read_text()
+    assert f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}] |" in page.split("## Every severity")[1]
+
+
+def test_an_unperturbed_row_is_what_evaluate_scenarios_gives(report, folder):
+    _, out = report
+    records = pd.read_csv(out / "episodes.csv.xz").query("model == 'tdpg' and train_seed == 1")
+    model = load_model(folder / "tdpg-seed1" / "model.zip", "Lava-v0", {})
+    expected = evaluate_scenarios(model, [Scenario("Unperturbed", "Lava-v0")], N_EPISODES)
+    costs = records.loc[records["kind"] == "unperturbed", "cost"].to_numpy()
+    np.testing.assert_allclose(costs, expected["cost"])
+    for _, perturbed in records.query("perturbation == 'vector_noise'").groupby("severity"):
+        assert not np.allclose(costs, perturbed["cost"])
+
+
+def test_it_goes_on_where_it_stopped_and_gives_the_same(report, monkeypatch):
+    arguments, out = report
+    before = {name: (out / name).read_bytes() for name in ("episodes.csv.xz", "levels.csv", "comparisons.csv")}
+    kept, lost = sorted((out / "rows").iterdir())[:2]
+    lost.unlink()
+    when = kept.stat().st_mtime_ns
+    assert main(arguments) == 0
+    assert lost.exists()
+    assert kept.stat().st_mtime_ns == when
+    assert {name: (out / name).read_bytes() for name in before} == before
+
+
+def test_other_perturbations_may_be_asked_for_later(report):
+    arguments, out = report
+    n_rows = len(list((out / "rows").iterdir()))
+    index = arguments.index("--perturbations")
+    assert main([*arguments[: index + 1], "vector_bias", *arguments[index + 3 :]]) == 0
+    assert len(list((out / "rows").iterdir())) == n_rows + 2
+    assert "vector_bias" in (out / "report.md").read_text()
+    assert main(arguments) == 0  # for the other tests
+
+
+def test_processes_give_the_same_episodes(report, tmp_path):
+    arguments, out = report
+    arguments = [*arguments[: arguments.index("--jobs")], "--jobs", "2", "--out", str(tmp_path / "two")]
+    assert main(arguments) == 0
+    assert (tmp_path / "two" / "episodes.csv.xz").read_bytes() == (out / "episodes.csv.xz").read_bytes()
+
+
+def test_all_methods_meet_the_same_episodes(tmp_path):
+    model = tiny_tdpg()
+    robustness_report(
+        {"A": model, "B": [model]}, "Lava-v0", out=tmp_path, perturbations=["vector_bias"], n_episodes=30,
+        progress_bar=False,
+    )  # fmt: skip
+    records = pd.read_csv(tmp_path / "episodes.csv.xz").set_index(["model", "perturbation", "severity", "episode"])
+    pd.testing.assert_series_equal(records.loc["A"]["cost"], records.loc["B"]["cost"])
+
+
+def test_one_model_is_not_taken_for_a_method(tmp_path):
+    text = robustness_report(
+        {"A": tiny_tdpg(), "B": tiny_tdpg(seed=1)}, "Lava-v0", out=tmp_path, perturbations=["vector_noise"],
+        n_episodes=30, scenarios=(), progress_bar=False,
+    )  # fmt: skip
+    assert "about this model" in text
+    assert "give several" in text
+    assert "Which is more robust" not in text
+    levels = pd.read_csv(tmp_path / "levels.csv")
+    costs = pd.read_csv(tmp_path / "episodes.csv.xz").query("model == 'A' and severity == 3")["cost"]
+    row = levels.query("model == 'A' and severity == 3").iloc[0]
+    assert row["iqm"] == pytest.approx(costs.mean())
+    assert row["high"] - row["low"] == pytest.approx(2 * 1.96 * costs.sem(), rel=1e-3)
+
+
+def made_up(n_seeds, control=10.0, method=8.0):
+    """Records of two methods of which the second is cheaper, whatever the seed, and suffers more."""
+    rows = [
+        dict(model=m, train_seed=s, perturbation=p, severity=v, kind=k, episode=e, cost=c + v * slope + 0.1 * s)
+        for m, c, slope in (("A", control, 1.0), ("B", method, 1.2))
+        for s in range(n_seeds)
+        for p, v, k in (("unperturbed", 0, "unperturbed"), ("x", 1, "sensor"), ("x", 2, "sensor"))
+        for e in range(2)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_cheaper_and_more_robust_are_two_things():
+    (row,) = make_numbers(made_up(4), n_bootstrap=50).comparisons.query("perturbation == 'x'").to_dict("records")
+    assert (row["p_cost"], row["cost"]) == (1.0, "less")
+    assert (row["p_added"], row["added"]) == (0.0, "more")
+
+
+def test_nothing_is_clear_of_two_models():
+    comparisons = make_numbers(made_up(2), n_bootstrap=50).comparisons
+    assert (comparisons["p_cost"] == 1.0).all()
+    assert set(comparisons["cost"]) == set(comparisons["added"]) == {"undecided"}
+
+
+def test_models_are_grouped_by_label_or_folder(tmp_path):
+    for name in ("runs/pg-seed0/model.zip", "runs/pg-seed1/model.zip", "runs/b=2_seed3/model.zip", "c/ppo_s.zip"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    methods = parse_models([f"{tmp_path}/runs/*-seed*/model.zip", f"my x={tmp_path}/runs/b=2_seed3", f"{tmp_path}/c/*"])
+    assert {label: [str(p.relative_to(tmp_path)) for p in paths] for label, paths in methods.items()} == {
+        "pg": ["runs/pg-seed0/model.zip", "runs/pg-seed1/model.zip"],
+        "my x": ["runs/b=2_seed3/model.zip"],
+        "ppo_s": ["c/ppo_s.zip"],
+    }
+    assert list(parse_models([f"{tmp_path}/runs/b=2_seed3/model.zip"])) == ["b=2"]
+    assert label_of(tmp_path / "logs" / "ppo" / "Lava-v0_1" / "Lava-v0.zip", "Lava-v0") == "Lava-v0"
+    with pytest.raises(ValueError, match="given twice"):
+        parse_models([f"A={tmp_path}/c/ppo_s.zip", f"B={tmp_path}/c/ppo_s.zip"])
+
+
+def test_models_of_other_algorithms_are_recognised(tmp_path):
+    from sb3_contrib import TRPO, RecurrentPPO
+
+    for algorithm, policy in (
+        (PPO, "MlpPolicy"), (A2C, "MlpPolicy"), (TRPO, "MlpPolicy"), (RecurrentPPO, "MlpLstmPolicy")
+    ):  # fmt: skip
+        sizes = {} if algorithm is A2C else dict(batch_size=10)
+        algorithm(policy, "Lava-v0", n_steps=10, **sizes, seed=0, device="cpu").save(tmp_path / algorithm.__name__)
+        assert type(load_model(tmp_path / f"{algorithm.__name__}.zip", "Lava-v0", {})) is algorithm
+    files = [str(tmp_path / f"{name}.zip") for name in ("RecurrentPPO", "PPO")]
+    out = tmp_path / "report"
+    arguments = ["report", *files, "--env", "Lava-v0", "--perturbations", "vector_dropout", "--severities", "4"]
+    assert main([*arguments, "--episodes", "4", "--out", str(out), "--jobs", "1"]) == 0
+    assert "PPO has no task-relevant variables" in (out / "report.md").read_text()
+
+
+@pytest.mark.filterwarnings("ignore:You are trying to run PPO")
+def test_the_statistics_that_the_zoo_leaves_beside_a_model_are_used(tmp_path):
+    env = VecNormalize(make_vec_env("Lava-v0", 2, seed=0), norm_reward=False)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu").learn(100)
+    model.save(tmp_path / "Lava-v0.zip")
+    (tmp_path / "Lava-v0").mkdir()
+    env.save(tmp_path / "Lava-v0" / "vecnormalize.pkl")
+    loaded = load_model(tmp_path / "Lava-v0.zip", "Lava-v0", {}).get_vec_normalize_env()
+    np.testing.assert_array_equal(loaded.obs_rms.mean, env.obs_rms.mean)
+
+
+def test_images_get_a_gallery_and_a_scene(tmp_path):
+    model = tiny_tdpg(
+        "BallCatch-v0", n_episodes=4, cost_limit=20.0, policy_kwargs=dict(net_arch=dict(encoder=[8], action_head=[8]))
+    )
+    text = robustness_report(
+        {"A": model}, "BallCatch-v0", out=tmp_path, perturbations=["noise", "camera_pose"], severities=[5],
+        n_episodes=3, scenarios=(), progress_bar=False,
+    )  # fmt: skip
+    assert "figures/examples.png" in text
+    assert "renderer='fast'" in text
+    records = pd.read_csv(tmp_path / "episodes.csv.xz")
+    assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
+
+
+BAD = {
+    "file": (["A=nothing.zip"], {}, "nothing.zip: there is no such file"),
+    "folder": (["."], {}, "holds no model.zip"),
+    "no model": (["notes.zip"], {}, "notes.zip cannot be read"),
+    "label": (["A="], {}, "LABEL=FILE"),
+    "environment": (["{pg}"], {"--env": "Larva-v0"}, "'Larva-v0' is not registered"),
+    "spaces": (["{pg}"], {"--env": "Pendulum-v1"}, "does not fit.*the model's observation_space"),
+    "keyword": (["{pg}"], {"--env-kwargs": "lava=3"}, "cannot be made"),
+    "horizon": (["{pg}"], {"--env-kwargs": "horizon=7"}, "horizon of 5 steps, the environment has 7"),
+    "perturbation": (["{pg}"], {"--perturbations": "fog"}, "'fog' is unknown: here there are .*vector_noise"),
+    "another kind": (["{pg}"], {"--perturbations": "hue"}, "'hue' does not apply"),
+    "severity": (["{pg}"], {"--severities": "6"}, "some of 1 to 5"),
+    "seed": (["{pg}"], {"--seed": "-1"}, "seed=-1 must be"),
+}
+
+
+@pytest.mark.parametrize("models, options, message", BAD.values(), ids=BAD)
+def test_bad_input_is_told_in_a_line(models, options, message, folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes.zip").write_text("no archive")
+    models = [model.format(pg=folder / "pg-seed0" / "model.zip") for model in models]
+    options = {"--env": "Lava-v0", **options}
+    assert main(["report", *models, *(word for option in options.items() for word in option)]) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error)
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    "change, name",
+    [(["--seed", "1"], "seed"), (["--episodes", "7"], "n_episodes"), (["--deterministic"], "deterministic")],
+)
+def test_a_folder_with_another_report_is_refused(report, change, name, capsys):
+    arguments, out = report
+    before = json.loads((out / "config.json").read_text())
+    assert main([*arguments, *change]) == 2
+    assert f"holds a report with another {name}" in capsys.readouterr().err
+    assert json.loads((out / "config.json").read_text()) == before
+
+
+def test_a_report_of_other_models_is_refused(report, folder, capsys):
+    arguments, _ = report
+    assert main([arguments[0], *arguments[2:]]) == 2
+    assert "another models" in capsys.readouterr().err
