@@ -16,7 +16,7 @@ release = version = sb3_tdpg.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx_copybutton"]
 exclude_patterns = ["_build", "results/*/*"]  # what is in there is included by the pages beside it
 nitpicky = True  # a reference that leads nowhere is a warning, and with -W an error
-nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium)\..*")]  # their pages are elsewhere
+nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium|pathlib)\..*")]  # their pages are elsewhere
 
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3

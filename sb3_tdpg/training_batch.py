@@ -39,7 +39,7 @@ class Member:
     One training of a batch.
 
     :param model: It is trained in place.
-    :param n_timesteps: As for :meth:`TDPG.learn`.
+    :param n_timesteps: As for :meth:`~sb3_tdpg.TDPG.learn`.
     :param callbacks: Likewise.
     :param reset_num_timesteps: Likewise; False to go on with a model that was loaded.
     :param random_state: The state of torch's generator with which the training is to begin.
@@ -135,7 +135,7 @@ class TrainingBatch:
 
     def learn(self) -> None:
         """
-        Train all, as :meth:`TDPG.learn` trains one.
+        Train all, as :meth:`~sb3_tdpg.TDPG.learn` trains one.
 
         :raises MemberDivergedError: if a loss or an action of one is NaN or infinite. The others keep their last
             parameters, but have not finished.
@@ -165,7 +165,7 @@ class TrainingBatch:
             callback.on_training_end()
 
     def _collect_rollouts(self) -> None:
-        """See :meth:`TDPG.collect_rollouts`; all episodes are equally long."""
+        """See :meth:`~sb3_tdpg.TDPG.collect_rollouts`; all episodes are equally long."""
         observations: list[np.ndarray] = []
         for k, (model, callback) in enumerate(zip(self.models, self.callbacks, strict=True)):
             model.policy.set_training_mode(False)
@@ -217,7 +217,7 @@ class TrainingBatch:
             fit.result = result
 
     def _train(self) -> None:
-        """See :meth:`TDPG.train`."""
+        """See :meth:`~sb3_tdpg.TDPG.train`."""
         updates = [self._of_member(k, model.begin_update) for k, model in enumerate(self.models)]
         log_prob, rebuilt = self.policy.evaluate_episodes(
             self.batch, self.models[0].encoder_gradient, rebuild=self.has_penalty

@@ -142,7 +142,9 @@ def interquartile_means(
     scores: np.ndarray, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return the interquartile mean over seeds of each of many rows, as :func:`aggregate_seeds` does, but all at once.
+    Return the interquartile mean over seeds of each of many rows.
+
+    It is what :func:`~sb3_tdpg.evaluation.aggregate_seeds` tells, of many rows at once.
 
     :param scores: ``(seeds, rows)``
     :param level: Coverage of the intervals; each row is resampled by itself.
@@ -166,7 +168,7 @@ def probabilities_of_improvement(
     """
     Return how likely a seed has a lower cost than a seed of the control, row by row; ties count half.
 
-    It is what :func:`probability_of_improvement` tells, of many rows at once.
+    It is what :func:`~sb3_tdpg.evaluation.probability_of_improvement` tells, of many rows at once.
 
     :param costs: ``(seeds, rows)``
     :param of_control: ``(seeds of the control, rows)``

@@ -53,7 +53,7 @@ class Numbers:
 
 def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
     """
-    Aggregate the records of :func:`~sb3_tdpg.report.records.run_row`.
+    Aggregate the records of ``run_row``.
 
     A model's number is its mean cost over episodes, of a perturbation also over severities. A method's is the
     interquartile mean over its models, with a stratified bootstrap interval over them. Of a single model the interval
