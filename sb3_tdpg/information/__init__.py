@@ -12,6 +12,7 @@ from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.information.smile import Smile
+from sb3_tdpg.information.vib import VariationalBottleneck
 
 ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "mine": Mine,
@@ -20,6 +21,7 @@ ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "infonce": InfoNCE,
     "logdet": LogDet,
     "loo": LeaveOneOut,
+    "vib": VariationalBottleneck,
 }
 
 
@@ -50,6 +52,7 @@ __all__ = [
     "Mine",
     "Nwj",
     "Smile",
+    "VariationalBottleneck",
     "get_estimator_class",
     "own_sample_bound",
 ]
