@@ -87,8 +87,8 @@ class TDPG(OnPolicyAlgorithm):
     :param n_episodes: Episodes N of a policy epoch; default: 500 and 160.
     :param n_envs: Number of environments that a string id is turned into; default: see
         :func:`~sb3_tdpg.make_episodes_env`.
-    :param mi_estimator: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, ``"logdet"``, ``"loo"`` or a subclass of
-        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"`` and ``"logdet"``.
+    :param mi_estimator: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, ``"logdet"``, ``"loo"``, ``"vib"`` or a
+        subclass of :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"`` and ``"logdet"``.
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step;
         ``"mean"``: cost of the whole episode minus the mean over the batch, as in the paper.

@@ -20,7 +20,7 @@ def tiny_tdpg(env="Lava-v0", **kwargs):
     defaults = dict(
         n_episodes=20,
         mi_estimator=estimator,
-        mi_kwargs={} if estimator in ("logdet", "loo") else dict(TINY_CRITIC),
+        mi_kwargs={} if estimator in ("logdet", "loo", "vib") else dict(TINY_CRITIC),
         policy_kwargs=dict(net_arch=dict(encoder=[8], action_head=[8])),
         seed=0,
         device="cpu",

@@ -286,7 +286,7 @@ def test_observations_may_be_normalised():
 
 
 def test_every_estimator_trains_from_its_name():
-    for name in ("mine", "nwj", "smile", "infonce", "logdet", "loo"):
+    for name in ("mine", "nwj", "smile", "infonce", "logdet", "loo", "vib"):
         model = train_epochs(tiny_tdpg(mi_estimator=name), 2)
         assert np.isfinite(model.information).all()
 

@@ -153,7 +153,7 @@ def test_every_environment_runs_its_quota_of_episodes_however_short_they_are(bas
     assert (buffer.observations[0, :, 2] == 0).all()
 
 
-@pytest.mark.parametrize("mi_estimator", ["mine", "logdet", "loo"])
+@pytest.mark.parametrize("mi_estimator", ["mine", "logdet", "loo", "vib"])
 def test_cartpole_ends_early_and_trains_with_a_mask(mi_estimator):
     model = tiny_tdpg(make_vec_env("CartPole-v1", n_envs=4, seed=0), n_episodes=8, mi_estimator=mi_estimator, beta=1.0)
     model.learn(600)

@@ -15,6 +15,7 @@ from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.information.pairs import InformationEstimate, estimate_information
 from sb3_tdpg.information.smile import Smile
 from sb3_tdpg.information.trust import TrustBadge, TrustCheck, trust_checks
+from sb3_tdpg.information.vib import VariationalBottleneck
 
 ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "mine": Mine,
@@ -23,6 +24,7 @@ ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "infonce": InfoNCE,
     "logdet": LogDet,
     "loo": LeaveOneOut,
+    "vib": VariationalBottleneck,
 }
 
 
@@ -58,6 +60,7 @@ __all__ = [
     "TrustBadge",
     "TrustCheck",
     "estimate_information",
+    "VariationalBottleneck",
     "get_estimator_class",
     "information_interval",
     "own_sample_bound",
