@@ -18,6 +18,7 @@ from typing import Any
 
 import pandas as pd
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from tqdm import tqdm
@@ -89,6 +90,17 @@ class Run:
             settings=self.settings,
         )
 
+    def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+        """
+        Train once, or go on where an earlier call was interrupted.
+
+        :param attempt: Which of the trainings this is.
+        :param folder: What it leaves behind: ``model.zip``, ``selected.json`` and the log.
+        :param progress_bar: Show a progress bar.
+        :return: the policy, and whether any epoch met the limits (otherwise it is the last epoch's)
+        """
+        return _train(self, attempt, folder, progress_bar)
+
 
 Task = tuple[Run, Path, Sequence[Scenario]]
 """A run, its folder, and what it is evaluated on."""
@@ -123,7 +135,7 @@ def complete_run(
         return folder
     for attempt in range(run.max_attempts):
         attempt_folder = folder / f"attempt{attempt}"
-        model, selected = _train(run, attempt, attempt_folder, progress_bar)
+        model, selected = run.train(attempt, attempt_folder, progress_bar)
         if selected:
             break
     records = evaluate_scenarios(

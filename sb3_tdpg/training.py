@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.tdpg import TDPG
@@ -41,6 +42,18 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     settings = {**block, **overrides}
     n_timesteps = int(settings.pop("n_timesteps"))
     callbacks: list[BaseCallback] = [_make(entry) for entry in settings.pop("callback", [])]
+    env = take_env(env_id, settings)
+    read_schedule(settings)
+    return Training(TDPG(settings.pop("policy"), env, **settings), callbacks, n_timesteps)
+
+
+def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
+    """
+    Make the environments of a training, and take what is about them out of its settings.
+
+    :param env_id: A registered id.
+    :param settings: ``n_envs``, ``env_kwargs`` and ``vec_env_wrapper`` are removed.
+    """
     env_kwargs = settings.pop("env_kwargs", {})
     # In this process: runs are made side by side in processes of their own, and come out the same on any machine.
     env = make_episodes_env(
@@ -52,10 +65,14 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     )
     for entry in settings.pop("vec_env_wrapper", []):
         env = _make(entry, env)
+    return env
+
+
+def read_schedule(settings: dict[str, Any]) -> None:
+    """Replace a learning rate that is given as a text by its schedule."""
     rate = settings.get("learning_rate")
     if isinstance(rate, str):
         settings["learning_rate"] = _make_schedule(rate)
-    return Training(TDPG(settings.pop("policy"), env, **settings), callbacks, n_timesteps)
 
 
 def _make(entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:
