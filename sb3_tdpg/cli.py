@@ -50,11 +50,19 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
     from sb3_tdpg.reproduction.ball import reproduce_ball
     from sb3_tdpg.reproduction.grasp import reproduce_grasp
     from sb3_tdpg.reproduction.lava import reproduce_lava
+    from sb3_tdpg.reproduction.peers import reproduce_peers
 
     given = {name: value for name, value in options.items() if value is not None}
     if "controls" in given and not experiment.startswith("ball"):
         raise ValueError(f"--no-controls is for ball and ball-varying: {experiment} does not do without any")
-    if experiment == "lava":
+    if "n_ball_seeds" in given and experiment != "peers":
+        raise ValueError(f"--n-ball-seeds is for peers: {experiment} has --n-seeds alone")
+    if "n_paper_seeds" in given and experiment == "peers":
+        raise ValueError("--n-paper-seeds is for lava and ball: the peers are not the paper's")
+    if experiment == "peers":
+        out = out or Path("results/peers")
+        text = reproduce_peers(out, **given)
+    elif experiment == "lava":
         out = out or Path("results/lava_reproduction")
         text = reproduce_lava(out, **given)
     elif experiment.startswith("grasp"):
@@ -163,7 +171,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_sizes(demo)
 
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
-    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-camera"))
+    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-camera", "peers"))
     reproduce.add_argument(
         "--out", type=Path, default=None, help="folder for the results (default: one in results/ for each experiment)"
     )
@@ -173,6 +181,9 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     reproduce.add_argument(
         "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
+    )
+    reproduce.add_argument(
+        "--n-ball-seeds", type=_positive, help="peers: training seeds on ball catching (default: 5); --n-seeds: on lava"
     )
     reproduce.add_argument(
         "--no-controls", action="store_false", dest="controls", default=None,

@@ -1,0 +1,175 @@
+"""The comparison with peers in miniature: what is trained, evaluated, timed and written."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from sb3_contrib import RecurrentPPO
+from small_problems import complete_runs_here
+from stable_baselines3 import PPO
+
+from sb3_tdpg.cli import main
+from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA
+from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.reproduction import peers
+from sb3_tdpg.reproduction.peers import BALL_PEERS, LAVA_PEERS, Peer, SB3Run, TimedRun
+from sb3_tdpg.runs import Run, complete_run
+from sb3_tdpg.training import take_env
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Small batches, in this process."""
+    run, sb3_run = Run.settings.fget, SB3Run.settings.fget
+    small = dict(n_envs=4, batch_size=20, n_epochs=1)
+    monkeypatch.setattr(Run, "settings", property(lambda self: {**run(self), "n_episodes": 20}))
+    monkeypatch.setattr(SB3Run, "settings", property(lambda self: {**sb3_run(self), **small}))
+    monkeypatch.setattr(peers, "aggregate_seeds", partial(peers.aggregate_seeds, n_bootstrap=10))
+    monkeypatch.setattr(peers, "complete_runs", complete_runs_here)
+
+
+def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny):
+    out, published = tmp_path / "out", tmp_path / "docs"
+    arguments = dict(n_seeds=2, n_ball_seeds=1, n_eval_episodes=2, n_timesteps=100, records=RESULTS)
+    summary = peers.reproduce_peers(out, publish=published, **arguments)
+
+    assert (published / "summary.md").read_text() == summary
+    assert {path.name for path in published.iterdir()} == {"summary.md", "seeds.csv", "episodes.csv.xz", "config.json"}
+    for each in (LAVA_PEERS, BALL_PEERS):
+        assert each.title in summary
+        for label in (*each.recorded.values(), *(peer.label for peer in each.peers)):
+            assert f"| {label} | " in summary
+    n_lava = sum(min(2, peer.max_seeds or 2) for peer in LAVA_PEERS.peers)
+    records = pd.read_csv(out / "episodes.csv.xz")
+    assert len(records) == 2 * (n_lava * len(LAVA) + len(BALL_PEERS.peers) * len(BALL_CATCH))
+    assert not records.isna().any().any()
+    assert records.groupby("env_id")["train_seed"].unique().map(list).to_dict() == {
+        "Lava-v0": [300, 301],
+        "BallCatch-v0": [100],
+    }
+    seeds = pd.read_csv(out / "seeds.csv")
+    assert (seeds[["cpu_s", "wall_s"]] > 0).all().all()
+    means = records.groupby(["env_id", "model", "train_seed", "scenario"])["cost"].mean()
+    for row in seeds.itertuples():
+        assert row.cost == pytest.approx(means[row.env_id, row.model, row.train_seed, row.scenario], abs=1e-3)
+
+    models = {path.parent: path.stat().st_mtime_ns for path in out.rglob("model.zip")}
+    assert peers.reproduce_peers(out, **arguments).split("Made by")[0] == summary.split("Made by")[0]
+    assert models == {path.parent: path.stat().st_mtime_ns for path in out.rglob("model.zip")}, "trained again"
+
+
+def test_the_policies_of_the_table_are_the_recorded_ones_where_there_is_a_record(tmp_path, tiny):
+    """What is trained once more, for its time, must not change the numbers of a method."""
+    summary = peers.reproduce_peers(
+        tmp_path, n_seeds=1, n_ball_seeds=1, n_eval_episodes=50, n_timesteps=100, records=RESULTS
+    )
+    recorded = pd.read_csv(RESULTS / "lava" / "episodes_text.csv.gz")
+    is_shown = recorded["train_seed"].between(300, 304) & (recorded["episode"] < 50) & (recorded["model"] == "PG")
+    means = recorded[is_shown & (recorded["scenario"] == "Training")].groupby("train_seed")["cost"].mean()
+    (line,) = [line for line in summary.splitlines() if line.startswith("| PG | 5")][:1]
+    iqm = float(line.split("|")[3].strip(" *").split()[0])
+    assert means.min() <= iqm <= means.max()
+    assert iqm == pytest.approx(peers.aggregate_seeds(
+        recorded[is_shown & (recorded["scenario"] == "Training")]
+    )["iqm"].item(), abs=0.006)  # fmt: skip
+
+
+@pytest.mark.parametrize(("algo", "cls"), [("ppo", PPO), ("ppo_lstm", RecurrentPPO)])
+def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tiny):
+    run = Peer("peer", "Lava-v0", algo, dict(n_timesteps=200)).run("Lava-v0", 3)
+    complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=4)
+
+    settings = run.settings
+    n_timesteps, policy = settings.pop("n_timesteps"), settings.pop("policy")
+    env = take_env("Lava-v0", settings)
+    peers.read_schedule(settings)
+    model = cls(policy, env, **settings, seed=3, device="cpu").learn(n_timesteps)
+    saved = cls.load(tmp_path / "run" / "model.zip", device="cpu")
+    for name, value in model.policy.state_dict().items():
+        assert (saved.policy.state_dict()[name] == value).all(), name
+    assert saved.num_timesteps == 200
+    assert (tmp_path / "run" / "progress_00000000.csv").stat().st_size > 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["algo"], config["seed"], config["settings"]["gae_lambda"]) == (algo, 3, 0.7)
+
+
+def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp_path, tiny, monkeypatch):
+    class Clock:
+        now = 0.0
+
+        def __call__(self):
+            return self.now
+
+    wall, cpu = Clock(), Clock()
+    monkeypatch.setattr(peers.time, "perf_counter", wall)
+    monkeypatch.setattr(peers.time, "process_time", cpu)
+
+    def train(run, attempt, folder, progress_bar):
+        folder.mkdir(parents=True, exist_ok=True)
+        wall.now += 10.0
+        cpu.now += 3.0
+        if wall.now == 20.0:
+            raise KeyboardInterrupt
+        return PPO("MlpPolicy", "Lava-v0", device="cpu"), wall.now == 40.0
+
+    monkeypatch.setattr(Run, "train", train)
+    run = TimedRun("TDPG", "Lava-v0", "Lava-v0-logdet", 0, max_attempts=3)
+    with pytest.raises(KeyboardInterrupt):
+        complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
+    complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
+    # The first attempt was called twice (its model was not kept here), the interrupted one leaves no time.
+    assert peers.training_time(tmp_path) == dict(wall_s=30.0, cpu_s=9.0)
+
+
+def test_weight_decay_reaches_the_optimiser_and_changes_nothing_else():
+    override = peers.with_weight_decay("Lava-v0-pg", 0.01)
+    kwargs = load_hyperparams("Lava-v0-pg")["policy_kwargs"]
+    assert override == dict(policy_kwargs={**kwargs, "optimizer_kwargs": {"weight_decay": 0.01}})
+    model = peers.TimedRun("PG", "Lava-v0", "Lava-v0-pg", 0, override)
+    from sb3_tdpg.training import make_training
+
+    optimizer = make_training("Lava-v0", model.settings).model.policy.optimizer
+    assert [group["weight_decay"] for group in optimizer.param_groups] == [0.01] * len(optimizer.param_groups)
+
+
+def test_each_augmentation_changes_images_and_only_as_it_says():
+    images = {}
+    for label, peer in {peer.label: peer for peer in BALL_PEERS.peers}.items():
+        settings = {**load_hyperparams("BallCatch-v0", "ppo"), **peer.overrides, "n_envs": 3}
+        env = take_env("BallCatch-v0", settings)
+        env.seed(0)
+        images[label] = env.reset().astype(float)
+    plain, noisy, other = (images[f"PPO{what}"] for what in ("", ", pixel noise", ", random backgrounds"))
+    # Noise has no mean and no neighbours; a pattern has both.
+    assert 0 < np.abs((noisy - plain).mean()) < 10
+    assert np.abs(noisy - plain).mean() > 3
+    assert np.abs((other - plain).mean(axis=(2, 3))).max() > 10
+
+
+def test_the_peers_of_one_table_have_the_same_length_and_differ_in_what_their_name_says():
+    for peer in LAVA_PEERS.peers:
+        steps = peer.run("Lava-v0", 0).settings["n_timesteps"]
+        assert steps == (1e6 if peer.label.startswith("PG") else 1.5e6), peer
+    tdpg, vib = (peer.run("Lava-v0", 0) for peer in LAVA_PEERS.peers if peer.label in ("TDPG (log-det)", "VIB"))
+    assert {key for key in tdpg.settings if tdpg.settings[key] != vib.settings[key]} == {"mi_estimator"}
+    assert tdpg.max_attempts == vib.max_attempts
+    for peer in BALL_PEERS.peers:
+        assert peer.run("BallCatch-v0", 0).settings["n_timesteps"] == 1.6e5
+
+
+def test_without_the_records_it_says_how_to_make_them_and_trains_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "peers"]) == 2
+    assert "make reproduce-lava reproduce-ball-controls" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["lava", "--n-ball-seeds", "2"], ["peers", "--n-paper-seeds", "2"]])
+def test_an_option_of_another_experiment_is_refused(arguments, capsys):
+    assert main(["reproduce", *arguments]) == 2
+    assert arguments[1] in capsys.readouterr().err
