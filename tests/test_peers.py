@@ -13,6 +13,7 @@ from stable_baselines3 import PPO
 
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA
+from sb3_tdpg.evaluation import write_frame_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.reproduction import peers
 from sb3_tdpg.reproduction.peers import BALL_PEERS, LAVA_PEERS, Peer, SB3Run, TimedRun
@@ -20,6 +21,23 @@ from sb3_tdpg.runs import Run, complete_run
 from sb3_tdpg.training import take_env
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
+
+
+@pytest.fixture
+def results(tmp_path):
+    """Records of policies that are not trained again: each seed's costs are its number, and 50 for others' policies."""
+    folder = tmp_path / "results"
+    for each in (LAVA_PEERS, BALL_PEERS):
+        rows = [
+            (model, seed, row.name, episode, 50.0 if model == "another" else float(seed), 0, False)
+            for model in ("another", *each.recorded)
+            for seed in range(each.first_seed, each.first_seed + 10)
+            for row in each.rows
+            for episode in range(3)
+        ]
+        columns = ["model", "train_seed", "scenario", "episode", "cost", "seed", "deterministic"]
+        write_frame_atomically(pd.DataFrame(rows, columns=columns), folder / each.records)
+    return folder
 
 
 @pytest.fixture
@@ -33,9 +51,9 @@ def tiny(monkeypatch):
     monkeypatch.setattr(peers, "complete_runs", complete_runs_here)
 
 
-def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny):
+def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
     out, published = tmp_path / "out", tmp_path / "docs"
-    arguments = dict(n_seeds=2, n_ball_seeds=1, n_eval_episodes=2, n_timesteps=100, records=RESULTS)
+    arguments = dict(n_seeds=2, n_ball_seeds=1, n_eval_episodes=2, n_timesteps=100, records=results)
     summary = peers.reproduce_peers(out, publish=published, **arguments)
 
     assert (published / "summary.md").read_text() == summary
@@ -44,6 +62,11 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny):
         assert each.title in summary
         for label in (*each.recorded.values(), *(peer.label for peer in each.peers)):
             assert f"| {label} | " in summary
+    # Of a method with records the table has these, of its first five seeds, and not the training for its time.
+    plain = summary.replace("**", "")
+    assert "| TDPG (log-det) | 5 | 302.00 " in plain
+    assert "| TDPG, perturbed images | 5 | 102.00 " in plain
+    assert "| VIB | 2 | " in plain
     n_lava = sum(min(2, peer.max_seeds or 2) for peer in LAVA_PEERS.peers)
     records = pd.read_csv(out / "episodes.csv.xz")
     assert len(records) == 2 * (n_lava * len(LAVA) + len(BALL_PEERS.peers) * len(BALL_CATCH))
@@ -61,22 +84,6 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny):
     models = {path.parent: path.stat().st_mtime_ns for path in out.rglob("model.zip")}
     assert peers.reproduce_peers(out, **arguments).split("Made by")[0] == summary.split("Made by")[0]
     assert models == {path.parent: path.stat().st_mtime_ns for path in out.rglob("model.zip")}, "trained again"
-
-
-def test_the_policies_of_the_table_are_the_recorded_ones_where_there_is_a_record(tmp_path, tiny):
-    """What is trained once more, for its time, must not change the numbers of a method."""
-    summary = peers.reproduce_peers(
-        tmp_path, n_seeds=1, n_ball_seeds=1, n_eval_episodes=50, n_timesteps=100, records=RESULTS
-    )
-    recorded = pd.read_csv(RESULTS / "lava" / "episodes_text.csv.gz")
-    is_shown = recorded["train_seed"].between(300, 304) & (recorded["episode"] < 50) & (recorded["model"] == "PG")
-    means = recorded[is_shown & (recorded["scenario"] == "Training")].groupby("train_seed")["cost"].mean()
-    (line,) = [line for line in summary.splitlines() if line.startswith("| PG | 5")][:1]
-    iqm = float(line.split("|")[3].strip(" *").split()[0])
-    assert means.min() <= iqm <= means.max()
-    assert iqm == pytest.approx(peers.aggregate_seeds(
-        recorded[is_shown & (recorded["scenario"] == "Training")]
-    )["iqm"].item(), abs=0.006)  # fmt: skip
 
 
 @pytest.mark.parametrize(("algo", "cls"), [("ppo", PPO), ("ppo_lstm", RecurrentPPO)])
@@ -173,3 +180,13 @@ def test_without_the_records_it_says_how_to_make_them_and_trains_nothing(tmp_pat
 def test_an_option_of_another_experiment_is_refused(arguments, capsys):
     assert main(["reproduce", *arguments]) == 2
     assert arguments[1] in capsys.readouterr().err
+
+
+def test_the_records_in_the_documentation_have_what_the_table_takes_from_them():
+    for each in (LAVA_PEERS, BALL_PEERS):
+        records = each.read_records(RESULTS, 1000)
+        counts = records.groupby(["model", "train_seed", "scenario"]).size()
+        assert len(counts) == len(each.recorded) * peers.N_RECORDED_SEEDS * len(each.rows)
+        assert (counts == 1000).all()
+        assert set(records["seed"]) == {0}
+        assert not records["deterministic"].any()
