@@ -183,7 +183,7 @@ def _make_parser() -> argparse.ArgumentParser:
         "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
     )
     reproduce.add_argument(
-        "--n-ball-seeds", type=_positive, help="peers: training seeds on ball catching (default: 5); --n-seeds: on lava"
+        "--n-ball-seeds", type=int, help="peers: training seeds on ball catching, 0: none; --n-seeds: on lava"
     )
     reproduce.add_argument(
         "--no-controls", action="store_false", dest="controls", default=None,

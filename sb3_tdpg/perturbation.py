@@ -36,8 +36,8 @@ class VecImagePerturbation(VecEnvWrapper):
     4. noise: normal at every pixel, with a standard deviation uniform up to ``noise``.
 
     The true state is left alone. What an encoder tells of such a change is of no use to the task and counts as
-    information with the bounds that see the encoder's density (``"logdet"``, ``"loo"``): they bound what the TRVs carry
-    of all that is in the image. Random numbers are torch's, so that a seed and a checkpoint cover them.
+    information with the bounds that see the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``): they bound what the
+    TRVs carry of all that is in the image. Random numbers are torch's, so that a seed and a checkpoint cover them.
 
     :param venv: Environments with images of bytes, channels first or last.
     :param color: See above; 0 leaves the colours alone.

@@ -85,14 +85,7 @@ class VariationalBottleneck(InformationEstimator):
         for _ in range(self.em_steps):
             responsibility = th.softmax(_log_joint(means, variances, prior), dim=2)
             prior = _moments(means, variances, responsibility * weight[:, :, None], pseudo=one)
-        # A local optimum may be worse than one Gaussian: that is then the prior, K times.
-        several, single = (
-            -(weight * th.logsumexp(_log_joint(means, variances, p), dim=2)).sum(1) for p in (prior, one)
-        )
-        keep = (several <= single)[:, None, None]
-        mean, var = (th.where(keep, p, o) for p, o in zip(prior[:2], one[:2], strict=True))
-        log_weight = th.where(keep[:, 0], prior[2], -math.log(self.n_components))
-        self._set_prior(enough, (mean, var, log_weight))
+        self._set_prior(enough, prior)
         return {}
 
     def _set_prior(self, steps: th.Tensor, prior: tuple[th.Tensor, th.Tensor, th.Tensor]) -> None:

@@ -260,7 +260,7 @@ def reproduce_peers(
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each method on the lava problem.
-    :param n_ball_seeds: Training seeds of each peer on ball catching.
+    :param n_ball_seeds: Training seeds of each peer on ball catching; 0 leaves it out.
     :param n_eval_episodes: Episodes of each row.
     :param n_timesteps: Environment steps of each training; default: as many as TDPG has (policy gradient: fewer).
     :param jobs: Runs at a time; default: the number of cores.
@@ -269,7 +269,7 @@ def reproduce_peers(
     :return: the summary, as Markdown
     :raises ValueError: if the records are not there; nothing has been trained by then.
     """
-    comparisons = ((LAVA_PEERS, n_seeds), (BALL_PEERS, n_ball_seeds))
+    comparisons = [(each, n) for each, n in ((LAVA_PEERS, n_seeds), (BALL_PEERS, n_ball_seeds)) if n > 0]
     if missing := [str(records / each.records) for each, _ in comparisons if not (records / each.records).exists()]:
         raise ValueError(
             f"{' and '.join(missing)} are not there: run this in the folder of the repository, or make them first with "
