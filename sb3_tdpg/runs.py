@@ -337,6 +337,7 @@ def _batches(tasks: Sequence[Task], jobs: int) -> list[list[Task]]:
     alike: dict[Hashable, list[Task]] = {}
     for task in tasks:
         run, folder, _ = task
+        # A subclass trains in its own way, or is timed.
         if type(run) is Run and run.start is None and not (folder / "episodes.csv").exists():
             settings = run.settings
             is_free = settings.pop("beta", None) == math.inf

@@ -89,6 +89,9 @@ def batch_key(model: TDPG) -> Hashable | None:
     if isinstance(estimator, CriticEstimator):
         fits = fits and estimator.held_out == 0 and estimator.reset_moments
         critics = (estimator.is_warm,)
+    else:
+        # What another estimator has learnt would have to be divided among the trainings.
+        fits = fits and not estimator.state_dict()
     if not fits:
         return None
     shape = policy._get_constructor_parameters()
