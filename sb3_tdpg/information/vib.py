@@ -66,7 +66,7 @@ class VariationalBottleneck(InformationEstimator):
         """
         Fit the prior of each time step to the encoder's densities in the episodes that are alive.
 
-        Where fewer than :meth:`min_episodes` are, it stays as it is.
+        Where fewer than ``min_episodes`` are, it stays as it is.
         """
         means, variances = batch.means.detach(), batch.stds.detach().square()  # (T, N, Z)
         alive = th.ones(means.shape[:2], dtype=th.bool, device=means.device) if batch.alive is None else batch.alive
