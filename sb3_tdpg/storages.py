@@ -47,7 +47,10 @@ def open_storage(url: str | os.PathLike[str]) -> BaseStorage:
     plain = parsed.render_as_string(hide_password=False).replace("{", "{{").replace("}", "}}")
     for attempt in range(ATTEMPTS):
         try:
-            return optuna.storages.get_storage(RDBStorage(plain, engine_kwargs=options))
+            storage = RDBStorage(plain, engine_kwargs=options)
+            if parsed.get_backend_name() == "sqlite":
+                _lock_before_reading(storage.engine)
+            return optuna.storages.get_storage(storage)
         except RuntimeError as e:  # its tables are of another version of Optuna
             raise ValueError(f"storage {shown}: {_one_line(e)}") from e
         except (sa.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError, AssertionError) as e:
@@ -78,6 +81,25 @@ def _connect_args(url: sa.URL) -> dict[str, Any]:
     if url.drivername in ("postgresql+psycopg", "postgresql+psycopg2"):
         return {**limits, **alive}
     return limits if url.get_backend_name() == "mysql" else {}
+
+
+def _lock_before_reading(engine: sa.Engine) -> None:
+    """
+    Let each transaction take SQLite's lock at its beginning.
+
+    Optuna reads the state of a trial and then sets it, and relies on SELECT ... FOR UPDATE in between, which SQLite
+    does not have: two workers could both take the same waiting trial, and a failure could overwrite a result.
+    """
+
+    @sa.event.listens_for(engine, "connect")
+    def leave_transactions_to_us(connection: Any, _: Any) -> None:
+        connection.isolation_level = None
+
+    @sa.event.listens_for(engine, "begin")
+    def begin(connection: sa.Connection) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+    engine.dispose()  # the connections that were opened without it
 
 
 def _check_answers(url: sa.URL, connect_args: dict[str, Any], shown: str) -> None:

@@ -83,6 +83,25 @@ def test_every_job_is_done_once_by_workers_that_begin_at_once_while_one_is_kille
     assert not [t for t in trials if t.state in (TrialState.RUNNING, TrialState.WAITING)]
 
 
+def test_a_waiting_trial_is_taken_by_one_worker_only(url):
+    study, taken = open_quick(url), []
+    for _ in range(40):
+        study.add_trial(optuna.trial.create_trial(state=TrialState.WAITING))
+    start = threading.Barrier(4)
+
+    def take():
+        mine = open_quick(url)
+        start.wait()
+        taken.extend(mine.ask().number for _ in range(10))
+
+    threads = [threading.Thread(target=take) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(taken) == list(range(40))
+
+
 def dropped(team):
     """Count results that were computed in vain: on a busy machine a living worker, too, may be silent for 2 s."""
     return team.said.count("its result is dropped")
