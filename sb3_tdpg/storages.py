@@ -19,6 +19,7 @@ CONNECT_TIMEOUT = 10  # seconds
 FORMS = "postgresql://user:password@host/database, sqlite:///file.db, or a path that ends in .log"
 # Optuna makes its tables in several steps, which workers that start at once disturb.
 ATTEMPTS = 10
+LOCK_TIMEOUT = 60  # seconds for which another worker may hold SQLite's lock
 
 
 def open_storage(url: str | os.PathLike[str]) -> BaseStorage:
@@ -39,12 +40,15 @@ def open_storage(url: str | os.PathLike[str]) -> BaseStorage:
     parsed = _parse(text)
     shown = parsed.render_as_string(hide_password=True)
     connect_args = _connect_args(parsed)
-    if parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:"):
-        Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
+    if parsed.get_backend_name() == "sqlite":
+        if parsed.database in (None, "", ":memory:"):
+            raise ValueError(f"storage={text!r} is in the memory of one process: name a file, sqlite:///file.db")
+        _make_folder(Path(str(parsed.database)), shown)
     _check_answers(parsed, connect_args, shown)
     # A restarted database must not break the connections that wait in the pool. Optuna formats the URL.
     options = dict(pool_pre_ping=True, connect_args=connect_args)
     plain = parsed.render_as_string(hide_password=False).replace("{", "{{").replace("}", "}}")
+    deadline = time.monotonic() + LOCK_TIMEOUT
     for attempt in range(ATTEMPTS):
         try:
             storage = RDBStorage(plain, engine_kwargs=options)
@@ -54,8 +58,9 @@ def open_storage(url: str | os.PathLike[str]) -> BaseStorage:
         except RuntimeError as e:  # its tables are of another version of Optuna
             raise ValueError(f"storage {shown}: {_one_line(e)}") from e
         except (sa.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError, AssertionError) as e:
-            if attempt == ATTEMPTS - 1:
-                raise ValueError(f"storage {shown} answers, but cannot be used: {_one_line(e)}") from e
+            if attempt == ATTEMPTS - 1 or time.monotonic() > deadline:
+                reason = _one_line(getattr(e, "orig", None) or e)
+                raise ValueError(f"storage {shown} answers, but cannot be used: {reason}") from e
             time.sleep(random.uniform(0.1, 0.5))
     raise AssertionError("not reached")
 
@@ -74,7 +79,7 @@ def _parse(text: str) -> sa.URL:
 
 def _connect_args(url: sa.URL) -> dict[str, Any]:
     if url.get_backend_name() == "sqlite":
-        return dict(timeout=60)  # for the lock that another worker holds
+        return dict(timeout=LOCK_TIMEOUT)
     limits = dict(connect_timeout=CONNECT_TIMEOUT)
     # A line that is cut in silence must not hold a worker for the hours that an operating system takes to notice.
     alive = dict(keepalives_idle=30, keepalives_interval=10, keepalives_count=3, tcp_user_timeout=60_000)
@@ -102,6 +107,13 @@ def _lock_before_reading(engine: sa.Engine) -> None:
     engine.dispose()  # the connections that were opened without it
 
 
+def _make_folder(path: Path, shown: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ValueError(f"storage {shown} does not answer: {_one_line(e)}") from e
+
+
 def _check_answers(url: sa.URL, connect_args: dict[str, Any], shown: str) -> None:
     try:
         engine = sa.create_engine(url, connect_args=connect_args, poolclass=sa.pool.NullPool)
@@ -124,7 +136,8 @@ def _open_journal(path: Path) -> BaseStorage:
             raise ValueError("it does not begin as one")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            return JournalStorage(JournalFileBackend(str(path)))
+            # Whole: a worker that dies with the lock leaves a link to this path, by which the others see its age.
+            return JournalStorage(JournalFileBackend(str(path.absolute())))
     except (OSError, ValueError, KeyError, AssertionError) as e:
         raise ValueError(f"storage={str(path)!r} cannot be used as a journal file of Optuna: {_one_line(e)}") from e
 

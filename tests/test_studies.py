@@ -1,6 +1,7 @@
 """Workers that share a study: real processes on a real PostgreSQL, on SQLite and on a journal file."""
 
 import re
+import sqlite3
 import threading
 import time
 
@@ -12,7 +13,7 @@ from optuna.trial import TrialState  # noqa: E402
 from postgres import PASSWORD, postgres  # noqa: E402, F401
 from study_workers import Workers, open_quick  # noqa: E402
 
-from sb3_tdpg import studies  # noqa: E402
+from sb3_tdpg import storages, studies  # noqa: E402
 from sb3_tdpg.studies import enqueue_once, open_storage, open_study, quiet_optuna, work  # noqa: E402
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -330,6 +331,9 @@ def test_a_password_is_neither_shown_nor_an_obstacle(postgres):  # noqa: F811
         ("study.txt", "is none of postgresql://"),
         ("/proc/nowhere/study.log", "cannot be used as a journal file"),
         ("sqlite:////proc/study.db", "does not answer"),
+        ("sqlite:////proc/nowhere/study.db", "does not answer"),
+        ("sqlite://", "is in the memory of one process: name a file"),
+        ("sqlite:///:memory:", "is in the memory of one process: name a file"),
     ],
 )
 def test_a_storage_that_cannot_be_used_is_named_in_one_line(url, message):
@@ -339,6 +343,35 @@ def test_a_storage_that_cannot_be_used_is_named_in_one_line(url, message):
     assert "secret" not in str(caught.value)
     assert "\n" not in str(caught.value)
     assert time.monotonic() - begin < 15
+
+
+def test_a_database_that_another_program_does_not_let_go_of_is_named_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(storages, "LOCK_TIMEOUT", 0.2)
+    study = open_quick(f"sqlite:///{tmp_path}/study.db")
+    locked = sqlite3.connect(tmp_path / "study.db", isolation_level=None)
+    locked.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(ValueError, match="cannot be used: database is locked$"):
+        open_storage(f"sqlite:///{tmp_path}/study.db")
+    said = []
+
+    def let_go(text):
+        said.append(text)
+        if "does not answer" in text:
+            locked.execute("ROLLBACK")
+
+    work_quickly(study, lambda trial: 1.0, 1, report=let_go)
+    assert said == ["the storage does not answer: trying again for 300 s", "trial 0: 1 (1 of 1 finished)"]
+
+
+def test_a_lock_that_a_killed_worker_has_left_on_a_journal_is_broken(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    study = open_quick("folder/study.log")
+    lock = study._storage._backend._lock
+    lock.acquire()  # and is not released
+    # Optuna tells its age by what the link points to: without that it would wait for ever.
+    assert (tmp_path / "folder" / "study.log.lock").exists()
+    lock.grace_period = 0.2
+    assert study.ask().number == 0
 
 
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path):
