@@ -29,9 +29,9 @@ except ImportError as e:
 from sb3_tdpg.evaluation.provenance import jsonable
 from sb3_tdpg.storages import open_storage, quiet_optuna
 from sb3_tdpg.study_jobs import JOB, job_of
-from sb3_tdpg.study_worker import Objective, Worker
+from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker
 
-__all__ = ["enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
+__all__ = ["UnfitWorkerError", "enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
 
 GRACE_PERIOD = 120.0  # seconds
 CREATION_TIME = 10.0  # seconds from the creation of a study to the description of its space, at most
@@ -130,7 +130,9 @@ def work(
 
     A trial is finished when it is complete or pruned. One that raises a ``ValueError`` is pruned, and keeps the message
     as its attribute ``reason``. Any other exception is recorded likewise, puts the trial back into the queue and ends
-    this worker. Ctrl-C puts the trial back. One whose worker was killed is run again by another, or by a later, worker.
+    this worker. Ctrl-C and an :class:`UnfitWorkerError` put the trial back. One whose worker was killed is run again by
+    another, or by a later, worker. A worker that was suspended for so long that it counted as dead is interrupted in
+    its trial, whose result is dropped, and goes on with the next one.
 
     :param study: From :func:`open_study`.
     :param objective: Gets a trial, returns its value or values.

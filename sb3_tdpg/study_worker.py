@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import _thread
+import math
 import os
 import socket
 import threading
@@ -23,11 +25,21 @@ Result = TypeVar("Result")
 PATIENCE = 300.0  # seconds for which a storage may be away
 
 
+class UnfitWorkerError(ValueError):
+    """A trial cannot be run here, but elsewhere: it is put back into the queue, and this worker ends."""
+
+
+class StorageAwayError(ValueError):
+    """The storage does not answer for too long."""
+
+
 class _Heartbeat(AbstractContextManager["_Heartbeat"]):
-    """Show the others that a trial is being run."""
+    """Show the others that a trial is being run; interrupt it if one of them has taken it over nevertheless."""
 
     def __init__(self, trial: optuna.Trial, interval: float) -> None:
         self._trial, self._interval = trial, interval
+        self._can_be_interrupted = threading.current_thread() is threading.main_thread()
+        self.is_taken_over = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -45,7 +57,11 @@ class _Heartbeat(AbstractContextManager["_Heartbeat"]):
             beats += 1
             try:
                 self._trial.set_user_attr(HEARTBEAT, beats)
-            except UpdateFinishedTrialError:  # another worker has taken it over
+            except UpdateFinishedTrialError:
+                # As happens to a worker that was suspended. What it would go on writing is another one's by now.
+                self.is_taken_over = True
+                if self._can_be_interrupted:
+                    _thread.interrupt_main()
                 return
             except Exception:  # a storage that is away may come back: the trial must not die of it
                 continue
@@ -69,6 +85,7 @@ class Worker:
         self.heartbeat_interval, self.grace_period = heartbeat_interval, grace_period
         self.next_number: int | None = 0  # if this worker is alone with the study
         self.seen: dict[int, tuple[Any, float]] = {}  # running trials of others: their heartbeat, and since when
+        self.looked_at = -math.inf  # when they were seen last
 
     def run(self) -> None:
         """Run trials until the study is finished."""
@@ -109,6 +126,10 @@ class Worker:
     def _fail_silent(self, jobs: Jobs) -> bool:
         """Fail the running trials whose heartbeat stands still; return whether there were any."""
         now, seen = time.monotonic(), {}
+        # After a pause nothing follows from what was seen before it: the others may have been suspended, too.
+        if now - self.looked_at > self.grace_period / 3:
+            self.seen = {}
+        self.looked_at = now
         running = [t for t in jobs.open.values() if t is not None and t.state == TrialState.RUNNING]
         silent = []
         for trial in running:
@@ -133,30 +154,48 @@ class Worker:
             self.next_number = None
         if self.next_number is not None:
             self.next_number += 1
+        heartbeat = _Heartbeat(trial, self.heartbeat_interval)
         try:
             if not self._read().counts(trial.number):
                 self._hand_back(trial)
                 return
             self._patiently(lambda: trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}"))
-            with _Heartbeat(trial, self.heartbeat_interval):
+            with heartbeat:
                 values = self.objective(trial)
             self._finish(trial, TrialState.COMPLETE, values)
+        except StorageAwayError:
+            raise  # nor can it be told how the trial has ended
+        except UnfitWorkerError:
+            self._put_back(trial)
+            raise
         except (TrialPruned, ValueError) as e:
             self._finish(trial, TrialState.PRUNED, reason=_reason(e))
         except UpdateFinishedTrialError:  # seen by the objective itself
             self._say_taken_over(trial)
+        except StorageInternalError as e:  # likewise
+            self._finish(trial, TrialState.FAIL, reason=_reason(e))
         except Exception as e:
             self._finish(trial, TrialState.FAIL, reason=_reason(e))
             raise
         except BaseException:
-            self._hand_back(trial)
-            self.report(f"trial {trial.number} is put back into the queue")
+            if heartbeat.is_taken_over:
+                self._say_taken_over(trial)
+                return
+            self._put_back(trial)
             raise
 
-    def _hand_back(self, trial: optuna.Trial) -> None:
-        """End an attempt that is no failure: its job is run later, if it is still wanted."""
-        self._patiently(lambda: trial.set_user_attr(HANDED_BACK, True))
-        self._tell(trial.number, TrialState.FAIL)
+    def _put_back(self, trial: optuna.Trial) -> None:
+        if self._hand_back(trial):
+            self.report(f"trial {trial.number} is put back into the queue")
+
+    def _hand_back(self, trial: optuna.Trial) -> bool:
+        """End an attempt that is no failure: its job is run later, if it is still wanted. False: it has ended."""
+        try:
+            self._patiently(lambda: trial.set_user_attr(HANDED_BACK, True))
+        except UpdateFinishedTrialError:
+            return False
+        told = self._tell(trial.number, TrialState.FAIL)
+        return told is not None and told.state == TrialState.FAIL
 
     def _finish(
         self,
@@ -209,7 +248,8 @@ class Worker:
                     deadline = time.monotonic() + PATIENCE
                     self.report(f"the storage does not answer: trying again for {PATIENCE:g} s")
                 if time.monotonic() > deadline:
-                    raise ValueError(f"the storage has not answered for {PATIENCE:g} s: {e}") from e
+                    reason = " ".join(str(e.__cause__ or e).split())
+                    raise StorageAwayError(f"the storage has not answered for {PATIENCE:g} s: {reason}") from e
                 time.sleep(1.0)
 
 

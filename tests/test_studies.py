@@ -13,8 +13,15 @@ from optuna.trial import TrialState  # noqa: E402
 from postgres import PASSWORD, postgres  # noqa: E402, F401
 from study_workers import Workers, open_quick  # noqa: E402
 
-from sb3_tdpg import storages, studies  # noqa: E402
-from sb3_tdpg.studies import enqueue_once, open_storage, open_study, quiet_optuna, work  # noqa: E402
+from sb3_tdpg import storages, studies, study_worker  # noqa: E402
+from sb3_tdpg.studies import (  # noqa: E402
+    UnfitWorkerError,
+    enqueue_once,
+    open_storage,
+    open_study,
+    quiet_optuna,
+    work,
+)
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
@@ -127,6 +134,91 @@ def test_ctrl_c_hands_the_trial_to_the_next_worker_at_once(workers, url):
     assert len(ran) == 2
     assert ran[:1] == team.lines("begin")
     assert not [line for line in said if "silent" in line]
+
+
+def test_a_worker_that_was_suspended_leaves_its_trial_to_the_one_that_has_taken_it_over(workers, url):
+    team = workers(None)
+    (suspended,) = team.start(60)
+    team.wait_for("begin", suspended)
+    team.send("SIGSTOP", suspended)
+    team.join(team.start(0.1))
+    team.send("SIGCONT", suspended)
+    team.join([suspended])  # long before the 60 s are over
+    assert team.lines("end", suspended) == []
+    assert dropped(team) == 1
+    finished = [t.params["x"] for t in open_quick(url).get_trials() if t.state in FINISHED]
+    assert sorted(finished) == [-2, -1, 0, 1, 2, 3]
+
+
+def test_workers_that_are_suspended_together_do_not_take_each_other_for_dead(monkeypatch):
+    study, said, clock = open_study(optuna.storages.InMemoryStorage(), "s", space={}), [], [0.0]
+    monkeypatch.setattr(study_worker.time, "monotonic", lambda: clock[0])
+    study.ask()  # by another one, that gives no sign
+    worker = study_worker.Worker(study, lambda trial: 0.0, 1, 3, 1.0, 6.0, said.append)
+    for seconds in (0, 1, 2, 100, 101, 103, 105, 106):
+        clock[0] = seconds
+        worker._look()
+    assert said == []
+    clock[0] = 107
+    worker._look()
+    assert said == ["trial 0: its worker is silent for 6 s: to be run again"]
+
+
+def test_ctrl_c_in_a_trial_that_was_taken_over_is_ctrl_c_and_a_trial_that_is_done_stays_done():
+    study, said = open_study(optuna.storages.InMemoryStorage(), "s", space={}), []
+
+    def objective(trial):
+        study.tell(trial.number, 1.0)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work_quickly(study, objective, 1, report=said.append)
+    assert said == []
+    assert [t.values for t in study.get_trials()] == [[1.0]]
+
+
+def test_a_result_that_cannot_be_stored_is_not_taken_for_a_bad_trial(monkeypatch):
+    monkeypatch.setattr(study_worker, "PATIENCE", 0.0)
+    study, tell = open_study(optuna.storages.InMemoryStorage(), "s", space={}), optuna.Study.tell
+
+    def is_away(*args, **kwargs):
+        monkeypatch.setattr(optuna.Study, "tell", tell)  # back when the worker has lost its patience
+        raise optuna.exceptions.StorageInternalError("gone")
+
+    monkeypatch.setattr(optuna.Study, "tell", is_away)
+    with pytest.raises(ValueError, match="the storage has not answered for 0 s: gone"):
+        work_quickly(study, lambda trial: 1.0, 1)
+    assert [t.state for t in study.get_trials()] == [TrialState.RUNNING]
+    work_quickly(study, lambda trial: 1.0, 1)  # after the grace period
+    assert [t.state for t in study.get_trials()] == [TrialState.FAIL, TrialState.COMPLETE]
+
+
+def test_a_storage_that_is_away_while_an_objective_needs_it_costs_the_attempt_not_the_worker():
+    study, said, values = open_study(optuna.storages.InMemoryStorage(), "s", space={}), [], []
+
+    def objective(trial):
+        values.append(trial.suggest_float("x", 0, 1))
+        if len(values) == 1:
+            raise optuna.exceptions.StorageInternalError("gone")
+        return 1.0
+
+    work_quickly(study, objective, 1, report=said.append)
+    assert said == ["trial 0: failed: StorageInternalError: gone (0 of 1 finished)", "trial 1: 1 (1 of 1 finished)"]
+    assert values[0] == values[1]
+
+
+def test_a_worker_that_cannot_run_a_trial_leaves_it_to_others(url):
+    study, said = open_quick(url), []
+
+    def unfit(trial):
+        raise UnfitWorkerError("folder holds another run")
+
+    for _ in range(5):  # more often than a trial may fail
+        with pytest.raises(ValueError, match="another run"):
+            work_quickly(study, unfit, 1, report=said.append)
+    assert said[-1] == "trial 4 is put back into the queue"
+    work_quickly(study, lambda trial: 1.0, 1)
+    assert [t.values for t in study.get_trials() if t.state in FINISHED] == [[1.0]]
 
 
 def test_a_trial_may_be_interrupted_any_number_of_times():
