@@ -193,10 +193,7 @@ def read_zoo_folder(
         settings=settings,
         seed=args["seed"],
         progress=_monitored_progress(folder, model.n_episodes),
-        notes=[
-            f"Trained with rl-zoo3; the policy is the one {candidates[model_path]}.",
-            _selection_note(folder, settings),
-        ],
+        notes=_zoo_notes(folder, settings, candidates[model_path]),
         command=_told_command((inner / "command.txt").read_text()) if (inner / "command.txt").exists() else None,
         how=_zoo_provenance(folder, model_path),
         files={name: path for name, path in files.items() if path.exists()},

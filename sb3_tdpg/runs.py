@@ -145,19 +145,31 @@ def complete_run(
         labels=dict(train_seed=run.seed, attempts=attempt + 1, selected=selected),
         progress_bar=progress_bar,
     )
-    shutil.copytree(attempt_folder, folder, dirs_exist_ok=True)
+    # A save that was killed leaves a part of a file behind.
+    shutil.copytree(attempt_folder, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.partial"))
     write_frame_atomically(records, folder / "episodes.csv")
     shutil.rmtree(attempt_folder)
     return folder
 
 
-def _begin(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episodes: int) -> bool:
-    """Make the folder of a run and say in it what the run is; False if the run is finished."""
+def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episodes: int) -> dict[str, Any]:
+    """
+    See whether a folder is free for a run, or holds it already; the parameters are those of :func:`complete_run`.
+
+    :return: what ``config.json`` is to say
+    :raises ValueError: if it holds a run with other settings.
+    """
     rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
-    if run.start is not None and not (run.start / "model.zip").exists():
-        raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
     config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
     check_same_config(folder / "config.json", config, "run")
+    return config
+
+
+def _begin(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episodes: int) -> bool:
+    """Make the folder of a run and say in it what the run is; False if the run is finished."""
+    if run.start is not None and not (run.start / "model.zip").exists():
+        raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
+    config = check_folder(run, folder, scenarios, n_eval_episodes)
     if (folder / "episodes.csv").exists():
         return False
     folder.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,8 @@ import os
 import random
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +142,15 @@ def _open_journal(path: Path) -> BaseStorage:
             return JournalStorage(JournalFileBackend(str(path.absolute())))
     except (OSError, ValueError, KeyError, AssertionError) as e:
         raise ValueError(f"storage={str(path)!r} cannot be used as a journal file of Optuna: {_one_line(e)}") from e
+
+
+@contextmanager
+def told_in_one_line() -> Iterator[None]:
+    """Turn what Optuna raises when a storage is away into a ``ValueError`` that says so."""
+    try:
+        yield
+    except optuna.exceptions.StorageInternalError as e:
+        raise ValueError(f"the storage does not answer: {_one_line(getattr(e.__cause__, 'orig', None) or e)}") from e
 
 
 def _without_password(text: str) -> str:

@@ -27,7 +27,7 @@ except ImportError as e:
     raise ImportError("studies need Optuna: pip install sb3_tdpg[zoo]") from e
 
 from sb3_tdpg.evaluation.provenance import jsonable
-from sb3_tdpg.storages import open_storage, quiet_optuna
+from sb3_tdpg.storages import open_storage, quiet_optuna, told_in_one_line
 from sb3_tdpg.study_jobs import JOB, job_of
 from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker
 
@@ -38,6 +38,7 @@ CREATION_TIME = 10.0  # seconds from the creation of a study to the description 
 SPACE = "space"  # attribute of a study
 
 
+@told_in_one_line()
 def open_study(
     storage: optuna.storages.BaseStorage,
     name: str,
@@ -57,7 +58,8 @@ def open_study(
     :param pruner: Likewise.
     :param space: All that makes one trial comparable with another, in JSON's types: search space, environment,
         settings. It is kept with the study.
-    :raises ValueError: if the study was made with another space or other directions; it says what differs.
+    :raises ValueError: if the study was made with another space or other directions; it says what differs. Likewise if
+        the storage does not answer.
     """
     wanted = json.loads(json.dumps(jsonable({SPACE: space, "directions": list(directions)})))
     kinds: list[Any] = list(directions)
@@ -101,6 +103,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+@told_in_one_line()
 def enqueue_once(study: optuna.Study, jobs: Sequence[Mapping[str, Any]]) -> None:
     """
     Put jobs into the queue, each once, however often and by however many workers at once this is called.

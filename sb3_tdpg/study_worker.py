@@ -248,7 +248,7 @@ class Worker:
                     deadline = time.monotonic() + PATIENCE
                     self.report(f"the storage does not answer: trying again for {PATIENCE:g} s")
                 if time.monotonic() > deadline:
-                    reason = " ".join(str(e.__cause__ or e).split())
+                    reason = " ".join(str(getattr(e.__cause__, "orig", None) or e).split())
                     raise StorageAwayError(f"the storage has not answered for {PATIENCE:g} s: {reason}") from e
                 time.sleep(1.0)
 

@@ -14,6 +14,7 @@ import json
 import math
 import multiprocessing as mp
 import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,8 @@ import pandas as pd
 
 from sb3_tdpg.evaluation import save_figure, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.tradeoff import tradeoff_figure
-from sb3_tdpg.files import write_atomically
-from sb3_tdpg.runs import complete_run, complete_runs, torch_threads
+from sb3_tdpg.files import replaced_atomically, write_atomically
+from sb3_tdpg.runs import check_folder, complete_run, complete_runs, torch_threads
 from sb3_tdpg.sweep_runs import Sweep, make_sweep, parse_inverse_beta
 from sb3_tdpg.sweep_summary import sweep_summary
 
@@ -88,6 +89,9 @@ def sweep(
     failures: dict[str, str] = {}
     if storage is None:
         tasks = [(plan.run(*job), plan.folder(out, *job), plan.scenarios) for job in wanted]
+        for task in tasks:
+            check_folder(*task, n_eval_episodes)
+        out.mkdir(parents=True, exist_ok=True)
         complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
         with torch_threads(1):
             rows = [plan.row(plan.folder(out, *job), *job) for job in wanted]
@@ -144,12 +148,15 @@ def _work_at_study(
 
     quiet_optuna()
     study = open_study(open_storage(storage), name, directions=("minimize", "minimize"), space=plan.config)
+    for job in wanted:
+        check_folder(plan.run(*job), plan.folder(out, *job), plan.scenarios, plan.n_eval_episodes)
+    out.mkdir(parents=True, exist_ok=True)
     arguments = (plan, out, storage, name, wanted, grace_period)
     if jobs == 1:
         _work(*arguments)
     else:
         context = mp.get_context("spawn")
-        workers = [context.Process(target=_work, args=arguments) for _ in range(jobs)]
+        workers = [context.Process(target=_work_in_process, args=arguments) for _ in range(jobs)]
         for worker in workers:
             worker.start()
         try:
@@ -160,18 +167,29 @@ def _work_at_study(
                 worker.join()
             raise
         if failed := sum(worker.exitcode != 0 for worker in workers):
-            raise RuntimeError(f"{failed} of {jobs} workers failed, see above; the same command goes on")
+            raise ValueError(f"{failed} of {jobs} workers failed, see above; the same command goes on")
     trials = study.get_trials(deepcopy=False)
     rows = {trial.user_attrs["job"]: trial.user_attrs["row"] for trial in trials if "row" in trial.user_attrs}
     reasons = {t.user_attrs["job"]: t.user_attrs["reason"] for t in trials if {"job", "reason"} <= t.user_attrs.keys()}
     return list(rows.values()), {job: reason for job, reason in reasons.items() if job not in rows}
 
 
+def _work_in_process(*arguments: Any) -> None:
+    """Be one of several workers of this machine: what ends it is told in a line."""
+    try:
+        _work(*arguments)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (ValueError, OSError) as e:
+        print(f"error: {e}", file=sys.stderr)
+        sys.exit(2)
+
+
 def _work(
     plan: Sweep, out: Path, storage: str, name: str, wanted: Sequence[tuple[float, int]], grace_period: float
 ) -> None:
     """Be one worker: run trials of the study until there are none left."""
-    from sb3_tdpg.studies import enqueue_once, open_storage, open_study, quiet_optuna, work
+    from sb3_tdpg.studies import UnfitWorkerError, enqueue_once, open_storage, open_study, quiet_optuna, work
 
     quiet_optuna()  # in a process of its own
     study = open_study(open_storage(storage), name, directions=("minimize", "minimize"), space=plan.config)
@@ -179,8 +197,12 @@ def _work(
 
     def objective(trial: Any) -> tuple[float, float]:
         job = trial.suggest_float("inverse_beta", 0.0, 1e9), trial.suggest_int("seed", 0, 2**31)
-        folder = plan.folder(out, *job)
-        complete_run(plan.run(*job), folder, plan.scenarios, n_eval_episodes=plan.n_eval_episodes)
+        run, folder = plan.run(*job), plan.folder(out, *job)
+        try:
+            check_folder(run, folder, plan.scenarios, plan.n_eval_episodes)
+        except ValueError as e:  # a job of another worker, which this one has no place for
+            raise UnfitWorkerError(str(e)) from e
+        complete_run(run, folder, plan.scenarios, n_eval_episodes=plan.n_eval_episodes)
         row = plan.row(folder, *job)
         trial.set_user_attr("row", row)
         return row["cost"], row["information"]
@@ -216,9 +238,8 @@ def _copy_selected(out: Path, best: pd.Series | None, cost_limit: float) -> bool
         return False
     source = out / "runs" / best["folder"] / "model.zip"
     if source.exists():
-        partial = model.with_name(model.name + ".partial")
-        shutil.copyfile(source, partial)
-        partial.replace(model)
+        with replaced_atomically(model) as partial:
+            shutil.copyfile(source, partial)
     else:
         model.unlink(missing_ok=True)
     content = {name: best[name] for name in ("label", "seed", "cost", "std", "information", "folder")}

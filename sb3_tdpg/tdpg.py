@@ -28,6 +28,7 @@ from sb3_tdpg.buffers import EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.checks import check_action_space, check_arguments, check_beta, check_count, nearest_multiples
 from sb3_tdpg.defaults import defaults_for, fill_in
+from sb3_tdpg.files import replaced_atomically
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.policy_update import PolicyUpdate, TrainingDivergedError
@@ -525,10 +526,8 @@ class TDPG(OnPolicyAlgorithm):
         if target.suffix == "":
             target = target.with_suffix(".zip")
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(target.name + ".partial")
-        with partial.open("wb") as file:
+        with replaced_atomically(target) as partial, partial.open("wb") as file:
             super().save(file, exclude, include)
-        os.replace(partial, target)
 
     @classmethod
     def load(

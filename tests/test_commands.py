@@ -52,6 +52,7 @@ BAD = {
     "environment": ([*SWEEP, "--env", "Foo-v0"], "'Foo-v0' is not registered"),
     "block": ([*SWEEP, "--block", "Lava-v0-foo"], "no block 'Lava-v0-foo'.*choose one with --block"),
     "storage": ([*SWEEP, *TINY, "--storage", "postgresql://a:b@127.0.0.1:1/c"], "does not answer"),
+    "out": ([*SWEEP, *TINY, "--out", "/proc/nowhere"], "No such file or directory: '/proc/nowhere'"),
     "folder": (["push", "nothing", "--repo-id", "a/b"], "nothing holds no training"),
 }
 

@@ -346,6 +346,9 @@ def test_a_folder_of_the_zoo_is_evaluated_and_told_of(zoo_folder, tmp_path):
     assert "gym.make('Lava-v0', action_cost=1.0)" in text
     assert "training seed: 3\n" in text
     assert re.search(r"versions: Python \d.*PyTorch \d", text)
+    # The zoo's own program leaves the last policy, whatever a selection has chosen.
+    assert "the policy is the one of the end of the training." in text
+    assert "The policy is that of" not in text
     assert (card / "training.png").exists()
 
 

@@ -442,7 +442,7 @@ def test_a_database_that_another_program_does_not_let_go_of_is_named_in_one_line
     study = open_quick(f"sqlite:///{tmp_path}/study.db")
     locked = sqlite3.connect(tmp_path / "study.db", isolation_level=None)
     locked.execute("BEGIN EXCLUSIVE")
-    with pytest.raises(ValueError, match="cannot be used: database is locked$"):
+    with pytest.raises(ValueError, match=r"cannot be used: database is locked$"):
         open_storage(f"sqlite:///{tmp_path}/study.db")
     said = []
 

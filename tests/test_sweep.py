@@ -20,7 +20,7 @@ from sb3_tdpg import TDPG  # noqa: E402
 from sb3_tdpg.envs.scenarios import LAVA  # noqa: E402
 from sb3_tdpg.evaluation.information import information_bounds, rollout_information  # noqa: E402
 from sb3_tdpg.information import InformationBatch  # noqa: E402
-from sb3_tdpg.studies import open_storage  # noqa: E402
+from sb3_tdpg.studies import enqueue_once, open_storage  # noqa: E402
 from sb3_tdpg.sweep import select, sweep  # noqa: E402
 from sb3_tdpg.sweep_runs import beta_label, parse_inverse_beta  # noqa: E402
 
@@ -158,6 +158,39 @@ def test_a_training_that_fails_is_named_in_the_summary(tmp_path, monkeypatch):
     text = quick_sweep(tmp_path, storage=str(tmp_path / "study.log"), betas=["inf"])
     assert_complete(tmp_path, 1)
     assert '- `{"inverse_beta": 0.0, "seed": 1}`: the policy has diverged' in text
+
+
+@pytest.mark.parametrize("storage", [None, "study.log"])
+def test_a_folder_with_another_run_is_refused_before_any_training_and_does_not_spoil_the_study(storage, tmp_path):
+    storage = storage and str(tmp_path / storage)
+    quick_sweep(tmp_path / "out", betas=["1/50"], n_seeds=1, n_timesteps=800)
+    before = sorted(tmp_path.rglob("out/*"))
+    with pytest.raises(ValueError, match=r"beta-1-50-seed0 holds a run with another settings: choose another folder"):
+        quick_sweep(tmp_path / "out", storage=storage, betas=["inf", "1/50"], n_seeds=1)
+    assert sorted(tmp_path.rglob("out/*")) == before
+    quick_sweep(tmp_path / "elsewhere", storage=storage, betas=["inf", "1/50"], n_seeds=1)
+    assert_complete(tmp_path / "elsewhere", 2)
+
+
+def test_a_job_of_another_worker_for_which_there_is_no_place_here_is_left_to_others(tmp_path):
+    storage = str(tmp_path / "study.log")
+    quick_sweep(tmp_path / "out", betas=["1/50"], n_seeds=1, n_timesteps=800)
+    quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
+    study = optuna.load_study(study_name="sweep-Lava-v0", storage=open_storage(storage))
+    enqueue_once(study, [dict(inverse_beta=50.0, seed=0)])
+    with pytest.raises(ValueError, match="holds a run with another settings"):
+        quick_sweep(tmp_path / "out", storage=storage, betas=["inf"], n_seeds=1)
+    quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
+    assert_complete(tmp_path / "mine", 2)
+
+
+def test_workers_of_one_machine_tell_in_a_line_what_ends_them(tmp_path, capfd):
+    storage = str(tmp_path / "study.log")
+    with pytest.raises(ValueError, match="2 of 2 workers failed, see above"):
+        quick_sweep(tmp_path, storage=storage, jobs=2, grace_period=-1.0)
+    lines = capfd.readouterr().err.splitlines()
+    assert [line for line in lines if line.startswith("error: grace_period=-1.0 must be")] == lines
+    assert len(lines) == 2
 
 
 def runs_of(*rows):

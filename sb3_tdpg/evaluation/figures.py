@@ -14,6 +14,7 @@ import pandas as pd
 from sb3_tdpg.envs.lava import GOAL, LAVA, WALL
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.trajectories import rollout_states
+from sb3_tdpg.files import replaced_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -327,9 +328,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) ->
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    figure.savefig(partial, format=path.suffix.lstrip("."), dpi=dpi)
-    os.replace(partial, path)
+    with replaced_atomically(path) as partial:
+        figure.savefig(partial, format=path.suffix.lstrip("."), dpi=dpi)
 
 
 def _draw_corridor(axes: Axes, horizon: int) -> None:

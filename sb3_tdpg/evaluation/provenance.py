@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.files import write_atomically
+from sb3_tdpg.files import replaced_atomically, write_atomically
 
 PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "pandas", "pybullet")
 
@@ -71,7 +71,7 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     if not path.exists():
         return
     found = json.loads(path.read_text())
-    found.pop("provenance")
+    found.pop("provenance", None)
     wanted = jsonable(config)
     changed = sorted(key for key in found if found[key] != wanted.get(key))
     if changed:
@@ -93,9 +93,8 @@ def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) ->
         raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
     # Without mtime the compressed file would differ from one second to the next.
     methods: dict[str, Any] = {".csv": None, ".gz": {"method": "gzip", "mtime": 0}, ".xz": "xz"}
-    partial = path.with_name(path.name + ".partial")
-    frame.to_csv(partial, index=False, compression=methods[path.suffix])
-    os.replace(partial, path)
+    with replaced_atomically(path) as partial:
+        frame.to_csv(partial, index=False, compression=methods[path.suffix])
 
 
 def _with_folder(path: str | os.PathLike[str]) -> Path:
