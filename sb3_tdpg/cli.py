@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -128,7 +129,8 @@ def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_epi
     from sb3_tdpg.hub import push_to_hub, write_model_card
 
     if not (folder / "README.md").exists():
-        card = card or folder.with_name(f"{folder.name}-hub")
+        named = Path(os.path.abspath(folder))  # "." has no name
+        card = card or named.with_name(f"{named.name}-hub")
         folder = write_model_card(folder, card, repo_id, film_episodes=film_episodes)
     if not dry_run:
         print(f"{folder} is now at {push_to_hub(folder, repo_id)}")

@@ -47,6 +47,15 @@ def test_push_and_pull_hand_on_what_they_are_given(tmp_path, capsys, monkeypatch
     assert "https://there" in capsys.readouterr().out
 
 
+def test_the_card_of_the_folder_where_one_stands_lies_beside_it(tmp_path, monkeypatch):
+    called = []
+    monkeypatch.setattr("sb3_tdpg.hub.write_model_card", lambda folder, card, *a, **k: called.append(card) or card)
+    (tmp_path / "run").mkdir()
+    monkeypatch.chdir(tmp_path / "run")
+    assert main(["push", ".", "--repo-id", "me/model", "--dry-run"]) == 0
+    assert called == [tmp_path / "run-hub"]
+
+
 BAD = {
     "beta": ([*SWEEP, "--betas", "1/x"], "beta='1/x' must be a positive number"),
     "environment": ([*SWEEP, "--env", "Foo-v0"], "'Foo-v0' is not registered"),

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import tempfile
 import re
 import sys
 
@@ -161,9 +162,11 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
             assert model.beta == pytest.approx(block["beta"])
 
 
-def test_a_shifted_scenario_is_what_the_cost_is_of(here):  # noqa: F811
+def test_a_shifted_scenario_is_what_the_cost_is_of(here, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     shift = ["--eval-env-kwargs", "lava_terminal_cost:1e6"]
     assert main(["tune", *TINY, *shift, "--n-trials", "2"]) == 0
+    assert not list(tmp_path.glob("SB3-*"))  # as SB3 makes in the system's folder for a training without a log
     folder = here / "logs" / "tdpg" / "study-Lava-v0-logdet-shift"
     trials = list(csv.DictReader((folder / "trials.csv").open()))
     assert all(float(trial["value"]) == float(trial["user_attrs_cost"]) > 1e3 for trial in trials)

@@ -19,6 +19,7 @@ import optuna
 import yaml
 from rl_zoo3.utils import get_callback_list
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.callbacks import SelectionCallback
@@ -104,6 +105,7 @@ class TuningManager(TDPGExperimentManager):
             contextlib.closing(self.create_envs(self.n_eval_episodes, eval_env=True)) as eval_env,
         ):
             model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
+            model.set_logger(Logger(None, []))  # SB3 would make a folder in /tmp for each trial
             callbacks = get_callback_list({"callback": self.specified_callbacks})
             is_constrained = self.objective_kind == "information"
             limit = self.cost_limit if is_constrained else math.inf
