@@ -2,9 +2,9 @@
 
 import csv
 import math
-import tempfile
 import re
 import sys
+import tempfile
 
 import optuna
 import pytest
