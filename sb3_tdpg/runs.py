@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 import multiprocessing as mp
+import os
 import shutil
 import signal
+import threading
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
@@ -382,8 +384,21 @@ _EPOCHS: Synchronized[int] | None = None  # in a worker: the count that all of t
 def _init_worker(epochs: Synchronized[int]) -> None:
     global _EPOCHS
     _EPOCHS = epochs
+    end_with_parent()
     th.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+
+
+def end_with_parent() -> None:
+    """In a worker: end when the process that has started it ends, be it killed. Files are never half-written."""
+    parent = mp.parent_process()
+    assert parent is not None
+
+    def wait_for_its_end() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait_for_its_end, daemon=True).start()
 
 
 @contextmanager

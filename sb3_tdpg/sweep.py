@@ -25,7 +25,7 @@ import pandas as pd
 from sb3_tdpg.evaluation import save_figure, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.tradeoff import tradeoff_figure
 from sb3_tdpg.files import replaced_atomically, write_atomically
-from sb3_tdpg.runs import check_folder, complete_run, complete_runs, torch_threads
+from sb3_tdpg.runs import check_folder, complete_run, complete_runs, end_with_parent, torch_threads
 from sb3_tdpg.sweep_runs import Sweep, make_sweep, parse_inverse_beta
 from sb3_tdpg.sweep_summary import sweep_summary
 
@@ -176,6 +176,7 @@ def _work_at_study(
 
 def _work_in_process(*arguments: Any) -> None:
     """Be one of several workers of this machine: what ends it is told in a line."""
+    end_with_parent()
     try:
         _work(*arguments)
     except KeyboardInterrupt:

@@ -1,6 +1,7 @@
 """From the command line to results in a folder, with tiny settings: train, evaluate, interrupt, go on."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -228,6 +229,22 @@ def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
     assert "the same command goes on" in error
     assert "Traceback" not in error
     assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
+
+
+@pytest.mark.parametrize("storage", [[], ["--storage", "study.log"]], ids=["pool", "storage"])
+def test_the_workers_of_a_command_that_is_killed_end_with_it(storage, tmp_path):
+    if storage:
+        pytest.importorskip("optuna")
+    command = [sys.executable, "-m", "sb3_tdpg", "sweep", "--env", "Lava-v0", "--betas", "inf", "--seeds", "2"]
+    command += ["--jobs", "2", "--cost-limit", "40", "--out", str(tmp_path), *storage]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("runs/*/attempt0/*")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.kill()
+        process.communicate(timeout=20)  # until nobody is left who could write there; a training takes longer
+    assert not list(tmp_path.glob("runs/*/episodes.csv"))
 
 
 def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
