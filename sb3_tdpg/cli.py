@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         advice = "" if out is None else f"; {out} keeps what is done, and the same command goes on from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
-    except (ValueError, ImportError) as e:  # a missing extra is told as an ImportError
+    except (ValueError, ImportError, OSError) as e:  # a missing extra; a folder that cannot be written to
         print(f"error: {e}", file=sys.stderr)
         return 2
     return 0

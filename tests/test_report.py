@@ -285,6 +285,22 @@ def test_bad_input_is_told_in_a_line(models, options, message, folder, tmp_path,
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.parametrize("content", ["{}", "[1]", '{"half": '])
+def test_a_folder_of_something_else_is_refused(content, folder, tmp_path, capsys):
+    (tmp_path / "config.json").write_text(content)
+    assert main(["report", f"{folder}/pg-seed0/model.zip", "--env", "Lava-v0", "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("config.json is there already and is not that of a report: choose another folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_a_line(folder, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main(["report", f"{folder}/pg-seed0/model.zip", "--env", "Lava-v0", "--out", str(tmp_path / "file")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(tmp_path / "file") in line
+
+
 @pytest.mark.parametrize(
     "change, name",
     [(["--seed", "1"], "seed"), (["--episodes", "7"], "n_episodes"), (["--deterministic"], "deterministic")],

@@ -70,8 +70,11 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     if not path.exists():
         return
-    found = json.loads(path.read_text())
-    found.pop("provenance")
+    try:
+        found = json.loads(path.read_text())
+        found.pop("provenance")
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
+        raise ValueError(f"{path} is there already and is not that of a {what}: choose another folder") from e
     wanted = jsonable(config)
     changed = sorted(key for key in found if found[key] != wanted.get(key))
     if changed:
