@@ -25,7 +25,13 @@ from torch.distributions import Normal, kl_divergence
 
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation.certificate import Certificate, CostDistribution, cost_distribution, worst_mean
+from sb3_tdpg.evaluation.certificate import (
+    Certificate,
+    CostDistribution,
+    check_allowance,
+    cost_distribution,
+    worst_mean,
+)
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
 from sb3_tdpg.information import InformationBatch, LogDet
@@ -128,6 +134,8 @@ def lava_shift(
     """
     Declare a shift of the lava problem; see :class:`~sb3_tdpg.envs.lava.LavaEnv` for the keywords.
 
+    In training the sensor must have no bias, and the start must be uniform: the divergences are from there.
+
     :param training_noise_std: The sensor noise in training.
     """
     noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
@@ -186,7 +194,8 @@ class TrainingEpisodes:
     :param confidence: With which all certificates of this object hold, each; ``None``: without allowance for the
         sampling error. Half of the error probability goes to the cost's distribution, half to the divergence.
     :param seed: Of the episodes.
-    :raises ValueError: if the environment is none of this plugin's, or the model's own environment normalises.
+    :raises ValueError: if the environment is none of this plugin's, the model's own environment normalises, or a number
+        does not fit; no episode has been run by then.
     """
 
     def __init__(
@@ -205,6 +214,7 @@ class TrainingEpisodes:
                 f"n_budget_episodes={n_budget_episodes} must be at least 1 and at most n_episodes={n_episodes} and "
                 f"{EPISODES_AT_A_TIME}"
             )
+        check_allowance(confidence, cost_bound)
         self.model, self.scenario, self.seed = model, scenario, seed
         self._env = _pomdp(model, scenario)
         costs: list[np.ndarray] = []
@@ -385,8 +395,13 @@ def _information(recorded: RecordedEpisodes) -> float:
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
-    pairs = zip(shifted, training, strict=True)
-    return np.stack([kl_divergence(p, q).sum(dim=1).double().clamp(min=0).cpu().numpy() for p, q in pairs])
+    # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
+    pairs = ((_double(p), _double(q)) for p, q in zip(shifted, training, strict=True))
+    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in pairs])
+
+
+def _double(density: Normal) -> Normal:
+    return Normal(density.mean.double(), density.stddev.double())
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
