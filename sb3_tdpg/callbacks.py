@@ -14,7 +14,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.information import InformationInterval, information_interval
-from sb3_tdpg.information.interval import component_estimates
+from sb3_tdpg.information.interval import component_estimates, min_episodes
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
@@ -75,7 +75,7 @@ class InformationCallback(_TDPGCallback):
     :param eval_freq: Epochs from one interval to the next, beginning with the first.
     :param confidence: With which the interval of a time step holds the truth.
     :param components: Whether the components of the state are measured, too; it takes as long again for each.
-    :raises ValueError: if ``eval_freq`` is below 1.
+    :raises ValueError: if ``eval_freq`` is below 1; where the training begins, if an epoch has too few episodes.
     """
 
     def __init__(self, eval_freq: int = 10, *, confidence: float = 0.95, components: bool = True) -> None:
@@ -86,6 +86,14 @@ class InformationCallback(_TDPGCallback):
         self.confidence = confidence
         self.components = components
         self.interval: InformationInterval | None = None  # the last one
+
+    def _on_training_start(self) -> None:
+        n_episodes, trv_dim = self.tdpg.n_episodes, self.tdpg.policy.trv_dim
+        if n_episodes < min_episodes(trv_dim):  # it would write limits of 0 and 0: sums over no time step
+            raise ValueError(
+                f"n_episodes={n_episodes} are too few for an interval of the information in {trv_dim} TRVs: an epoch "
+                f"must have at least {min_episodes(trv_dim)}"
+            )
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
