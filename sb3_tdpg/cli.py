@@ -105,7 +105,7 @@ def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: P
     from sb3_tdpg.enjoy import parse_keywords
     from sb3_tdpg.reproduction.certificate import certify_lava
 
-    if env != "Lava-v0":
+    if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
             f"certify knows the shifts of Lava-v0 only, and not of {env}: declare them in Python, see "
             "sb3_tdpg.evaluation.shifts.TrainingEpisodes"

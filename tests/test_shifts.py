@@ -235,6 +235,8 @@ def test_the_information_is_that_of_the_log_det_bound(model, episodes):
 def test_bad_input_is_told(model):
     with pytest.raises(ValueError, match="n_budget_episodes=50 must be at least 1 and at most n_episodes=20"):
         TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=20, n_budget_episodes=50)
+    with pytest.raises(ValueError, match="n_episodes=2 must be at least 4, to estimate the information of 2 TRVs"):
+        TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=2, n_budget_episodes=1)
     for wrong in (dict(confidence=1.5), dict(cost_bound=math.nan)):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))}={next(iter(wrong.values()))} must"):
             TrainingEpisodes(None, TRAINING, **{**SMALL, **wrong})  # before it looks at the model
@@ -270,6 +272,7 @@ def test_certify_on_the_command_line(model, tmp_path, capsys):
     "arguments, message",
     [
         (["nothing.zip"], "nothing.zip cannot be read"),
+        (["nothing.zip", "--env", "sb3_tdpg:Lava-v0"], "nothing.zip cannot be read"),
         (["nothing.zip", "--env", "BallCatch-v0"], "certify knows the shifts of Lava-v0 only"),
         (["model.zip", "model.zip"], "model.zip is given twice"),
         (["model.zip", "--seed", "-1"], "seed=-1 must be at least 0"),

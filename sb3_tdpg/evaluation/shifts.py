@@ -386,6 +386,11 @@ def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
 
 def _information(recorded: RecordedEpisodes) -> float:
     """Bound the sum over t of I[x_t; x~_t] from above, by the log-det bound."""
+    n_episodes, trv_dim = recorded.last_trv_noise.shape
+    if n_episodes < trv_dim + 2:
+        raise ValueError(
+            f"n_episodes={n_episodes} must be at least {trv_dim + 2}, to estimate the information of {trv_dim} TRVs"
+        )
     means, stds = (th.stack([getattr(d, name) for d in recorded.densities[:-1]]).cpu() for name in ("mean", "stddev"))
     last = means[-1] + stds[-1] * recorded.last_trv_noise.cpu()
     trvs = th.cat([recorded.prev_trvs[1:].cpu(), last[None]])
