@@ -134,7 +134,9 @@ def run_episodes(
         env.close()
     # In the order of their ends, a number would stand for another start with every model and perturbation.
     order = sorted(range(n_episodes), key=begun.__getitem__)
-    ended = pd.concat([pd.DataFrame(dict(cost=-np.asarray(returns), length=lengths)), pd.DataFrame(final_infos)], axis=1)
+    ended = pd.concat(
+        [pd.DataFrame(dict(cost=-np.asarray(returns), length=lengths)), pd.DataFrame(final_infos)], axis=1
+    )
     records = ended.iloc[order].reset_index(drop=True)
     records.insert(0, "episode", np.arange(n_episodes))
     return records
