@@ -1,5 +1,6 @@
 """Sphinx configuration: MyST Markdown, the Read the Docs theme, and docstrings of the code itself."""
 
+import re
 from pathlib import Path
 
 from docutils import nodes
@@ -35,10 +36,24 @@ html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 
 
+# A space before a unit, and the one in an interval: "43.9 ms", "[8.20, 9.04]".
+TOGETHER = re.compile(r"(?<=\d) (?=%|(?:[nµm]?s|min|nat)\b)|(?<=\d,) (?=[^\s\]]+\])")
+
+
+def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
+    """Let the cells of tables break before an interval, and not in it or before a unit."""
+    for entry in doctree.findall(nodes.entry):
+        for text in list(entry.findall(nodes.Text)):
+            if not isinstance(text.parent, nodes.literal):
+                text.parent.replace(text, nodes.Text(TOGETHER.sub("\N{NO-BREAK SPACE}", text)))
+
+
 class FigureIfMade(Figure):
     """A figure, or, before the script that draws it has been run, the command to run."""
 
     def run(self) -> list[nodes.Node]:
+        if "alt" not in self.options:
+            raise self.error(f"{self.arguments[0]} needs an :alt: text, for those who cannot see it")
         page = Path(self.state.document.current_source or "").parent
         if (page / self.arguments[0]).is_file():
             return super().run()
@@ -47,3 +62,4 @@ class FigureIfMade(Figure):
 
 def setup(app: Sphinx) -> None:
     app.add_directive("figure-if-made", FigureIfMade)
+    app.connect("doctree-read", keep_numbers_together)
