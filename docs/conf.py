@@ -36,16 +36,18 @@ html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 
 
-# A space before a unit, and the one in an interval: "43.9 ms", "[8.20, 9.04]".
+# Where a cell is not to break: before a unit, in an interval, in an exponent ("43.9 ms", "[8.20, 9.04]", "1e-3").
 TOGETHER = re.compile(r"(?<=\d) (?=%|(?:[nµm]?s|min|nat)\b)|(?<=\d,) (?=[^\s\]]+\])")
+EXPONENT = re.compile(r"(?<=\de-)(?=\d)")
 
 
 def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
-    """Let the cells of tables break before an interval, and not in it or before a unit."""
+    """Let the cells of tables break where a reader would."""
     for entry in doctree.findall(nodes.entry):
         for text in list(entry.findall(nodes.Text)):
             if not isinstance(text.parent, nodes.literal):
-                text.parent.replace(text, nodes.Text(TOGETHER.sub("\N{NO-BREAK SPACE}", text)))
+                kept = EXPONENT.sub("\N{WORD JOINER}", TOGETHER.sub("\N{NO-BREAK SPACE}", text))
+                text.parent.replace(text, nodes.Text(kept))
 
 
 class FigureIfMade(Figure):

@@ -159,7 +159,9 @@ def test_the_markdown_table_over_seeds_shows_the_interval_and_says_so():
 
 
 def test_one_training_seed_has_no_interval():
-    text = comparison_markdown(aggregate_seeds(some_records({"ours": {"a|b": [1.0, 2.0]}}, train_seed=0)), SCENARIOS[:1])
+    text = comparison_markdown(
+        aggregate_seeds(some_records({"ours": {"a|b": [1.0, 2.0]}}, train_seed=0)), SCENARIOS[:1]
+    )
     assert r"| a\|b | 1.50 |" in text
     assert "Mean episode cost of one training seed, hence without an interval." in text
 
