@@ -108,17 +108,17 @@ def test_a_critic_that_diverges_is_not_chosen():
 
 
 def test_a_fold_does_not_choose_by_its_own_luck():
-    history = th.zeros(2, 2, 1, 1, 3)  # two checks, one start, one problem, three folds
-    history[1, 0, 0, 0] = th.tensor([5.0, -1.0, -1.0])  # one fold lucky at the second check
-    held_out, _ = _choose(history, th.full((1, 1), th.inf), -2.0, 10.0)
+    history = th.zeros(2, 2, 1, 3)  # two checks, one problem, three folds
+    history[1, 0, 0] = th.tensor([5.0, -1.0, -1.0])  # one fold lucky at the second check
+    held_out, _ = _choose(history, th.full((1,), th.inf), -2.0, 10.0)
     # Fold 0 is told by the others to take the first check; these are told by fold 0 to take the second.
     assert held_out.item() == pytest.approx(-2 / 3)
 
 
 def test_a_critic_out_of_bounds_in_one_fold_is_not_chosen_in_any():
-    history = th.zeros(2, 2, 1, 1, 3)
-    history[1, :, 0, 0] = th.tensor([5.0, 5.0, th.nan])
-    held_out, trained_on = _choose(history, th.full((1, 1), th.inf), -2.0, 10.0)
+    history = th.zeros(2, 2, 1, 3)
+    history[1, :, 0] = th.tensor([5.0, 5.0, th.nan])
+    held_out, trained_on = _choose(history, th.full((1,), th.inf), -2.0, 10.0)
     assert held_out.item() == trained_on.item() == 0
 
 
