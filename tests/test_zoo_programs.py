@@ -29,7 +29,7 @@ def loaded(path, env, n=1):
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1", "Lava-v0"])
-def test_every_block_of_ours_trains_for_a_hundred_steps(env, here):  # noqa: F811
+def test_a_block_of_ours_trains_for_a_hundred_steps(env, here):  # noqa: F811
     assert main(["train", "--env", env, "-n", "100", "--verbose", "0"]) == 0
     assert loaded(here, env).num_timesteps >= 100
 
