@@ -106,8 +106,8 @@ def test_the_table_shows_the_numbers(report):
     _, out = report
     levels = pd.read_csv(out / "levels.csv").set_index(["model", "perturbation", "severity"])
     row = levels.loc[("tdpg", "vector_delay", 5)]
-    page = (out / "report.md").read_text()
-    assert f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}] |" in page.split("## Every severity")[1]
+    section = (out / "report.md").read_text().split("## Every severity")[1]
+    assert f"{row['iqm']:.1f} [{row['low']:.1f},\N{NO-BREAK SPACE}{row['high']:.1f}] |" in section
 
 
 def test_an_unperturbed_row_is_what_evaluate_scenarios_gives(report, folder):

@@ -19,7 +19,7 @@ from sb3_tdpg.evaluation import aggregate_seeds, provenance, write_frame_atomica
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.reproduction.ball import GROUPS, with_groups
-from sb3_tdpg.reproduction.common import commits_of, how_made, publish_files
+from sb3_tdpg.reproduction.common import RECORD_COLUMNS, commits_of, how_made, publish_files
 from sb3_tdpg.reproduction.lava import MAX_ATTEMPTS
 from sb3_tdpg.runs import Run, complete_runs
 from sb3_tdpg.training import read_schedule, take_env
@@ -237,18 +237,7 @@ BALL_PEERS = Comparison(
     },
 )
 
-COLUMNS = (
-    "env_id",
-    "model",
-    "train_seed",
-    "attempts",
-    "selected",
-    "scenario",
-    "episode",
-    "cost",
-    "seed",
-    "deterministic",
-)
+COLUMNS = ["env_id", *RECORD_COLUMNS]
 
 
 def reproduce_peers(
@@ -297,7 +286,7 @@ def reproduce_peers(
     for (each, _), in_env in zip(comparisons, folders, strict=True):
         trained = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in in_env], ignore_index=True)
         seeds = _seed_table(trained, in_env)
-        frames.append(trained[list(COLUMNS)])
+        frames.append(trained[COLUMNS])
         seed_tables.append(seeds)
         recorded = each.read_records(records, n_eval_episodes)
         order = {label: i for i, label in enumerate([*each.recorded.values(), *(peer.label for peer in each.peers)])}
