@@ -106,10 +106,11 @@ def write_page(numbers: Numbers, page: Page) -> str:
 
 
 def _introduction(numbers: Numbers, page: Page) -> str:
-    counts = " and ".join(
+    *first, last = (
         f"{len(names)} {'model' if len(names) == 1 else 'models'} of **{_text(label)}**"
         for label, names in page.sources.items()
     )
+    counts = f"{', '.join(first)} and {last}" if first else last
     n_rows = len(numbers.levels) // len(numbers.models)
     policy = "deterministic" if page.deterministic else "stochastic"
     kwargs = ", ".join(f"{name}={value!r}" for name, value in page.env_kwargs.items())
