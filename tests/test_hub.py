@@ -306,6 +306,7 @@ def zoo_folder(tmp_path_factory):
     """What the zoo's train leaves of a training on normalised observations, with the evaluations of a callback."""
     pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
     import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
 
     folder = tmp_path_factory.mktemp("zoo")
     block = dict(
@@ -321,6 +322,8 @@ def zoo_folder(tmp_path_factory):
     flags = f"train --algo tdpg --env Lava-v0 --seed 3 -f {folder}/logs --conf-file {folder}/conf.yml --eval-freq 100"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(rl_zoo3.ALGOS, "tdpg", TDPG)
+        # Another test may have called register() in this process.
+        patch.setattr(rl_zoo3.train, "ExperimentManager", ExperimentManager)
         patch.setattr(sys, "argv", flags.split())
         rl_zoo3.train.train()
     return folder / "logs" / "tdpg" / "Lava-v0_1"
