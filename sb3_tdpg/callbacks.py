@@ -14,7 +14,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.information import InformationInterval, information_interval
-from sb3_tdpg.information.interval import component_estimates
+from sb3_tdpg.information.interval import component_estimates, min_episodes
+from sb3_tdpg.problem import read_problem
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
@@ -69,13 +70,14 @@ class InformationCallback(_TDPGCallback):
     It is made from the epoch's rollouts, which are fresh for it: they were made with the policy as it is, and each
     critic is fitted to other episodes than those that it is evaluated on. It needs no penalty, and changes nothing in
     the training. The keys are ``mi/lower`` and ``mi/upper``, the limits summed over time; for TensorBoard
-    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_x0``, ..., what the TRVs know at least of
-    each component of the state, averaged over the time steps at which it varies.
+    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_d``, ..., what the TRVs know at least of
+    each component of the state, averaged over the time steps at which it varies. A component is called as in the
+    environment's ``state_names``, without its unit, or ``x0``, ``x1``, ...
 
     :param eval_freq: Epochs from one interval to the next, beginning with the first.
     :param confidence: With which the interval of a time step holds the truth.
     :param components: Whether the components of the state are measured, too; it takes as long again for each.
-    :raises ValueError: if ``eval_freq`` is below 1.
+    :raises ValueError: if ``eval_freq`` is below 1; where the training begins, if an epoch has too few episodes.
     """
 
     def __init__(self, eval_freq: int = 10, *, confidence: float = 0.95, components: bool = True) -> None:
@@ -86,6 +88,14 @@ class InformationCallback(_TDPGCallback):
         self.confidence = confidence
         self.components = components
         self.interval: InformationInterval | None = None  # the last one
+
+    def _on_training_start(self) -> None:
+        n_episodes, trv_dim = self.tdpg.n_episodes, self.tdpg.policy.trv_dim
+        if n_episodes < min_episodes(trv_dim):  # it would write limits of 0 and 0: sums over no time step
+            raise ValueError(
+                f"n_episodes={n_episodes} are too few for an interval of the information in {trv_dim} TRVs: an epoch "
+                f"must have at least {min_episodes(trv_dim)}"
+            )
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
@@ -102,9 +112,10 @@ class InformationCallback(_TDPGCallback):
                     self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))
         if self.components:
             estimates, _ = component_estimates(batch, seed=model.epoch)
-            for k, values in enumerate(estimates.T):
+            names = read_problem(self.training_env).state_names
+            for name, values in zip(names, estimates.T, strict=True):
                 if np.isfinite(values).any():
-                    self.logger.record(f"mi/knows_x{k}", float(np.nanmean(values.clip(min=0))))
+                    self.logger.record(f"mi/knows_{name.split(' (')[0]}", float(np.nanmean(values.clip(min=0))))
 
 
 class Candidate(NamedTuple):

@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         advice = "" if out is None else f"; {out} keeps what is done, and the same command goes on from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
-    except (ValueError, ImportError, OSError) as e:  # a missing extra; a folder or a disk that cannot be written to
+    except (ValueError, ImportError, OSError) as e:  # a missing extra; a folder that cannot be written to
         print(f"error: {e}", file=sys.stderr)
         return 2
     return 0
@@ -106,7 +106,7 @@ def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: P
     from sb3_tdpg.enjoy import parse_keywords
     from sb3_tdpg.reproduction.certificate import certify_lava
 
-    if env != "Lava-v0":
+    if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
             f"certify knows the shifts of Lava-v0 only, and not of {env}: declare them in Python, see "
             "sb3_tdpg.evaluation.shifts.TrainingEpisodes"

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.evaluation.provenance import as_typed
 from sb3_tdpg.rerun import scenarios_of, with_numbers
 from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
@@ -193,7 +194,7 @@ def read_zoo_folder(
         settings=settings,
         seed=args["seed"],
         progress=_monitored_progress(folder, model.n_episodes),
-        notes=_zoo_notes(folder, settings, candidates[model_path]),
+        notes=_zoo_notes(folder, settings, model_path, candidates[model_path]),
         command=_told_command((inner / "command.txt").read_text()) if (inner / "command.txt").exists() else None,
         how=_zoo_provenance(folder, model_path),
         files={name: path for name, path in files.items() if path.exists()},
@@ -205,14 +206,15 @@ def _told_command(command: str) -> str | None:
     """Return a command as a user would type it; ``None`` for that of a worker process, which tells nothing."""
     if "multiprocessing" in command or not command.strip():
         return None
-    program, *rest = shlex.split(command)
-    return shlex.join([Path(program).name, *rest])
+    return shlex.join(as_typed(shlex.split(command)))
 
 
-def _zoo_notes(folder: Path, settings: Mapping[str, Any], which: str) -> list[str]:
-    note = f"Trained with rl-zoo3; the policy is the one {which}."
-    # The zoo's own program does not put the selected policy in the place of the last one, ours does.
-    return [note, _selection_note(folder, settings)] if (folder / "run.json").exists() else [note]
+def _zoo_notes(folder: Path, settings: Mapping[str, Any], model_path: Path, which: str) -> list[str]:
+    """Say which policy it is. Our ``train`` puts the selected one in the place of the last one when it is finished."""
+    is_finished = (folder / "run.json").exists() and not (folder / "checkpoint.zip").exists()
+    if is_finished and model_path.name != "best_model.zip":
+        return ["Trained with rl-zoo3.", _selection_note(folder, settings)]
+    return [f"Trained with rl-zoo3; the policy is the one {which}."]
 
 
 def _zoo_provenance(folder: Path, model_path: Path) -> dict[str, Any]:

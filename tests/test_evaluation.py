@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -179,6 +180,43 @@ def test_any_environment_works_also_where_episodes_differ_in_length_and_the_mode
     assert frames[0]["length"].nunique() > 1
 
 
+class RaceEnv(gym.Env):
+    """Each episode costs its start; whether a high or a low one ends first is a keyword."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    observation_space = spaces.Box(0, 1, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, high_first=False):
+        self.high_first = high_first
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = float(self.np_random.uniform())
+        self.left = 1 + int(30 * (1 - self.x if self.high_first else self.x))
+        return np.array([self.x], np.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        ended = self.left == 0
+        return np.array([self.x], np.float32), -self.x if ended else 0.0, ended, False, {"start": self.x}
+
+
+def test_an_episode_has_the_same_number_whichever_ends_first(monkeypatch):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
+    gym.register("Race-v0", RaceEnv)
+    model = PPO("MlpPolicy", "Race-v0", n_steps=20, batch_size=20, seed=0, device="cpu")
+    rows = [Scenario(str(high), "Race-v0", dict(high_first=high)) for high in (False, True)]
+    # Fewer environments than episodes: two and three of each.
+    monkeypatch.setattr("sb3_tdpg.evaluation.records.MAX_PARALLEL_EPISODES", 4)
+    frame = evaluate_scenarios(model, rows, 10)
+    np.testing.assert_allclose(frame["cost"], frame["final_start"], atol=1e-5)
+    low, high = (frame.loc[frame["scenario"] == row.name, "cost"].to_numpy() for row in rows)
+    np.testing.assert_allclose(low, high)
+    assert len(np.unique(low)) == 10
+
+
 def test_a_model_trained_on_normalised_observations_is_evaluated_on_them():
     env = VecNormalize(make_episodes_env("Lava-v0", 4), norm_reward=False)
     model = PPO("MlpPolicy", env, n_steps=5, batch_size=20, seed=0, device="cpu").learn(100)
@@ -326,6 +364,10 @@ def test_the_command_is_told_without_the_folders_of_the_machine(tmp_path, monkey
         sys, "orig_argv", [str(tmp_path / "bin" / "python3"), "-m", "sb3_tdpg", "--out", str(out), "./x"]
     )
     assert provenance()["command"] == "python3 -m sb3_tdpg --out 'results/a b' ./x"
+    monkeypatch.setattr(sys, "orig_argv", ["/venv/bin/python3", "/venv/bin/sb3-tdpg", "sweep", "--out", str(out)])
+    assert provenance()["command"] == "sb3-tdpg sweep --out 'results/a b'"
+    monkeypatch.setattr(sys, "orig_argv", ["python", "train.py"])
+    assert provenance()["command"] == "python train.py"
 
 
 @pytest.mark.parametrize("in_checkout_of_something_else", [False, True])

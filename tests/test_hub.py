@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
-from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.evaluation import evaluate_scenarios, provenance
 from sb3_tdpg.hub import load_from_hub, pull_from_hub, push_to_hub, write_model_card
 from sb3_tdpg.model_card import model_name, results_with_intervals
 from sb3_tdpg.publication import Publication, read_publication, read_run
@@ -166,6 +166,7 @@ def test_the_command_of_a_user_is_told_and_that_of_a_worker_process_is_not(runs,
         (
             ("python -m sb3_tdpg demo --out 'my results'", "python -m sb3_tdpg demo --out 'my results'"),
             ("/home/me/venv/bin/python train.py", "python train.py"),
+            ("/home/me/venv/bin/python3 /home/me/venv/bin/sb3-tdpg train --env a", "sb3-tdpg train --env a"),
             ("python -c 'from multiprocessing.spawn import spawn_main; spawn_main()' --multiprocessing-fork", None),
         )
     ):
@@ -305,6 +306,7 @@ def zoo_folder(tmp_path_factory):
     """What the zoo's train leaves of a training on normalised observations, with the evaluations of a callback."""
     pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
     import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
 
     folder = tmp_path_factory.mktemp("zoo")
     block = dict(
@@ -320,6 +322,8 @@ def zoo_folder(tmp_path_factory):
     flags = f"train --algo tdpg --env Lava-v0 --seed 3 -f {folder}/logs --conf-file {folder}/conf.yml --eval-freq 100"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(rl_zoo3.ALGOS, "tdpg", TDPG)
+        # Another test may have called register() in this process.
+        patch.setattr(rl_zoo3.train, "ExperimentManager", ExperimentManager)
         patch.setattr(sys, "argv", flags.split())
         rl_zoo3.train.train()
     return folder / "logs" / "tdpg" / "Lava-v0_1"
@@ -369,6 +373,23 @@ def test_a_folder_of_the_zoo_without_its_last_policy_gives_the_best_one(zoo_fold
     (copy / "best_model.zip").unlink()
     with pytest.raises(ValueError, match=r"neither Lava-v0.zip nor best_model.zip: let the training end first"):
         read_publication(copy)
+
+
+def test_the_card_of_a_folder_of_ours_says_which_policy_it_is(zoo_folder, tmp_path):
+    copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
+    (copy / "selected.json").write_text(json.dumps(dict(epoch=3, cost=17.0, information=0.5)))
+
+    def notes():
+        return " ".join(read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1]).notes)
+
+    assert "the policy is the one of the end" in notes()  # the zoo's own program leaves the last one
+    assert "epoch 3" not in notes()
+    (copy / "run.json").write_text(json.dumps(dict(provenance=provenance())))
+    assert "The policy is that of epoch 3, which the selection chose" in notes()
+    assert "of the end" not in notes()
+    (copy / "checkpoint.zip").touch()  # interrupted
+    assert "the policy is the one of the end" in notes()
+    assert "epoch 3" not in notes()
 
 
 def test_a_model_in_memory_is_published_with_its_records(tmp_path):

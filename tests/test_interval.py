@@ -9,7 +9,8 @@ import torch as th
 from information_problems import gaussian_batch, gaussian_channels, half_dead, random_batch
 from small_problems import tiny_tdpg, train_epochs
 
-from sb3_tdpg import InformationCallback, make_episodes_env
+from sb3_tdpg import BatchedVecEnv, InformationCallback, make_episodes_env
+from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.evaluation import (
     information_report,
     information_timeline,
@@ -322,6 +323,28 @@ def test_a_noisier_copy_that_knows_more_fails(monkeypatch):
     assert "data processing FAILED" in str(trust_checks(batch))
 
 
+def test_noise_that_depends_on_the_state_raises_no_false_alarm():
+    """TRVs that are N(0, 1.01) whatever the state: with the encoder's noise doubled, they would tell its sign."""
+    rng = np.random.default_rng(0)
+    states = rng.standard_normal((1, 400, 1))
+    is_wide, means = states > 0, rng.standard_normal(states.shape)
+    batch = channel(states, np.where(is_wide, 0.0, means), np.where(is_wide, math.sqrt(1.01), 0.1), rng)
+    # What stands where an episode has ended may be anything.
+    alive = th.arange(400)[None] < 300
+    dead = {k: getattr(batch, k).masked_fill(~alive[..., None], math.nan) for k in ("states", "trvs", "means", "stds")}
+    assert trust_checks(batch._replace(**dead, alive=alive)).passed
+
+
+def test_a_critic_that_finds_nothing_raises_no_false_alarm():
+    """Of two modes for one half of the states, and none for the other: worse than nothing for a critic of Gaussians."""
+    rng = np.random.default_rng(0)
+    states = rng.standard_normal((1, 300, 1))
+    is_wide, sign = states > 0, rng.choice([-2.0, 2.0], states.shape)
+    batch = channel(states, np.where(is_wide, 0.0, sign), np.where(is_wide, math.hypot(2, 0.4), 0.4), rng)
+    assert information_interval(batch).estimates["critic"] < -0.1
+    assert trust_checks(batch).passed
+
+
 def test_an_estimate_at_the_cap_warns():
     badge = trust_checks(gaussian_batch(100, [[0.1, 0.1], [100.0, 100.0]], generator=generator()))
     assert badge.capped_steps == (1,)
@@ -400,6 +423,34 @@ def test_the_report_on_a_policy_has_frames_a_badge_and_figures(tmp_path):
     env.close()
 
 
+class CalledEnv(LavaEnv):
+    """The lava problem with other names of its state."""
+
+    state_names = ("place", "speed")
+
+
+class NamelessEnv(LavaEnv):
+    """The lava problem whose state has no names."""
+
+    state_names = None
+
+
+@pytest.mark.parametrize(
+    "env_class, names",
+    [(LavaEnv, {"d (m)", "v (m/step)"}), (CalledEnv, {"place", "speed"}), (NamelessEnv, {"x0", "x1"})],
+)
+def test_the_report_calls_the_components_as_the_environment_does(env_class, names):
+    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(env_class(), 50), n_episodes=50, seed=0)
+    assert set(report.knowledge["component"]) == names
+    labels = report.figures()["knowledge"].axes[0].get_yticklabels()
+    assert {label.get_text() for label in labels} == names
+
+
+def test_names_that_are_given_win_over_those_of_the_environment():
+    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(LavaEnv(), 50), 50, names=("a", "b"))
+    assert set(report.knowledge["component"]) == {"a", "b"}
+
+
 def test_rounds_of_episodes_differ():
     model = tiny_tdpg(PROBLEM)
     env = make_episodes_env(PROBLEM, n_episodes=25)
@@ -444,10 +495,16 @@ def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the
     plain, watched = losses
     pd.testing.assert_series_equal(plain["rollout/ep_cost_mean"], watched["rollout/ep_cost_mean"])
     assert not [name for name in plain if name.startswith("mi/")]
-    assert {"mi/lower", "mi/upper", "mi/knows_x0", "mi/knows_x1"} <= set(watched)
+    assert {"mi/lower", "mi/upper", "mi/knows_d", "mi/knows_v"} <= set(watched)
     # The CSV logger fills what is missing in a row with nothing.
     assert watched["mi/upper"].notna().tolist() == [True, False, True, False]
     assert (watched["mi/lower"].dropna() <= watched["mi/upper"].dropna()).all()
+
+
+def test_a_callback_is_refused_where_an_epoch_has_too_few_episodes_for_an_interval():
+    model = tiny_tdpg(PROBLEM, n_episodes=min_episodes(2) - 1)
+    with pytest.raises(ValueError, match=r"n_episodes=19 are too few.* at least 20"):
+        train_epochs(model, 1, callback=InformationCallback())
 
 
 def test_a_callback_without_epochs_between_is_refused():

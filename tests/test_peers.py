@@ -105,6 +105,23 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
     assert (config["algo"], config["seed"], config["settings"]["gae_lambda"]) == (algo, 3, 0.7)
 
 
+def test_a_model_that_was_half_written_when_a_run_was_killed_is_trained_anew(tmp_path, tiny, monkeypatch):
+    run = Peer("peer", "Lava-v0", "ppo", dict(n_timesteps=20)).run("Lava-v0", 3)
+    save = PPO.save
+
+    def killed(self, path, *args, **kwargs):
+        Path(path).write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PPO, "save", killed)
+    with pytest.raises(KeyboardInterrupt):
+        complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=2)
+    monkeypatch.setattr(PPO, "save", save)
+    complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=2)
+    assert PPO.load(tmp_path / "run" / "model.zip", device="cpu").num_timesteps == 20
+    assert not list((tmp_path / "run").rglob("*.partial*"))
+
+
 def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp_path, tiny, monkeypatch):
     class Clock:
         now = 0.0

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from gymnasium import spaces
 from scipy.stats import binomtest, mannwhitneyu, trim_mean
 from small_problems import tiny_tdpg
 from stable_baselines3 import A2C, PPO
@@ -18,7 +19,8 @@ from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
 from sb3_tdpg.report.html import to_html
 from sb3_tdpg.report.models import label_of
-from sb3_tdpg.report.numbers import ALL, make_numbers
+from sb3_tdpg.report.numbers import make_numbers
+from sb3_tdpg.report.rows import ALL, make_rows
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rliable")
@@ -283,6 +285,39 @@ def test_bad_input_is_told_in_a_line(models, options, message, folder, tmp_path,
     assert re.search(message, error)
     assert len(error.splitlines()) == 1
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("content", ["{}", "[1]", '{"half": '])
+def test_a_folder_of_something_else_is_refused(content, folder, tmp_path, capsys):
+    (tmp_path / "config.json").write_text(content)
+    assert main(["report", f"{folder}/pg-seed0/model.zip", "--env", "Lava-v0", "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("config.json is there already and is not that of a report: choose another folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_a_line(folder, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main(["report", f"{folder}/pg-seed0/model.zip", "--env", "Lava-v0", "--out", str(tmp_path / "file")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(tmp_path / "file") in line
+
+
+def rows_of(*scenarios):
+    space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    return make_rows("Lava-v0", {}, space, 5, perturbations=["vector_noise"], scenarios=scenarios)
+
+
+@pytest.mark.parametrize("name", ["vector_noise", "unperturbed", ALL, "twice"])
+def test_scenarios_must_not_be_called_as_another_row_of_a_table(name):
+    with pytest.raises(ValueError, match=re.escape(f"['{name}'] name several rows")):
+        rows_of(Scenario(name, "Lava-v0"), *[Scenario("twice", "Lava-v0")] * (name == "twice"))
+    assert len(rows_of(Scenario("once", "Lava-v0"))) == 1 + 5 + 1
+
+
+def test_records_of_another_environment_are_no_records_of_this_one():
+    here, there = (rows_of(Scenario("x", env_id, {}))[-1] for env_id in ("Lava-v0", "Other-v0"))
+    assert here.file_name != there.file_name
 
 
 @pytest.mark.parametrize(

@@ -288,6 +288,8 @@ def test_tdpg_trains_on_perturbed_observations_with_the_true_states():
     ("colour", dict(perturbation="fog"), r"'fog' is unknown: use one of \['noise'"),
     ("colour", dict(perturbation="blur", severity=0), "severity=0 of 'blur' must be an integer from 1 to 5"),
     ("colour", dict(perturbation="blur", severity=2.5), "severity=2.5"),
+    ("colour", dict(perturbation="blur", severity=2.0), "severity=2.0"),
+    ("colour", dict(perturbation="blur", severity="2"), "severity='2'"),
     ("colour", dict(perturbation="blur", severity=True), "severity=True"),
     ("colour", dict(perturbation="blur", seed=-1), "seed=-1 must be None or an integer of at least 0"),
     ("colour", dict(perturbation="vector_noise"), "it is for vectors"),

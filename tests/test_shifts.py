@@ -22,6 +22,7 @@ from sb3_tdpg.evaluation.information import information_bounds, rollout_informat
 from sb3_tdpg.evaluation.shifts import (
     Shift,
     TrainingEpisodes,
+    _divergences,
     beta_kl,
     encode,
     gaussian_kl,
@@ -29,6 +30,7 @@ from sb3_tdpg.evaluation.shifts import (
     random_lava_shifts,
     record_episodes,
 )
+from sb3_tdpg.reproduction.certificate import _load
 from sb3_tdpg.runs import Run, complete_run
 from sb3_tdpg.tdpg import TDPG
 
@@ -166,6 +168,12 @@ def test_the_divergence_is_that_of_the_shifted_density_from_the_other(model, epi
         np.testing.assert_allclose(divergence, expected, rtol=1e-3, atol=1e-5)
 
 
+def test_a_small_divergence_is_not_rounded_away():
+    mean, std = th.zeros(3, 2), th.ones(3, 2)
+    (divergence,) = _divergences([Normal(mean + 1e-4, std)], [Normal(mean, std)])
+    np.testing.assert_allclose(divergence, 2 * 0.5e-8, rtol=1e-4)  # of two TRVs
+
+
 def test_a_shifted_start_makes_room_for_worse_divergences_later(episodes):
     noise = lava_shift("", sensor_noise_std=0.05)
     both = lava_shift("", sensor_noise_std=0.05, start_beta=(2.0, 1.0))
@@ -227,6 +235,11 @@ def test_the_information_is_that_of_the_log_det_bound(model, episodes):
 def test_bad_input_is_told(model):
     with pytest.raises(ValueError, match="n_budget_episodes=50 must be at least 1 and at most n_episodes=20"):
         TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=20, n_budget_episodes=50)
+    with pytest.raises(ValueError, match="n_episodes=2 must be at least 4, to estimate the information of 2 TRVs"):
+        TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=2, n_budget_episodes=1)
+    for wrong in (dict(confidence=1.5), dict(cost_bound=math.nan)):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))}={next(iter(wrong.values()))} must"):
+            TrainingEpisodes(None, TRAINING, **{**SMALL, **wrong})  # before it looks at the model
     normalized = tiny_tdpg(VecNormalize(DummyVecEnv([LavaEnv]), norm_reward=False), n_episodes=2)
     with pytest.raises(ValueError, match="VecNormalize"):
         TrainingEpisodes(normalized, TRAINING, **SMALL)
@@ -258,14 +271,39 @@ def test_certify_on_the_command_line(model, tmp_path, capsys):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["nothing.zip", "--env", "Lava-v0"], "nothing.zip cannot be read"),
+        (["nothing.zip"], "nothing.zip cannot be read"),
+        (["nothing.zip", "--env", "sb3_tdpg:Lava-v0"], "nothing.zip cannot be read"),
         (["nothing.zip", "--env", "BallCatch-v0"], "certify knows the shifts of Lava-v0 only"),
+        (["model.zip", "model.zip"], "model.zip is given twice"),
+        (["model.zip", "--seed", "-1"], "seed=-1 must be at least 0"),
+        (["model.zip", "--n-test-episodes", "1"], "n_test_episodes=1 must be at least 2"),
+        (["model.zip", "--confidence", "1.5"], "confidence=1.5 must lie between 0 and 1"),
+        (["model.zip", "--cost-bound", "nan"], "cost_bound=nan must be finite"),
+        # The shifts' divergences are from a uniform start and no bias.
+        (["model.zip", "--env-kwargs", "start_beta=[2,2]"], "leave start_beta out"),
+        (["model.zip", "--env-kwargs", "sensor_bias=[1,0]"], "leave sensor_bias out"),
+        (["model.zip", "--out", "model.zip"], "File exists"),
     ],
 )
-def test_bad_input_to_the_command_is_told_in_a_line(arguments, message, capsys, tmp_path, monkeypatch):
+def test_bad_input_to_the_command_is_told_in_a_line(arguments, message, model, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["certify", *arguments]) == 2
-    assert message in capsys.readouterr().err
+    monkeypatch.setattr("sb3_tdpg.evaluation.shifts.record_episodes", None)  # by then, nothing has been run
+    model.save("model.zip")
+    assert main(["certify", "--env", "Lava-v0", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_models_from_folders_of_one_name_are_all_certified(tmp_path):
+    paths = [tmp_path / name / "model.zip" for name in ("a", "b", "c/a")]
+    for path in paths:
+        path.parent.mkdir(parents=True)
+        tiny_tdpg().save(path)
+    assert list(_load(paths, TRAINING)) == ["TDPG", "TDPG (b/model)", "TDPG (a/model)"]
+    beside = tmp_path / "d" / "a" / "model.zip"
+    beside.parent.mkdir(parents=True)
+    tiny_tdpg().save(beside)
+    assert list(_load([*paths, beside], TRAINING))[3] == f"TDPG ({beside})"
 
 
 @pytest.mark.slow

@@ -152,6 +152,13 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     assert main([*command, "--n-trials", "5", "-n", "500"]) == 2  # TINY's -n comes first
     assert "is there with other settings, n_timesteps: 400 there, 500 here" in capsys.readouterr().err
 
+    results = {path.name: path.read_bytes() for path in folder.iterdir()}
+    elsewhere = ["--storage", "sqlite:///another.db", "--cost-limit", "1e5"]  # of the same name
+    assert main([*command, *elsewhere]) == 2
+    assert "holds a study with another cost_limit" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == results
+    assert not (here / "another.db").exists()
+
     train = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1"]
     assert main([*train, "--conf-file", str(folder / "best.yml")]) == 0
     where = ["--storage", str(folder / "study.log"), "--study-name", folder.name[6:], "--trial-id", best["number"]]

@@ -157,6 +157,16 @@ def test_dead_episodes_and_steps_with_too_few_of_them_do_not_reach_the_prior(n_c
 
 
 @pytest.mark.parametrize("n_components", [1, 3])
+def test_dead_episodes_cost_no_digits_however_far_away_the_living_are(n_components):
+    batch = random_batch(alive=half_dead())
+    batch = batch._replace(means=batch.means + 3000, trvs=batch.trvs + 3000, stds=0.01 * batch.stds)
+    living = batch.alive[2]
+    alone = InformationBatch(*(x[2:3, living] for x in batch[:4]))
+    estimator, expected = fitted(batch, n_components=n_components), fitted(alone, n_components=n_components)
+    th.testing.assert_close(estimator.prior_var[2:3], expected.prior_var, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("n_components", [1, 3])
 def test_the_gradient_is_that_of_the_bound_with_the_prior_held_fixed(n_components):
     batch = random_batch(n=12)
     estimator = fitted(batch, n_components=n_components).double()

@@ -34,9 +34,12 @@ _RANK_FACTOR = 1.04
 class CostDistribution(NamedTuple):
     """A distribution on M values that lies, with some confidence, stochastically above that of a cost."""
 
-    values: np.ndarray  # (M,), ascending
-    probabilities: np.ndarray  # (M,)
-    confidence: float | None  # None: no allowance for the sampling error was made
+    values: np.ndarray
+    """``(M,)``, ascending."""
+    probabilities: np.ndarray
+    """``(M,)``: of the values."""
+    confidence: float | None
+    """With which it lies above; None: no allowance for the sampling error was made."""
 
     def with_largest(self, probability: float) -> CostDistribution:
         """
@@ -68,10 +71,15 @@ class Certificate(NamedTuple):
     """A bound on an expected cost, and what it is made of: ``bound = risk + kl / beta``."""
 
     bound: float
-    beta: float  # inf: the bound is the largest cost; 0: it is the mean
-    risk: float  # the entropic risk at beta, with the allowance for the sampling error
-    kl: float  # nats
+    """On the expected cost."""
+    beta: float
+    """The best one, or the one given. inf: the bound is the largest cost; 0: it is the mean."""
+    risk: float
+    """The entropic risk at beta, with the allowance for the sampling error."""
+    kl: float
+    """The divergence in nats that the bound is for."""
     confidence: float | None
+    """With which the bound holds; None: no allowance for the sampling error was made."""
 
 
 def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:
@@ -128,14 +136,8 @@ def cost_distribution(
     if confidence is None:
         below, values = ranks / n, costs[ranks - 1]
     else:
-        if not 0 < confidence < 1:
-            raise ValueError(f"confidence={confidence} must lie between 0 and 1, or be None for no allowance")
-        if cost_bound is None or not np.isfinite(cost_bound):
-            raise ValueError(
-                f"cost_bound={cost_bound} must be finite for a confidence of {confidence}: without it one rare episode "
-                "could cost anything; give the largest cost that an episode can have, or confidence=None for an "
-                "estimate without allowance for the sampling error"
-            )
+        check_allowance(confidence, cost_bound)
+        assert cost_bound is not None
         if costs[-1] > cost_bound:
             raise ValueError(
                 f"a cost of {costs[-1]:g} exceeds cost_bound={cost_bound:g}: give a larger bound, or certify the "
@@ -144,6 +146,20 @@ def cost_distribution(
         below = beta_distribution.ppf((1 - confidence) / len(ranks), ranks, n + 1 - ranks)
         below, values = np.append(below, 1.0), np.append(costs[ranks - 1], cost_bound)
     return CostDistribution(values, np.diff(below, prepend=0.0), confidence)
+
+
+def check_allowance(confidence: float | None, cost_bound: float | None) -> None:
+    """Raise a ``ValueError`` if a confidence is none, or is asked for without a bound on the cost."""
+    if confidence is None:
+        return
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence={confidence} must lie between 0 and 1, or be None for no allowance")
+    if cost_bound is None or not np.isfinite(cost_bound):
+        raise ValueError(
+            f"cost_bound={cost_bound} must be finite for a confidence of {confidence}: without it one rare episode "
+            "could cost anything; give the largest cost that an episode can have, or confidence=None for an "
+            "estimate without allowance for the sampling error"
+        )
 
 
 def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = None) -> Certificate:

@@ -9,7 +9,7 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -70,8 +70,11 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     if not path.exists():
         return
-    found = json.loads(path.read_text())
-    found.pop("provenance", None)
+    try:
+        found = json.loads(path.read_text())
+        found.pop("provenance")
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
+        raise ValueError(f"{path} is there already and is not that of a {what}: choose another folder") from e
     wanted = jsonable(config)
     changed = sorted(key for key in found if found[key] != wanted.get(key))
     if changed:
@@ -112,10 +115,24 @@ def _version(package: str) -> str | None:
 
 def _command() -> str:
     """Return the command line without the folders of this machine: relative to where it was run."""
-    interpreter, *arguments = sys.orig_argv
     here = Path.cwd()
+    program, *arguments = as_typed(sys.orig_argv)
     relative = [str(Path(a).relative_to(here)) if Path(a).is_relative_to(here) else a for a in arguments]
-    return shlex.join([Path(interpreter).name, *relative])
+    return shlex.join([program, *relative])
+
+
+def as_typed(command: Sequence[str]) -> list[str]:
+    """
+    Return a command without the folder of its program.
+
+    A program that pip has installed is run by the interpreter beside it, which its user has not typed.
+
+    :param command: Interpreter and arguments.
+    """
+    interpreter, arguments = Path(command[0]), list(command[1:])
+    if arguments and interpreter.is_absolute() and Path(arguments[0]).parent == interpreter.parent:
+        return [Path(arguments[0]).name, *arguments[1:]]
+    return [interpreter.name, *arguments]
 
 
 def _git() -> dict[str, Any] | None:

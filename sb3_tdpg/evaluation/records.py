@@ -101,15 +101,18 @@ def run_episodes(
     :param deterministic: Act without noise.
     :param sensor: Wraps the environments inside the model's own wrappers.
     :param at_end: Called at the end of each episode.
-    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``
+    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``; the
+        first episodes of all environments, then the second ones, and so on, whichever ended first
     """
     final_infos: list[dict[str, float]] = []
+    begun: list[tuple[int, int]] = []  # of each: how many this environment had ended before, and which one it is
 
     def at_step(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
         # evaluate_policy appends an episode's return under the very same condition, right after this call.
         info = local_variables["info"]
         if local_variables["done"] and ("episode" in info or not local_variables["is_monitor_wrapped"]):
             final_infos.append(_final_columns(info))
+            begun.append((int(local_variables["episode_counts"][local_variables["i"]]), local_variables["i"]))
             if at_end is not None:
                 at_end()
 
@@ -129,8 +132,14 @@ def run_episodes(
             )
     finally:
         env.close()
-    episodes = pd.DataFrame(dict(episode=np.arange(n_episodes), cost=-np.asarray(returns), length=lengths))
-    return pd.concat([episodes, pd.DataFrame(final_infos)], axis=1)
+    # In the order of their ends, a number would stand for another start with every model and perturbation.
+    order = sorted(range(n_episodes), key=begun.__getitem__)
+    ended = pd.concat(
+        [pd.DataFrame(dict(cost=-np.asarray(returns), length=lengths)), pd.DataFrame(final_infos)], axis=1
+    )
+    records = ended.iloc[order].reset_index(drop=True)
+    records.insert(0, "episode", np.arange(n_episodes))
+    return records
 
 
 def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:

@@ -25,7 +25,13 @@ from torch.distributions import Normal, kl_divergence
 
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation.certificate import Certificate, CostDistribution, cost_distribution, worst_mean
+from sb3_tdpg.evaluation.certificate import (
+    Certificate,
+    CostDistribution,
+    check_allowance,
+    cost_distribution,
+    worst_mean,
+)
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
 from sb3_tdpg.information import InformationBatch, LogDet
@@ -65,19 +71,27 @@ class Shift:
 class Budget(NamedTuple):
     """How far a shift moves the TRVs; see :meth:`TrainingEpisodes.budgets`."""
 
-    kl: float  # nats
-    exceedance: float  # probability, in training, of episodes whose divergence is not counted in full
+    kl: float
+    """Nats."""
+    exceedance: float
+    """Probability, in training, of episodes whose divergence is not counted in full."""
 
 
 class ShiftCertificate(NamedTuple):
     """What is certified for one shift."""
 
-    bound: float  # the least of the following three
+    bound: float
+    """The least of the following three."""
     through_trvs: float
+    """By the divergence of the TRVs."""
     through_sensor: float
-    trivial: float  # cost_bound
+    """By that of the sensor, which does not know the policy."""
+    trivial: float
+    """What no episode can cost more than."""
     budget: Budget
-    sensor_kl: float  # of the whole episode, with the start's
+    """The divergence of the TRVs that ``through_trvs`` is for."""
+    sensor_kl: float
+    """Divergence of the sensor over the whole episode, with the start's, in nats."""
 
 
 class RecordedEpisodes(NamedTuple):
@@ -127,6 +141,8 @@ def lava_shift(
 ) -> Shift:
     """
     Declare a shift of the lava problem; see :class:`~sb3_tdpg.envs.lava.LavaEnv` for the keywords.
+
+    In training the sensor must have no bias, and the start must be uniform: the divergences are from there.
 
     :param training_noise_std: The sensor noise in training.
     """
@@ -186,7 +202,8 @@ class TrainingEpisodes:
     :param confidence: With which all certificates of this object hold, each; ``None``: without allowance for the
         sampling error. Half of the error probability goes to the cost's distribution, half to the divergence.
     :param seed: Of the episodes.
-    :raises ValueError: if the environment is none of this plugin's, or the model's own environment normalises.
+    :raises ValueError: if the environment is none of this plugin's, the model's own environment normalises, or a number
+        does not fit; no episode has been run by then.
     """
 
     def __init__(
@@ -205,6 +222,7 @@ class TrainingEpisodes:
                 f"n_budget_episodes={n_budget_episodes} must be at least 1 and at most n_episodes={n_episodes} and "
                 f"{EPISODES_AT_A_TIME}"
             )
+        check_allowance(confidence, cost_bound)
         self.model, self.scenario, self.seed = model, scenario, seed
         self._env = _pomdp(model, scenario)
         costs: list[np.ndarray] = []
@@ -376,6 +394,11 @@ def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
 
 def _information(recorded: RecordedEpisodes) -> float:
     """Bound the sum over t of I[x_t; x~_t] from above, by the log-det bound."""
+    n_episodes, trv_dim = recorded.last_trv_noise.shape
+    if n_episodes < trv_dim + 2:
+        raise ValueError(
+            f"n_episodes={n_episodes} must be at least {trv_dim + 2}, to estimate the information of {trv_dim} TRVs"
+        )
     means, stds = (th.stack([getattr(d, name) for d in recorded.densities[:-1]]).cpu() for name in ("mean", "stddev"))
     last = means[-1] + stds[-1] * recorded.last_trv_noise.cpu()
     trvs = th.cat([recorded.prev_trvs[1:].cpu(), last[None]])
@@ -385,8 +408,13 @@ def _information(recorded: RecordedEpisodes) -> float:
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
-    pairs = zip(shifted, training, strict=True)
-    return np.stack([kl_divergence(p, q).sum(dim=1).double().clamp(min=0).cpu().numpy() for p, q in pairs])
+    # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
+    pairs = ((_double(p), _double(q)) for p, q in zip(shifted, training, strict=True))
+    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in pairs])
+
+
+def _double(density: Normal) -> Normal:
+    return Normal(density.mean.double(), density.stddev.double())
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:

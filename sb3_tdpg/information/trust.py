@@ -15,7 +15,7 @@ from sb3_tdpg.information.interval import InformationInterval, information_inter
 
 NEAR_THE_CAP = 0.9  # of ln N
 FALSE_ALARM = 0.01  # probability of each check to fail without a cause, all time steps together
-NOISE_FACTOR = 2.0  # by which the data-processing check multiplies the encoder's standard deviation
+ADDED_VARIANCE = 3.0  # of the data-processing check's noise, in multiples of the encoder's mean variance
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,10 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
 
     - **shuffled pairs**: with every state paired with the TRVs of another episode there is no information, and the
       lower bound must not find any;
-    - **data processing**: a noisier copy of the TRVs (the encoder's standard deviation doubled) knows no more of the
-      state, so its lower limit must not be above the upper limit of the TRVs, nor its estimate above theirs;
+    - **data processing**: a noisier copy of the TRVs (the same noise added to all of a time step, so much that the
+      encoder's mean variance is four times as large) knows no more of the state, so its lower limit must not be above
+      the upper limit of the TRVs, nor its estimate above theirs (where both count as 0 if they are negative: then the
+      critic finds nothing, and its limit is 0);
     - **encoder density**: :math:`(\tilde x - \mu) / \sigma` must have mean square 1, or the density that every bound
       rests on is not that of the TRVs (actions and TRVs taken without noise, say).
 
@@ -126,14 +128,18 @@ def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float,
 def _data_processing(
     batch: InformationBatch, interval: InformationInterval, steps: np.ndarray, quantile: float, seed: int
 ) -> TrustCheck:
-    noisier = batch._replace(
-        trvs=batch.means + NOISE_FACTOR * (batch.trvs - batch.means), stds=NOISE_FACTOR * batch.stds
-    )
+    # Noise that knew how noisy the encoder is would tell something of its input: one variance for all of a time step.
+    variances = batch.stds.square()
+    if batch.alive is not None:
+        variances = variances.masked_fill(~batch.alive[..., None], 0.0)
+    n_living = batch.trvs.shape[1] if batch.alive is None else batch.alive.sum(1)[:, None, None].clamp(min=1)
+    stds = (batch.stds.square() + ADDED_VARIANCE * variances.sum(1, keepdim=True) / n_living).sqrt()
+    noisier = batch._replace(trvs=batch.means + (batch.trvs - batch.means) * stds / batch.stds, stds=stds)
     copy = information_interval(noisier, confidence=interval.confidence, seed=seed)
     name = "data processing"
     in_order = _worst(
         name,
-        (copy.estimates["critic"] - interval.estimates["critic"])[steps],
+        (copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0))[steps],
         quantile * np.hypot(copy.errors["critic"], interval.errors["critic"])[steps],
         "nats by which a noisier copy of the TRVs knows more, by the lower bound",
     )

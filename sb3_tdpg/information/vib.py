@@ -130,8 +130,9 @@ def _moments(
     :param pseudo: A Gaussian that counts as one more episode of every component, so that none is ever empty.
     :return: means and variances, ``(T, K, Z)``, and logarithms of the weights, ``(T, K)``
     """
-    # Around the origin of the batch: the second moments lose digits far from it.
-    origin = means.mean(dim=1, keepdim=True)
+    # Around the mean of the living: the second moments lose digits far from it.
+    weight = responsibility.sum(2, keepdim=True)
+    origin = (weight * means).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
     centred = means - origin
     count = responsibility.sum(1)[:, :, None]  # (T, K, 1)
     first = responsibility.mT @ centred

@@ -96,7 +96,7 @@ def robustness_report(
     loaded = load_all(sources, env_id, kwargs)
     _check_fit(loaded, rows)
     n_episodes = n_episodes or N_EPISODES["image" if shows_images(space) else "vector"]
-    plan = Plan(env_id, kwargs, n_episodes, seed, deterministic, scale)
+    plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
     config = dict(
         env_id=env_id,
         env_kwargs=kwargs,
@@ -110,14 +110,15 @@ def robustness_report(
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
 
-    records = complete_rows(plan, rows, sources, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar)
+    records = complete_rows(plan, rows, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar)
     numbers = make_numbers(records, seed=seed)
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     page = Page(env_id, kwargs, n_episodes, deterministic, names)
     page.figures = _draw(numbers, plan, rows, loaded, space, out)
     with torch_threads(1):
         page.knowledge = [_measure(plan, rows[0], *each, out) for each in _firsts(loaded)]
-    page.made = how_made(provenance()["command"], provenance(), [])
+    how = provenance()
+    page.made = how_made(how["command"], how, [])
     write_frame_atomically(records, out / "episodes.csv.xz")
     for name, frame in (("levels", numbers.levels), ("perturbations", numbers.groups)):
         write_frame_atomically(frame, out / f"{name}.csv")

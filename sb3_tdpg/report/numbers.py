@@ -13,9 +13,8 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdpg.evaluation.statistics import interquartile_means, probabilities_of_improvement
-from sb3_tdpg.report.rows import UNPERTURBED
+from sb3_tdpg.report.rows import ALL, UNPERTURBED
 
-ALL = "all perturbations"
 CLEAR = 0.95
 """Probability from which on a comparison counts as clear."""
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.report.numbers import ALL, CLEAR, MIN_CLEAR, Numbers
-from sb3_tdpg.report.rows import UNPERTURBED
+from sb3_tdpg.report.numbers import CLEAR, MIN_CLEAR, Numbers
+from sb3_tdpg.report.rows import ALL, UNPERTURBED
 
 MIN_SEEDS = 5
 """With fewer models of a method its interval says little."""

@@ -34,6 +34,7 @@ class Plan:
 
     :param env_id: A registered id.
     :param env_kwargs: Keywords of the environment as it is.
+    :param sources: Models by method: for other processes, files.
     :param n_episodes: Of each model in each row.
     :param seed: Of environments, policies and perturbations.
     :param deterministic: Act without noise.
@@ -42,6 +43,7 @@ class Plan:
 
     env_id: str
     env_kwargs: Mapping[str, Any]
+    sources: Mapping[str, Sequence[Source]]
     n_episodes: int
     seed: int
     deterministic: bool
@@ -93,7 +95,6 @@ def _sensor(plan: Plan, row: Row) -> Callable[[VecEnv], VecEnv] | None:
 def complete_rows(
     plan: Plan,
     rows: Sequence[Row],
-    sources: Mapping[str, Sequence[Source]],
     models: Mapping[str, Sequence[Any]],
     folder: Path,
     *,
@@ -105,8 +106,7 @@ def complete_rows(
 
     :param plan: How.
     :param rows: In what.
-    :param sources: Models by method, for other processes: files.
-    :param models: The same, loaded.
+    :param models: Those of the plan, loaded.
     :param folder: Where the files are.
     :param jobs: Processes; with 1 it is this one.
     :param progress_bar: Show a progress bar on stderr.
@@ -115,7 +115,7 @@ def complete_rows(
     folder.mkdir(parents=True, exist_ok=True)
     with tqdm(total=len(rows), initial=len(rows) - len(missing), unit="row", disable=not progress_bar) as progress:
         try:
-            for row, records in _completed(plan, missing, sources, models, min(jobs, len(missing))):
+            for row, records in _completed(plan, missing, models, min(jobs, len(missing))):
                 write_frame_atomically(records, folder / row.file_name)
                 progress.set_postfix_str(row.title, refresh=False)
                 progress.update()
@@ -132,11 +132,7 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _completed(
-    plan: Plan,
-    rows: Sequence[Row],
-    sources: Mapping[str, Sequence[Source]],
-    models: Mapping[str, Sequence[Any]],
-    jobs: int,
+    plan: Plan, rows: Sequence[Row], models: Mapping[str, Sequence[Any]], jobs: int
 ) -> Iterator[tuple[Row, pd.DataFrame]]:
     if jobs <= 1:
         with torch_threads(1):
@@ -144,7 +140,7 @@ def _completed(
                 yield row, run_row(plan, row, models)
         return
     context = mp.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, initializer=_init_worker, initargs=(plan, sources)) as pool:
+    with ProcessPoolExecutor(jobs, context, initializer=_init_worker, initargs=(plan,)) as pool:
         try:
             running = {pool.submit(_run_row_in_worker, row): row for row in rows}
             while running:
@@ -162,10 +158,10 @@ def _completed(
 _WORKER: dict[str, Any] = {}  # what a process of the pool loads once
 
 
-def _init_worker(plan: Plan, sources: Mapping[str, Sequence[Source]]) -> None:
+def _init_worker(plan: Plan) -> None:
     th.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    _WORKER.update(plan=plan, models=load_all(sources, plan.env_id, plan.env_kwargs))
+    _WORKER.update(plan=plan, models=load_all(plan.sources, plan.env_id, plan.env_kwargs))
 
 
 def _run_row_in_worker(row: Row) -> pd.DataFrame:

@@ -17,6 +17,7 @@ from sb3_tdpg.robustness import applicable, scene_perturbations
 from sb3_tdpg.robustness.registry import N_SEVERITIES, find
 
 UNPERTURBED = "unperturbed"
+ALL = "all perturbations"
 
 FAST: Mapping[str, Mapping[str, Any]] = MappingProxyType({"BallCatch-v0": dict(renderer="fast")})
 """Keywords that spare time and change next to nothing, by environment; a user's own win."""
@@ -47,9 +48,10 @@ class Row:
 
     @property
     def file_name(self) -> str:
-        """A name for a file of its records; another one if the keywords or the value of a severity change."""
+        """A name for a file of its records; another one if the environment or the value of a severity change."""
         slug = "".join(c if c.isalnum() else "-" for c in self.title.lower())
-        content = json.dumps(jsonable([self.title, self.kind, self.scenario.env_kwargs, self.value]), sort_keys=True)
+        env = [self.scenario.env_id, self.scenario.env_kwargs]
+        content = json.dumps(jsonable([self.title, self.kind, *env, self.value]), sort_keys=True)
         return f"{slug}-{hashlib.sha256(content.encode()).hexdigest()[:8]}.csv.xz"
 
 
@@ -104,7 +106,10 @@ def make_rows(
     for own in own_scenarios(env_id) if scenarios is None else scenarios:
         rows.append(Row(own.name, 0, "own", Scenario(own.name, own.env_id, {**env_kwargs, **own.env_kwargs})))
     titles = [row.title for row in rows]
-    if twice := sorted({title for title in titles if titles.count(title) > 1}):
+    # In the tables a perturbation's name stands for all its severities, and ALL for all of them.
+    groups = {ALL, *(row.perturbation for row in rows if row.kind != "own")}
+    of_groups = {row.title for row in rows if row.kind == "own"} & groups
+    if twice := sorted(of_groups | {title for title in titles if titles.count(title) > 1}):
         raise ValueError(f"{twice} name several rows of the report: rename the scenarios")
     return rows
 

@@ -63,9 +63,15 @@ def certify_lava(
     :param cost_bound: Certify the cost clipped there; default: ``wall_cost``.
     :param seed: Of the episodes and of the shifts.
     :return: the summary, as Markdown
+    :raises ValueError: if something does not fit; no episode has been run by then.
     """
     training = Scenario("Training", "Lava-v0", dict(env_kwargs or {}))
+    _check_training(training)
+    for name, value, least in (("seed", seed, 0), ("n_test_episodes", n_test_episodes, 2)):
+        if value < least:
+            raise ValueError(f"{name}={value} must be at least {least}")
     loaded = _load(models, training)
+    out.mkdir(parents=True, exist_ok=True)  # so that a folder that cannot be made is not told at the very end
     std = float(training.env_kwargs.get("sensor_noise_std", LAVA[0].env_kwargs["sensor_noise_std"]))
     bound = wall_cost(next(iter(loaded.values())).horizon) if cost_bound is None else cost_bound
     n_budget = min(N_BUDGET_EPISODES, n_episodes)
@@ -106,15 +112,28 @@ def certify_lava(
     return summary
 
 
+def _check_training(training: Scenario) -> None:
+    """The divergences are from a sensor without bias and a uniform start."""
+    given = [name for name in ("sensor_bias", "start_beta") if training.env_kwargs.get(name) is not None]
+    if given:
+        raise ValueError(
+            f"certify shifts the bias of the sensor and the start itself: leave {' and '.join(given)} out of env_kwargs"
+        )
+
+
 def _load(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
     models: dict[str, TDPG] = {}
+    if twice := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
+        raise ValueError(f"{twice[0]} is given twice")
     for path in paths:
         try:
             model = TDPG.load(path, device="cpu")
         except OSError as e:
             raise ValueError(f"{path} cannot be read ({e.strerror}): give .zip files that model.save() wrote") from e
-        label = "PG" if model.beta == math.inf else "TDPG"
-        models[label if label not in models else f"{label} ({path.parent.name}/{path.stem})"] = model
+        method = "PG" if model.beta == math.inf else "TDPG"
+        # As short as can be; the whole path is of one model only.
+        labels = (method, f"{method} ({path.parent.name}/{path.stem})", f"{method} ({path})")
+        models[next(label for label in labels if label not in models)] = model
     check_models_fit(models, [training])
     return models
 
@@ -254,7 +273,7 @@ def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float
     figure = _new_figure(WIDTH, 4.0)
     against_cost, against_size = figure.subplots(1, 2, sharey=True)
     shown = paper[paper["sensor_kl"] > 0]
-    for color, label in zip(cycle(reversed(PALETTE[:2])), random["model"].unique(), strict=False):
+    for color, label in zip(cycle(PALETTE), random["model"].unique(), strict=False):
         group, rows = (frame[frame["model"] == label] for frame in (random, shown))
         moved = group[group["sensor_kl"] > 0]
         against_cost.scatter(group["cost"], group["bound"], s=7, color=color, alpha=0.5, label=label, linewidths=0)

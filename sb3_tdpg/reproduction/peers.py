@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,7 +45,7 @@ class TimedRun(Run):
     """A run that leaves ``time.json`` in its folder: seconds that the training took, on the clock and of the CPU."""
 
     def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        """Train as :class:`~sb3_tdpg.runs.Run` does; a training that is resumed adds to its time."""
+        """Train as :class:`~sb3_tdpg.runs.Run` does; later calls add to its time, an interrupted one does not."""
         path = folder / "time.json"
         before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
         wall, cpu = time.perf_counter(), time.process_time()
@@ -89,7 +90,9 @@ class SB3Run(TimedRun):
         model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
         model.learn(n_timesteps, progress_bar=progress_bar)
         model.logger.close()
-        model.save(path)
+        partial = folder / "model.partial.zip"  # so that there is never half a model
+        model.save(partial)
+        os.replace(partial, path)
         return model, False
 
 

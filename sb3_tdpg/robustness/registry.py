@@ -72,7 +72,8 @@ class Perturbation:
 
         :raises ValueError: if the severity is no integer from 1 to 5.
         """
-        if isinstance(severity, bool) or severity not in range(1, N_SEVERITIES + 1):
+        is_whole = isinstance(severity, (int, np.integer)) and not isinstance(severity, bool)
+        if not (is_whole and 1 <= severity <= N_SEVERITIES):
             raise ValueError(f"severity={severity!r} of {self.name!r} must be an integer from 1 to {N_SEVERITIES}")
         return self.severities[severity - 1]
 

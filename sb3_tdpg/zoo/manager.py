@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import rl_zoo3.train
 import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.wrappers import HistoryWrapper, HistoryWrapperObsDict
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
 
@@ -113,11 +117,11 @@ class TDPGExperimentManager(ExperimentManager):
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if self.algo == "tdpg" and "n_envs" not in hyperparams:
             hyperparams["n_envs"] = self._count_episodes(hyperparams)
-        processed = super()._preprocess_hyperparams(hyperparams)
-        self.env_wrapper = processed[1]
+        processed, wrap, *others = super()._preprocess_hyperparams(hyperparams)
+        self.env_wrapper = None if wrap is None else partial(_wrap_with_horizon, wrap)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
-        return processed
+        return processed, self.env_wrapper, *others
 
     def _count_episodes(self, hyperparams: dict[str, Any]) -> int:
         """As many environments as an epoch has episodes if these go as a batch, otherwise a divisor of that."""
@@ -246,6 +250,16 @@ class _Resumed:
 
     def learn(self, _: int, **kwargs: Any) -> None:
         self.model.learn(self.model.remaining_timesteps, reset_num_timesteps=False, **kwargs)
+
+
+def _wrap_with_horizon(wrap: Callable[[gym.Env], gym.Env], env: gym.Env) -> gym.Env:
+    """Wrap an environment and show its horizon again, where the zoo's wrapper calls the length of its history so."""
+    wrapped = layer = wrap(env)
+    while layer is not env and isinstance(layer, gym.Wrapper):
+        if isinstance(layer, (HistoryWrapper, HistoryWrapperObsDict)):
+            del layer.horizon  # it has made its arrays, and reads this no more
+        layer = layer.env
+    return wrapped
 
 
 def _restore_selected(selection: SelectionCallback, model: TDPG) -> None:

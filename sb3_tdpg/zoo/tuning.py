@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
+from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.studies import open_storage, open_study, quiet_optuna, work
 from sb3_tdpg.tdpg import TDPG
@@ -33,6 +34,8 @@ from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
 OBJECTIVES = ("information", "shift")
 N_EVALUATIONS = 10
+# What a study was made of, beside its results.
+RECORD = "study.json"
 # What a trial keeps beside its value. The cost above the limit is a constraint, too.
 COST, INFORMATION = "cost", "information"
 
@@ -140,6 +143,8 @@ class TuningManager(TDPGExperimentManager):
             n_evaluations=self.n_evaluations,
             n_eval_episodes=self.n_eval_episodes,
         )
+        if Path(self.storage) != Path(self.save_path, "study.log"):  # of its own study the storage tells more
+            check_same_config(Path(self.save_path, RECORD), self._described(description), "study")
         quiet_optuna()
         study = open_study(
             open_storage(self.storage),
@@ -153,6 +158,9 @@ class TuningManager(TDPGExperimentManager):
         work(study, self.objective, self.max_total_trials or self.n_trials)
         self._write_results(study, description)
 
+    def _described(self, description: dict[str, Any]) -> dict[str, Any]:
+        return dict(study=self.study_name, **description)
+
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         if self.algo != "tdpg" or sampler_method != "tpe":
             return super()._create_sampler(sampler_method)
@@ -165,7 +173,7 @@ class TuningManager(TDPGExperimentManager):
         folder = Path(self.save_path)
         folder.mkdir(parents=True, exist_ok=True)
         write_frame_atomically(study.trials_dataframe(), folder / "trials.csv")
-        write_run_config(folder / "study.json", dict(study=self.study_name, **description))
+        write_run_config(folder / RECORD, self._described(description))
         best = best_trial(study)
         if best is None:
             print(
