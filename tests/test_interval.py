@@ -153,7 +153,7 @@ def test_the_standard_errors_are_those_of_repetitions(bound):
             estimates.append(interval_module.critic_bounds(step, np.random.default_rng(t))[0])
         else:
             estimates.append(getattr(interval_module, bound)(step))
-    values, errors = np.transpose(estimates)
+    values, errors = np.transpose([(estimate.value, estimate.error) for estimate in estimates])
     assert 0.75 < errors.mean() / values.std(ddof=1) < 1.4
 
 
