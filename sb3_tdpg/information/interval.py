@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 from scipy.optimize import brentq
+from scipy.optimize import brentq
 
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.information.density_critic import (
@@ -32,7 +33,7 @@ MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
 DIVISIONS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of quarters of the episodes into halves
 MAX_REDIVIDED = 300  # episodes that are divided more than once; bounds the time, and more gain little by it
 TINY = 1e-12  # nats
-SPENT = 0.5  # of the probability to miss; the rest is for what the limits neglect
+SPENT = 0.5  # of the probability to miss; the rest is for the skewness that the limits neglect
 MIN_HITS = 10  # pairs of a state with another episode's TRVs at the clip, to estimate the critic's denominator from
 
 LOWER_BOUNDS = ("critic",)
@@ -129,7 +130,8 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     which holds for any F that the samples have no part in. Half of the episodes fit the critic
     (:class:`~sb3_tdpg.information.density_critic.DensityCritic`), it is frozen, and the other half is fresh; then the
-    halves change places, and the mean of the two counts. Densities of the encoder alone give no such bound: they bound
+    halves change places, and the mean of the two counts. Up to 300 episodes are divided in three ways, and the mean of
+    these counts, since a division leaves out the pairs of episodes that it parts. Densities of the encoder alone give no such bound: they bound
     the information of its *input*, which may be larger.
 
     **Above** stands the smallest of three bounds on I[e_t; x~_t], which is not below I[x_t; x~_t], with
@@ -143,15 +145,17 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     Since the encoder's density is known, its noise is drawn anew: each episode counts with the mean over several draws
     of x~ given e, which lessens the error and changes no expectation.
 
-    Each limit is an estimate less or plus a multiple of its standard error, and misses with probability
-    ``(1 - confidence) / 2``; above, a third of this for each of the bounds, since the smallest is taken (Bonferroni).
-    The limits are asymptotic: they take the means over episodes as Gaussian. The interval holds for each step by
-    itself, not for all of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot
+    Each limit is an estimate less or plus a multiple of its standard error. The multiples spend half of the probability
+    to miss, ``1 - confidence``. The other half is for what they neglect: the limits are asymptotic, they take the means
+    over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too low comes
+    with a standard error that is too small. What is spent is shared between the limits according to the gap between the
+    estimates (:func:`miss_of_each_limit`); above, a third of a share is for each of the bounds, since the smallest is
+    taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot
     exceed about ``ln(N^2 / 40)``.
 
     :param batch: Rollouts ``(T, N, ...)`` that the encoder was not trained on since; the episodes are independent.
-    :param confidence: Probability that the interval of a step holds the truth.
-    :param seed: Of the division into halves and of the noise.
+    :param confidence: Probability, at least, with which the interval of a step holds the truth.
+    :param seed: Of the divisions into halves and of the noise.
     :raises ValueError: if the shapes do not fit, a value is not finite, or a standard deviation is not positive.
     """
     if not 0 < confidence < 1:
