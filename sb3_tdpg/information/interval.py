@@ -33,7 +33,7 @@ MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
 DIVISIONS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of quarters of the episodes into halves
 MAX_REDIVIDED = 300  # episodes that are divided more than once; bounds the time, and more gain little by it
 TINY = 1e-12  # nats
-SPENT = 0.5  # of the probability to miss; the rest is for the skewness that the limits neglect
+SPENT = 0.4  # of the probability to miss; the rest is for the skewness that the limits neglect
 MIN_HITS = 10  # pairs of a state with another episode's TRVs at the clip, to estimate the critic's denominator from
 
 LOWER_BOUNDS = ("critic",)
@@ -145,13 +145,13 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     Since the encoder's density is known, its noise is drawn anew: each episode counts with the mean over several draws
     of x~ given e, which lessens the error and changes no expectation.
 
-    Each limit is an estimate less or plus a multiple of its standard error. The multiples spend half of the probability
-    to miss, ``1 - confidence``. The other half is for what they neglect: the limits are asymptotic, they take the means
-    over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too low comes
-    with a standard error that is too small. What is spent is shared between the limits according to the gap between the
-    estimates (:func:`miss_of_each_limit`); above, a third of a share is for each of the bounds, since the smallest is
-    taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot
-    exceed about ``ln(N^2 / 40)``.
+    Each limit is an estimate less or plus a multiple of its standard error. The multiples spend two fifths of the
+    probability to miss, ``1 - confidence``. The rest is for what they neglect: the limits are asymptotic, they take the
+    means over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too low
+    comes with a standard error that is too small. What is spent is shared between the limits according to the gap
+    between the estimates (:func:`miss_of_each_limit`); above, a third of a share is for each of the bounds, since the
+    smallest is taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about
+    ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 40)``.
 
     :param batch: Rollouts ``(T, N, ...)`` that the encoder was not trained on since; the episodes are independent.
     :param confidence: Probability, at least, with which the interval of a step holds the truth.
