@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 from scipy.optimize import brentq
-from scipy.optimize import brentq
 
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.information.density_critic import (
@@ -88,12 +87,13 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
 
     The further the truth is from one bound, the less its limit can miss. It is worst at either end of the gap, where
     :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c standard errors from their bounds
-    (Imbens and Manski, 2004, Econometrica 72(6), equation 7): half each without a gap, all of it each with a wide one.
+    (Imbens and Manski, 2004, Econometrica 72(6)): half of it each without a gap, all of it each with a wide one.
 
     :param miss: Of both limits together.
-    :param gap: Upper less lower bound, in standard errors; below 0 it counts as 0.
+    :param gap: Upper less lower bound, in standard errors; below 0 and NaN count as 0.
+    :return: the probability to miss of each limit by itself
     """
-    normal, gap = NormalDist(), max(0.0, gap)  # in this order, NaN counts as 0, too
+    normal, gap = NormalDist(), max(0.0, gap)  # in this order also of NaN
 
     def excess(c: float) -> float:
         return normal.cdf(-c) + normal.cdf(-c - gap) - miss
@@ -131,8 +131,8 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     which holds for any F that the samples have no part in. Half of the episodes fit the critic
     (:class:`~sb3_tdpg.information.density_critic.DensityCritic`), it is frozen, and the other half is fresh; then the
     halves change places, and the mean of the two counts. Up to 300 episodes are divided in three ways, and the mean of
-    these counts, since a division leaves out the pairs of episodes that it parts. Densities of the encoder alone give no such bound: they bound
-    the information of its *input*, which may be larger.
+    these counts, since a division leaves out the pairs of episodes that it parts. Densities of the encoder alone give
+    no such bound: they bound the information of its *input*, which may be larger.
 
     **Above** stands the smallest of three bounds on I[e_t; x~_t], which is not below I[x_t; x~_t], with
     e_t = (x~_{t-1}, y_t) the input of the encoder, whose density q is known:
@@ -147,8 +147,8 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     Each limit is an estimate less or plus a multiple of its standard error. The multiples spend two fifths of the
     probability to miss, ``1 - confidence``. The rest is for what they neglect: the limits are asymptotic, they take the
-    means over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too low
-    comes with a standard error that is too small. What is spent is shared between the limits according to the gap
+    means over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too
+    low comes with a standard error that is too small. What is spent is shared between the limits according to the gap
     between the estimates (:func:`miss_of_each_limit`); above, a third of a share is for each of the bounds, since the
     smallest is taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about
     ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 40)``.
