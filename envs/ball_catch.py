@@ -72,6 +72,7 @@ class BallCatchEnv(POMDPEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
+    state_names = ("d (m)", "b_x (m)", "b_y (m)", "v_x (m/s)", "v_y (m/s)")
 
     def __init__(
         self,

@@ -45,6 +45,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
+    #: Optional: what each component of the state is called in figures, with its unit: ``("d (m)", "v (m/s)")``.
+    state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``: how many share the work of a batch.
     shares_work: bool = False
 

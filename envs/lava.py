@@ -47,6 +47,7 @@ class LavaEnv(POMDPEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    state_names = ("d (m)", "v (m/step)")
 
     def __init__(
         self,

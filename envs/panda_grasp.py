@@ -114,8 +114,10 @@ class PandaGraspEnv(POMDPEnv):
         self.motion = motion
         self.depth_noise_std = float(depth_noise_std)
         self.n_processes = n_processes
-        size = 4 if camera_range is None else 5
-        self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        self.state_names = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
+        if camera_range is not None:
+            self.state_names += ("camera height (m)",)
+        self.state_space = spaces.Box(-np.inf, np.inf, (len(self.state_names),), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
         self._last_details: list[dict[str, Any]] = []

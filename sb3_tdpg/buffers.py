@@ -18,15 +18,15 @@ from sb3_tdpg.information import InformationBatch
 class EpisodeBatch(NamedTuple):
     """An epoch's rollouts as tensors on the training device."""
 
-    observations: th.Tensor  # (T, N, *obs), y_t
-    states: th.Tensor  # (T, N, X), x_t
-    noise: th.Tensor  # (T, N, Z), eps_t
-    trvs: th.Tensor  # (T, N, Z), x~_t
-    means: th.Tensor  # (T, N, Z) of q(x~_t | x~_{t-1}, y_t)
-    stds: th.Tensor  # (T, N, Z)
-    actions: th.Tensor  # (T, N, U), u_t before clipping
-    costs: th.Tensor  # (T, N), zero after the end
-    alive: th.Tensor  # (T, N), 1.0 while the episode lasts
+    observations: th.Tensor  #: ``(T, N, *obs)``, y_t
+    states: th.Tensor  #: ``(T, N, X)``, x_t
+    noise: th.Tensor  #: ``(T, N, Z)``, eps_t
+    trvs: th.Tensor  #: ``(T, N, Z)``, x~_t
+    means: th.Tensor  #: ``(T, N, Z)`` of q(x~_t | x~_{t-1}, y_t)
+    stds: th.Tensor  #: ``(T, N, Z)``
+    actions: th.Tensor  #: ``(T, N, U)``, u_t before clipping
+    costs: th.Tensor  #: ``(T, N)``, zero after the end
+    alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
 
     def select(self, episodes: th.Tensor | slice) -> EpisodeBatch:
         """Only some episodes, by their columns."""

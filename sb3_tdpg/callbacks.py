@@ -15,6 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.information import InformationInterval, information_interval
 from sb3_tdpg.information.interval import component_estimates
+from sb3_tdpg.problem import read_problem
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
@@ -69,8 +70,9 @@ class InformationCallback(_TDPGCallback):
     It is made from the epoch's rollouts, which are fresh for it: they were made with the policy as it is, and each
     critic is fitted to other episodes than those that it is evaluated on. It needs no penalty, and changes nothing in
     the training. The keys are ``mi/lower`` and ``mi/upper``, the limits summed over time; for TensorBoard
-    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_x0``, ..., what the TRVs know at least of
-    each component of the state, averaged over the time steps at which it varies.
+    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_d``, ..., what the TRVs know at least of
+    each component of the state, averaged over the time steps at which it varies. A component is called as in the
+    environment's ``state_names``, without its unit, or ``x0``, ``x1``, ...
 
     :param eval_freq: Epochs from one interval to the next, beginning with the first.
     :param confidence: With which the interval of a time step holds the truth.
@@ -102,9 +104,10 @@ class InformationCallback(_TDPGCallback):
                     self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))
         if self.components:
             estimates, _ = component_estimates(batch, seed=model.epoch)
-            for k, values in enumerate(estimates.T):
+            names = read_problem(self.training_env).state_names
+            for name, values in zip(names, estimates.T, strict=True):
                 if np.isfinite(values).any():
-                    self.logger.record(f"mi/knows_x{k}", float(np.nanmean(values.clip(min=0))))
+                    self.logger.record(f"mi/knows_{name.split(' (')[0]}", float(np.nanmean(values.clip(min=0))))
 
 
 class Candidate(NamedTuple):

@@ -86,7 +86,7 @@ class TRVPolicy(BasePolicy):
     :param observation_space: A vector, or an image with channels first.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
-    :param horizon: T. The algorithm passes the environment's.
+    :param horizon: Number of time steps T; the algorithm passes the environment's.
     :param trv_dim: Number of TRVs Z; default: 2, 8, 16.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
         ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``.

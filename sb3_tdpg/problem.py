@@ -27,11 +27,13 @@ class Problem:
     :param horizon: Controls in an episode, T.
     :param state_dim: X
     :param state_is_observation: The environment tells no state, and the observation stands in for it.
+    :param state_names: Of the X components: the environment's ``state_names``, or ``x0``, ``x1``, ...
     """
 
     horizon: int
     state_dim: int
     state_is_observation: bool
+    state_names: tuple[str, ...]
 
     def initial_states(self, env: VecEnv, obs: np.ndarray) -> np.ndarray:
         """x_0 after a reset or an auto-reset of all environments: ``(E, X)``."""
@@ -61,7 +63,8 @@ def read_problem(env: VecEnv) -> Problem:
     """
     Learn the horizon and the state of an environment, without a step.
 
-    :raises ValueError: if it has no finite horizon, an unsuitable observation space, or no state where it needs one.
+    :raises ValueError: if it has no finite horizon, an unsuitable observation space, no state where it needs one, or
+        names that do not fit the state.
     """
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
         raise ValueError(
@@ -79,20 +82,35 @@ def read_problem(env: VecEnv) -> Problem:
         )
     state_space = _attribute(env, "state_space")
     if state_space is not None:
-        return Problem(int(horizon), int(np.prod(state_space.shape)), state_is_observation=False)
+        state_dim = int(np.prod(state_space.shape))
+        return Problem(int(horizon), state_dim, state_is_observation=False, state_names=_state_names(env, state_dim))
     observation_shape = env.observation_space.shape
     if observation_shape is None or len(observation_shape) > 1:
         raise ValueError(
             f"the mutual information is that of the true state, and an observation of shape {observation_shape} "
             f"cannot stand in for it: {BRING_THE_STATE}"
         )
-    return Problem(int(horizon), max(1, int(np.prod(observation_shape))), state_is_observation=True)
+    state_dim = max(1, int(np.prod(observation_shape)))
+    return Problem(int(horizon), state_dim, state_is_observation=True, state_names=_state_names(env, state_dim))
 
 
 def reward_threshold(env: VecEnv) -> float | None:
     """Return the return at which the environment counts as solved, if it was registered with one."""
     spec = _attribute(env, "spec")
     return None if spec is None else spec.reward_threshold
+
+
+def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
+    """Read the names of the components of the state; an environment need not have any."""
+    names = _attribute(env, "state_names")
+    if names is None:
+        return tuple(f"x{k}" for k in range(state_dim))
+    if isinstance(names, str) or len(names) != state_dim or len(set(names)) != state_dim:
+        raise ValueError(
+            f"the environment's state_names={names!r} must be {state_dim} different names, one for each component of "
+            'the state, with its unit: ("d (m)", "v (m/s)") for two. Leave the attribute out to have x0, x1, ...'
+        )
+    return tuple(str(name) for name in names)
 
 
 def _attribute(env: VecEnv, name: str) -> Any:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -24,34 +24,20 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.auto_weight import AutoWeight
-from sb3_tdpg.baselines import get_baseline
-from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
+from sb3_tdpg.buffers import EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.checks import check_action_space, check_arguments, check_beta, check_count, nearest_multiples
 from sb3_tdpg.defaults import defaults_for, fill_in
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
-from sb3_tdpg.losses import clipped_policy_loss, information_loss, normalized, policy_gradient_loss
-from sb3_tdpg.policies import RebuiltTRVs, TRVPolicy
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.policy_update import PolicyUpdate, TrainingDivergedError
 from sb3_tdpg.problem import Problem, read_problem, reward_threshold
 from sb3_tdpg.random_state import RandomState
 from sb3_tdpg.vec_env import make_episodes_env
 
+__all__ = ["TDPG", "TrainingDivergedError"]
+
 SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
-
-
-class TrainingDivergedError(ValueError):
-    """A loss is NaN or infinite. The model keeps the last good parameters."""
-
-
-class PolicyUpdate(NamedTuple):
-    """What an update of the policy works with."""
-
-    batch: EpisodeBatch
-    mi_coef: float
-    advantages: th.Tensor  # (T, N)
-    cost_scale: th.Tensor  # scalar, what the advantages were divided by
-    clip_range: float
-    old_log_prob: th.Tensor | None  # (T, N) of the policy that made the rollouts; None without a clip_range
 
 
 class TDPG(OnPolicyAlgorithm):
@@ -432,133 +418,11 @@ class TDPG(OnPolicyAlgorithm):
 
     def train(self) -> None:
         """Update encoder and action head (line 6 of alg:trv-policy)."""
-        update = self.begin_update()
+        update = PolicyUpdate(self)
         for _ in range(self.n_epochs):
-            for episodes in self._minibatches():
-                part = update.batch.select(episodes)
-                log_prob, rebuilt = self._evaluate(part, rebuild=update.mi_coef > 0.0)
-                information = None
-                if rebuilt is not None and update.mi_coef > 0.0:
-                    information = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
-                loss = self.loss(update, episodes, log_prob, information)
-                self.policy.optimizer.zero_grad()
-                loss.backward()
-                self.descend()
-        self.end_update(update)
-
-    def begin_update(self) -> PolicyUpdate:
-        """Prepare the update of the policy: what stays the same however often the rollouts are passed through."""
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        batch = self.rollout_buffer.episode_batch()
-        self._check_finite({"costs": batch.costs})
-        if self.auto_weight is not None:
-            assert self.information is not None
-            self._check_finite({"information": th.as_tensor(self.information)})
-            self.auto_weight.update(batch.costs.sum(0).mean().item(), float(self.information.sum()))
-        advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
-        cost_scale = th.ones(())
-        if self.normalize_advantage:
-            negligible = 1e-5 * batch.costs.abs().max()
-            advantages, cost_scale = normalized(advantages, batch.alive, negligible)
-
-        old_log_prob = None
-        clip_range = self.clip_range_schedule(self._current_progress_remaining)
-        if clip_range < math.inf:
-            with th.no_grad():
-                old_log_prob = th.empty_like(batch.costs)
-                for episodes in self._minibatches():
-                    part = batch.select(episodes)
-                    old_log_prob[:, episodes] = self._evaluate(part)[0]
-        return PolicyUpdate(batch, self.mi_coef, advantages, cost_scale, clip_range, old_log_prob)
-
-    def loss(
-        self,
-        update: PolicyUpdate,
-        episodes: th.Tensor | slice,
-        log_prob: th.Tensor,
-        information: th.Tensor | None,
-    ) -> th.Tensor:
-        """
-        Compute the loss of some episodes, and log it: their cost, and the penalty on the information.
-
-        :param update: What :meth:`begin_update` returned.
-        :param episodes: Their columns.
-        :param log_prob: of what was sampled, ``(T, n)``
-        :param information: I[x_t; x~_t] in nats, ``(T,)``; None without a penalty
-        :return: scalar
-        :raises TrainingDivergedError: if it is NaN or infinite.
-        """
-        advantages, alive = update.advantages[:, episodes], update.batch.alive[:, episodes]
-        if update.old_log_prob is None:
-            policy_loss = policy_gradient_loss(log_prob, advantages, alive)
-        else:
-            old = update.old_log_prob[:, episodes]
-            policy_loss = clipped_policy_loss(log_prob, old, advantages, alive, update.clip_range)
-            self._record_distance(log_prob.detach() - old, alive, update.clip_range)
-        loss = policy_loss
-        if information is not None:
-            penalty = update.mi_coef * information_loss(information)
-            loss = loss + penalty / update.cost_scale
-            self.logger.record_mean("train/mi_loss", penalty.item())
-        self._check_finite({"policy loss": policy_loss, "loss": loss})
-        self.logger.record_mean("train/policy_loss", policy_loss.item())
-        self.logger.record_mean("train/loss", loss.item())
-        return loss
-
-    def end_update(self, update: PolicyUpdate) -> None:
-        """Count the policy epoch, and log it."""
-        self.epoch += 1
-        self._n_updates += self.n_epochs
-        mean_cost = update.batch.costs.sum(0).mean().item()
-        total = 0.0 if self.information is None else float(self.information.sum())
-        self.logger.record("train/objective", mean_cost + update.mi_coef * total)
-        self.logger.record("train/mi_coef", update.mi_coef)
-        self.logger.record("train/trv_std", update.batch.stds.mean().item())
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _evaluate(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
-        return self.policy.evaluate_episodes(batch, self.encoder_gradient, self.bptt_steps, rebuild)
-
-    def _minibatches(self) -> Sequence[th.Tensor | slice]:
-        """Columns of the episodes of each minibatch: a random partition into nearly equal parts, or one of all."""
-        n_parts = 1 if self.batch_size is None else math.ceil(self.n_episodes / self.batch_size)
-        if n_parts == 1:
-            return [slice(None)]
-        # Nearly equal: nothing can be estimated from the one episode that might remain.
-        return th.randperm(self.n_episodes, device=self.device).tensor_split(n_parts)
-
-    def _record_distance(self, log_ratio: th.Tensor, alive: th.Tensor, clip_range: float) -> None:
-        """Log how far the policy has moved from that of the rollouts, as SB3's PPO does."""
-        log_ratio = th.where(alive > 0, log_ratio, 0.0)
-        n = alive.sum()
-        kl = (th.exp(log_ratio) - 1.0 - log_ratio).sum() / n  # http://joschu.net/blog/kl-approx.html
-        clipped = ((th.exp(log_ratio) - 1.0).abs() > clip_range).sum() / n
-        self.logger.record_mean("train/approx_kl", kl.item())
-        self.logger.record_mean("train/clip_fraction", clipped.item())
-
-    def _check_finite(self, values: dict[str, th.Tensor]) -> None:
-        """Stop, while the parameters are still good, if something is NaN or infinite."""
-        for name, value in values.items():
-            if not bool(th.isfinite(value).all()):
-                raise self._diverged(name)
-
-    def descend(self) -> None:
-        """Make one step along the gradients, unless they are not finite: then the parameters stay as they are."""
-        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
-        if not bool(th.isfinite(grad_norm)):
-            raise self._diverged("gradient")
-        self.logger.record_mean("train/grad_norm", grad_norm.item())
-        self.policy.optimizer.step()
-
-    def _diverged(self, name: str) -> TrainingDivergedError:
-        self._last_obs = None
-        return TrainingDivergedError(
-            f"the {name} of epoch {self.epoch} is NaN or infinite (after {self.num_timesteps} timesteps). The model "
-            "keeps the parameters from before this update. Check the environment's costs and observations; a smaller "
-            "learning_rate, max_grad_norm=1, or a larger encoder_var_floor in policy_kwargs help against exploding "
-            "log-probabilities"
-        )
+            for episodes in update.minibatches():
+                update.step(episodes)
+        update.finish()
 
     # -- learn, save, resume ----------------------------------------------------------------------------------
 

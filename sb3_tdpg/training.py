@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.tdpg import TDPG
@@ -32,8 +32,9 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     """
     Build model and callbacks from a block of settings, read as rl-zoo3 reads it.
 
-    ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper`` and ``callback`` are the zoo's keys; ``lin_1e-3`` is a learning
-    rate that falls linearly to zero; every other key is an argument of :class:`~sb3_tdpg.tdpg.TDPG`.
+    ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper``, ``normalize`` and ``callback`` are the zoo's keys;
+    ``lin_1e-3`` is a learning rate that falls linearly to zero; every other key is an argument of
+    :class:`~sb3_tdpg.tdpg.TDPG`.
 
     :param env_id: A registered id.
     :param block: The settings, as :func:`sb3_tdpg.hyperparams.load_hyperparams` gives them.
@@ -52,7 +53,8 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
     Make the environments of a training, and take what is about them out of its settings.
 
     :param env_id: A registered id.
-    :param settings: ``n_envs``, ``env_kwargs`` and ``vec_env_wrapper`` are removed.
+    :param settings: ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of
+        ``VecNormalize``, to which the zoo adds ``gamma``) are removed.
     """
     env_kwargs = settings.pop("env_kwargs", {})
     # In this process: runs are made side by side in processes of their own, and come out the same on any machine.
@@ -65,7 +67,8 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
     )
     for entry in settings.pop("vec_env_wrapper", []):
         env = _make(entry, env)
-    return env
+    normalize = settings.pop("normalize", None)
+    return env if normalize is None else VecNormalize(env, **{**normalize, "gamma": settings.get("gamma", 0.99)})
 
 
 def read_schedule(settings: dict[str, Any]) -> None:

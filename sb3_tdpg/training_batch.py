@@ -26,6 +26,7 @@ from sb3_tdpg.buffers import EpisodeBatch
 from sb3_tdpg.callbacks import MINECallback
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.policy_update import PolicyUpdate
 from sb3_tdpg.stacked import RandomStreams, StackedEstimator, StackedPolicy
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import BatchedVecEnv
@@ -221,7 +222,7 @@ class TrainingBatch:
 
     def _train(self) -> None:
         """See :meth:`~sb3_tdpg.TDPG.train`."""
-        updates = [self._of_member(k, model.begin_update) for k, model in enumerate(self.models)]
+        updates = [self._of_member(k, partial(PolicyUpdate, model)) for k, model in enumerate(self.models)]
         log_prob, rebuilt = self.policy.evaluate_episodes(
             self.batch, self.models[0].encoder_gradient, rebuild=self.has_penalty
         )
@@ -230,17 +231,17 @@ class TrainingBatch:
             batch = self.batch.information_batch()._replace(**rebuilt._asdict())
             information = list(self.estimator(batch))
         losses = [
-            self._of_member(k, partial(model.loss, update, slice(None), log_prob_k, information_k))
-            for k, (model, update, log_prob_k, information_k) in enumerate(
-                zip(self.models, updates, log_prob.chunk(len(self.models)), information, strict=True)
+            self._of_member(k, partial(update.loss, slice(None), log_prob_k, information_k))
+            for k, (update, log_prob_k, information_k) in enumerate(
+                zip(updates, log_prob.chunk(len(updates)), information, strict=True)
             )
         ]
         self.policy.zero_grad()
         th.stack(losses).sum().backward()
         self.policy.hand_out_gradients()
-        for k, (model, update) in enumerate(zip(self.models, updates, strict=True)):
-            self._of_member(k, model.descend)
-            model.end_update(update)
+        for k, update in enumerate(updates):
+            self._of_member(k, update.descend)
+            update.finish()
 
     @staticmethod
     def _of_member(k: int, call: Callable[[], Result]) -> Result:

@@ -61,6 +61,7 @@ class ToyEnv(gym.Env):
         gives_state=True,
         declares_horizon=True,
         nan_cost_in_episode=None,
+        state_names=None,
     ):
         self.observation_space = observation_space or spaces.Box(-1, 1, (2,), np.float32)
         self.action_space = action_space or spaces.Box(-1, 1, (1,), np.float32)
@@ -71,6 +72,7 @@ class ToyEnv(gym.Env):
         if gives_state:
             self.state_space = spaces.Box(-1, 1, (1,), np.float64)
         self.nan_cost_in_episode = nan_cost_in_episode
+        self.state_names = state_names
         self.n_resets = 0
         self.actions = []
 

@@ -80,7 +80,7 @@ class Workers:
         return "\n".join(" ".join(words) for words in self.lines("say"))
 
     def wait_for(self, kind, process):
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 120  # a machine may be busy
         while not self.lines(kind, process):
             assert time.monotonic() < deadline, f"no {kind} in the log: {[p.exitcode for p in self.processes]}"
             time.sleep(0.02)
@@ -90,7 +90,7 @@ class Workers:
 
     def join(self, processes):
         for process in processes:
-            process.join(40)
+            process.join(120)
         assert [process.exitcode for process in processes] == [0] * len(processes), self.said
 
     def stop(self):

@@ -28,6 +28,10 @@ class WithoutHorizon(ToyEnv):
         super().__init__(declares_horizon=False)
 
 
+class NamedTwice(LavaEnv):
+    state_names = ("d", "d")
+
+
 # Name of the case: what is done, and what the message must say (regular expressions, in any order).
 ARGUMENTS = {
     "beta zero": (dict(beta=0.0), "beta=0.0", "positive number", "inf"),
@@ -101,6 +105,11 @@ ARGUMENTS = {
     "image without a state": (
         dict(env=toy_vec_env(observation_space=IMAGE, gives_state=False)), r'info\["state"\]', "state_space", "reset"
     ),
+    "too many names of the state": (
+        dict(env=toy_vec_env(state_names=("d (m)", "v (m/s)"))), r"state_names=\('d \(m\)', 'v", "1 different", "x0"
+    ),
+    "names of the state as one text": (dict(env=toy_vec_env(state_names="d")), "state_names='d'", "1 different"),
+    "a name of the state twice": (dict(env=BatchedVecEnv(NamedTwice(), 20)), "state_names=.'d', 'd'.", "2 different"),
     "action bounds that are not finite": (
         dict(env=toy_vec_env(action_space=spaces.Box(-np.inf, np.inf, (1,), np.float32))), "action", "bound", "finite"
     ),

@@ -3,8 +3,10 @@ The Python of the README, of the documentation and of its notebooks runs; what t
 """
 
 import importlib
+import importlib.util
 import json
 import re
+import subprocess
 import warnings
 from pathlib import Path
 
@@ -131,6 +133,21 @@ def no_window(monkeypatch):
 def test_a_notebook_runs_from_top_to_bottom(notebook, tmp_path, monkeypatch, brief_training, no_window):
     monkeypatch.chdir(tmp_path)
     run_in_order(code_cells(notebook), notebook)
+
+
+def test_the_notebook_installs_the_wheel_beside_it_where_the_package_is_missing(tmp_path, monkeypatch):
+    _, first = next(code_cells(ROOT / "docs" / "notebooks" / "quickstart.ipynb"))
+    installed = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(subprocess, "check_call", installed.append)
+    with pytest.raises(FileNotFoundError, match="make wheel"):
+        exec(first, {})
+    Path("sb3_tdpg-0.1.0-py3-none-any.whl").touch()
+    exec(first, {})
+    assert [command[1:4] + command[-1:] for command in installed] == [
+        ["-m", "pip", "install", "sb3_tdpg-0.1.0-py3-none-any.whl[plots]"]
+    ]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The lava problem, step by step, and what every registered environment must satisfy."""
 
+import re
 import warnings
 
 import gymnasium as gym
@@ -157,6 +158,13 @@ def test_the_true_state_is_in_the_state_space_after_reset_and_after_every_step(e
             assert env.unwrapped.state_space.contains(info["state"])
             _, _, ended, _, info = env.step(env.action_space.sample())
         assert env.unwrapped.state_space.contains(info["state"])
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_every_component_of_the_state_has_a_name_with_a_unit(env_id):
+    env = gym.make(env_id).unwrapped
+    assert (len(env.state_names),) == env.state_space.shape
+    assert all(re.fullmatch(r".+ \(.+\)", name) for name in env.state_names)
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)

@@ -23,6 +23,7 @@ def test_the_heights_are_uniform_and_tell_nothing_of_the_mug(env):
     env.reset(seed=0)
     state = env._initial_state(20_000)
     assert env.state_space.shape == (5,) == state[0].shape
+    assert env.state_names[4:] == ("camera height (m)",)
     share, _ = np.histogram(state[:, 4], bins=10, range=(LOW, HIGH))
     np.testing.assert_allclose(share, 2000, atol=200)
     assert abs(np.corrcoef(state.T[[0, 1, 3, 4]])[3, :3]).max() < 0.03

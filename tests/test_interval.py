@@ -9,7 +9,8 @@ import torch as th
 from information_problems import gaussian_batch, gaussian_channels, half_dead, random_batch
 from small_problems import tiny_tdpg, train_epochs
 
-from sb3_tdpg import InformationCallback, make_episodes_env
+from sb3_tdpg import BatchedVecEnv, InformationCallback, make_episodes_env
+from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.evaluation import (
     information_report,
     information_timeline,
@@ -460,6 +461,34 @@ def test_the_report_on_a_policy_has_frames_a_badge_and_figures(tmp_path):
     env.close()
 
 
+class CalledEnv(LavaEnv):
+    """The lava problem with other names of its state."""
+
+    state_names = ("place", "speed")
+
+
+class NamelessEnv(LavaEnv):
+    """The lava problem whose state has no names."""
+
+    state_names = None
+
+
+@pytest.mark.parametrize(
+    "env_class, names",
+    [(LavaEnv, {"d (m)", "v (m/step)"}), (CalledEnv, {"place", "speed"}), (NamelessEnv, {"x0", "x1"})],
+)
+def test_the_report_calls_the_components_as_the_environment_does(env_class, names):
+    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(env_class(), 50), n_episodes=50, seed=0)
+    assert set(report.knowledge["component"]) == names
+    labels = report.figures()["knowledge"].axes[0].get_yticklabels()
+    assert {label.get_text() for label in labels} == names
+
+
+def test_names_that_are_given_win_over_those_of_the_environment():
+    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(LavaEnv(), 50), 50, names=("a", "b"))
+    assert set(report.knowledge["component"]) == {"a", "b"}
+
+
 def test_rounds_of_episodes_differ():
     model = tiny_tdpg(PROBLEM)
     env = make_episodes_env(PROBLEM, n_episodes=25)
@@ -504,7 +533,7 @@ def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the
     plain, watched = losses
     pd.testing.assert_series_equal(plain["rollout/ep_cost_mean"], watched["rollout/ep_cost_mean"])
     assert not [name for name in plain if name.startswith("mi/")]
-    assert {"mi/lower", "mi/upper", "mi/knows_x0", "mi/knows_x1"} <= set(watched)
+    assert {"mi/lower", "mi/upper", "mi/knows_d", "mi/knows_v"} <= set(watched)
     # The CSV logger fills what is missing in a row with nothing.
     assert watched["mi/upper"].notna().tolist() == [True, False, True, False]
     assert (watched["mi/lower"].dropna() <= watched["mi/upper"].dropna()).all()

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_tdpg.information.flat_adam import FlatAdam
+from sb3_tdpg.information.flat_adam import AveragedAdam, FlatAdam
 from sb3_tdpg.networks import BatchedLinear, BatchedMLP, TimeMLP
 
 T, N = 3, 5
@@ -95,3 +95,22 @@ def test_flat_adam_makes_the_steps_of_torchs_adam(by_hand):
         adam.step()
     for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         th.testing.assert_close(one, other)
+
+
+def test_averaged_adam_lends_the_average_of_the_parameters_and_goes_on_with_its_own():
+    th.manual_seed(0)
+    linear = nn.Linear(1, 1, bias=False)
+    averaged = AveragedAdam(0.1, decay=0.5)
+    values, average = [], None
+    for step in range(20):
+        if step in (0, 10):  # the second time the average must be kept
+            averaged.attach(linear)
+        average = linear.weight.item() if average is None else average
+        linear.weight.grad.fill_((-1.0) ** (step // 3))
+        averaged.step()
+        values.append(linear.weight.item())
+        past = min(0.5, (step + 1) / (step + 11))
+        average = past * average + (1 - past) * values[-1]
+        with averaged.averaged():
+            assert linear.weight.item() == pytest.approx(average, abs=1e-5)
+        assert linear.weight.item() == values[-1]

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import mannwhitneyu, trim_mean
+from scipy.stats import binomtest, mannwhitneyu, trim_mean
 from small_problems import tiny_tdpg
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -106,8 +106,8 @@ def test_the_table_shows_the_numbers(report):
     _, out = report
     levels = pd.read_csv(out / "levels.csv").set_index(["model", "perturbation", "severity"])
     row = levels.loc[("tdpg", "vector_delay", 5)]
-    page = (out / "report.md").read_text()
-    assert f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}] |" in page.split("## Every severity")[1]
+    section = (out / "report.md").read_text().split("## Every severity")[1]
+    assert f"{row['iqm']:.1f} [{row['low']:.1f},\N{NO-BREAK SPACE}{row['high']:.1f}] |" in section
 
 
 def test_an_unperturbed_row_is_what_evaluate_scenarios_gives(report, folder):
@@ -301,3 +301,23 @@ def test_a_report_of_other_models_is_refused(report, folder, capsys):
     arguments, _ = report
     assert main([arguments[0], *arguments[2:]]) == 2
     assert "another models" in capsys.readouterr().err
+
+
+def test_of_one_policy_that_fails_or_not_the_share_has_wilsons_interval():
+    failures = np.random.default_rng(0).random((3, 40)) < np.array([[0.0], [0.2], [0.4]])
+    rows = [("unperturbed", 0, "unperturbed"), ("x", 1, "sensor"), ("x", 2, "sensor")]
+    records = pd.DataFrame(
+        dict(model="A", train_seed=0, perturbation=p, severity=v, kind=k, episode=e, cost=float(failures[i, e]))
+        for i, (p, v, k) in enumerate(rows)
+        for e in range(40)
+    )
+    numbers = make_numbers(records)
+    for fails, row in zip(failures, numbers.levels.to_dict("records"), strict=True):
+        expected = binomtest(int(fails.sum()), 40).proportion_ci(0.95, "wilson")
+        assert (row["low"], row["high"]) == pytest.approx(tuple(expected))
+    # The mean of two rows is known better than one row, and never below 0.
+    group = numbers.groups.set_index("perturbation").loc["x"]
+    assert 0 < group["low"] < group["iqm"] < group["high"]
+    assert group["high"] - group["low"] < (numbers.levels["high"] - numbers.levels["low"]).iloc[1:].min()
+    records["cost"] += 0.5  # no shares any more
+    assert make_numbers(records).levels["low"][0] == 0.5

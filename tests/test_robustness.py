@@ -1,140 +1,37 @@
 """Every perturbation reaches the policy, in every episode, and never touches the state."""
 
 import functools
-from collections import namedtuple
-from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from small_problems import CountdownEnv, lava_env, tiny_tdpg, toy_vec_env, train_epochs
+from perturbed_problems import (
+    APPLYING,
+    HORIZON,
+    PROBLEMS,
+    SEVERITIES,
+    PictureEnv,
+    countdown,
+    differs,
+    dummy,
+    episodes,
+    pendulum,
+    perturbed,
+    run,
+)
+from small_problems import lava_env, tiny_tdpg, train_epochs
 from stable_baselines3.common.env_checker import check_env as sb3_check
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_tdpg import BatchedVecEnv, make_episodes_env
-from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.envs.textures import random_texture
+from sb3_tdpg import make_episodes_env
 from sb3_tdpg.robustness import (
     PERTURBATIONS,
     Perturbation,
     PerturbedObservation,
     PerturbedVecEnv,
-    applicable,
-    observation_scale,
     register,
 )
-
-SEVERITIES = (1, 2, 3, 4, 5)
-HORIZON = 8
-
-
-class PictureEnv(gym.Env):
-    """A camera that looks at another part of a picture at every step; the episodes of a name last 8, 9, ... steps."""
-
-    action_space = spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, name=0, layout="HWC", side=24):
-        self.lengths = 8 + name
-        self.layout, self.side = layout, side
-        shape = dict(HWC=(side, side, 3), CHW=(3, side, side), HW=(side, side))[layout]
-        self.observation_space = spaces.Box(0, 255, shape, np.uint8)
-        self.picture = random_texture(3)
-
-    def _observe(self):
-        at = int(self.x) % (128 - self.side)
-        image = self.picture[at : at + self.side, 3 * self.t : 3 * self.t + self.side]
-        return dict(HWC=image, CHW=image.transpose(2, 0, 1), HW=image[..., 0])[self.layout].copy()
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t, self.x = 0, self.np_random.uniform(0, 100)
-        return self._observe(), {"state": np.array([self.x])}
-
-    def step(self, action):
-        self.t += 1
-        self.x += float(action[0]) + self.np_random.normal()
-        info = {"state": np.array([self.x]), "cost": abs(self.x)}
-        return self._observe(), -info["cost"], self.t == self.lengths, False, info
-
-
-def dummy(make, n):
-    return DummyVecEnv([functools.partial(make, i) for i in range(n)])
-
-
-def pendulum(_=0):
-    return gym.make("Pendulum-v1", max_episode_steps=HORIZON)
-
-
-PROBLEMS = {
-    "colour": lambda n: BatchedVecEnv(BallCatchEnv(renderer="fast", horizon=HORIZON), n),
-    "channels last": lambda n: dummy(PictureEnv, n),
-    "grey": lambda n: dummy(lambda i: PictureEnv(i, "HW"), n),
-    "depth": lambda n: make_episodes_env("PandaGrasp-v0", n, use_processes=False),
-    "unbounded vector": lambda n: make_episodes_env("Lava-v0", n, env_kwargs=dict(horizon=HORIZON)),
-    "bounded vector": lambda n: dummy(pendulum, n),
-}
-
-
-def applying():
-    """Name every problem with every perturbation that applies to it."""
-    for problem, make in PROBLEMS.items():
-        env = make(1)
-        horizon = env.get_attr("horizon")[0] if env.has_attr("horizon") else None
-        for name in applicable(env.observation_space, horizon):
-            yield pytest.param(problem, name, id=f"{name}, {problem}")
-        env.close()
-
-
-APPLYING = list(applying())
-
-Run = namedtuple("Run", "observations starts states rewards dones terminal")
-
-
-def run(env, n_steps=None, seed=0):
-    """Roll out with fixed actions; everything as arrays ``(T + 1, N, ...)``, the start of an episode at its place."""
-    if n_steps is None:  # two episodes and the beginning of a third
-        n_steps = 2 if getattr(env.unwrapped, "env", None) is not None and env.unwrapped.env.horizon == 1 else 20
-    env.seed(seed)
-    rng = np.random.default_rng(1)
-    observations, starts = [env.reset()], [np.ones(env.num_envs, dtype=bool)]
-    kept = observations[0].copy()
-    states = [[info.get("state") for info in env.unwrapped.reset_infos]]
-    rewards, all_dones, terminal = [], [], []
-    for _ in range(n_steps):
-        actions = rng.uniform(-0.3, 0.3, (env.num_envs, *env.action_space.shape)).astype(np.float32)
-        seen, reward, dones, infos = env.step(actions)
-        observations.append(seen.copy())
-        starts.append(dones)
-        reset_infos = env.unwrapped.reset_infos
-        states.append([(reset_infos if done else infos)[i].get("state") for i, done in enumerate(dones)])
-        states.append([info.get("state") for info in infos])
-        rewards.append(reward)
-        all_dones.append(dones)
-        terminal.extend((i, info["terminal_observation"]) for i, info in enumerate(infos) if dones[i])
-    np.testing.assert_array_equal(observations[0], kept)  # what was handed out is not overwritten
-    return Run(np.stack(observations), np.stack(starts), states, np.array(rewards), np.array(all_dones), terminal)
-
-
-def perturbed(env, name, severity=3, seed=5, **kwargs):
-    return PerturbedVecEnv(env, name, severity, seed=seed, **kwargs)
-
-
-def differs(first, second):
-    """Whether observations ``(T, N, *obs)`` differ: ``(T, N)``."""
-    return (first != second).reshape(*first.shape[:2], -1).any(axis=2)
-
-
-def episodes(starts):
-    """Steps of the policy in each complete episode of each environment: (environment, slice)."""
-    for i in range(starts.shape[1]):
-        begins = np.flatnonzero(starts[:, i])
-        for begin, end in pairwise(begins):
-            yield i, slice(begin, end)
-
-
-# -- conformance -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -291,10 +188,6 @@ def test_environments_in_processes_show_the_same_as_in_this_one():
 # -- episodes --------------------------------------------------------------------------------------------------------
 
 
-def countdown(lengths=((4, 3), (2, 4))):
-    return DummyVecEnv([lambda i=i: CountdownEnv(i, lengths[i]) for i in range(len(lengths))])
-
-
 @pytest.mark.parametrize("severity", [1, 3])
 def test_a_delay_shows_what_was_some_steps_ago_and_nothing_of_an_earlier_episode(severity):
     plain, late = countdown(), PerturbedVecEnv(countdown(), "vector_delay", severity, scale=1.0)
@@ -386,172 +279,6 @@ def test_tdpg_trains_on_perturbed_observations_with_the_true_states():
         train_epochs(each, 1)
     np.testing.assert_array_equal(model.rollout_buffer.states[0], plain.rollout_buffer.states[0])
     assert (model.rollout_buffer.observations[0] != plain.rollout_buffer.observations[0]).all()
-
-
-# -- what each one does ----------------------------------------------------------------------------------------------
-
-
-def images_under(name, severity, images, **kwargs):
-    """Perturb a batch of images in one call."""
-    env = toy_vec_env(len(images), observation_space=spaces.Box(0, 255, images.shape[1:], np.uint8))
-    wrapped = perturbed(env, name, severity, **kwargs)
-    return wrapped._perturber(images)
-
-
-GREY = np.full((2, 3, 32, 32), 100, np.uint8)
-
-
-def test_noise_has_the_standard_deviation_of_its_severity():
-    for severity, std in enumerate((0.05, 0.10, 0.15, 0.20, 0.25), start=1):
-        residual = images_under("noise", severity, GREY.repeat(8, 0)).astype(float) - 100
-        # What is cut off lies beyond the median.
-        assert np.median(np.abs(residual)) / 0.6745 == pytest.approx(255 * std, rel=0.1)
-
-
-@pytest.mark.parametrize("name", [name for name, row in PERTURBATIONS.items() if row.kind == "image"])
-def test_what_it_is_given_stays_what_it_was_and_what_it_returns_is_new(name):
-    images = np.random.default_rng(0).integers(0, 256, (4, 3, 20, 20), dtype=np.uint8)
-    original = images.copy()
-    env = perturbed(toy_vec_env(4, observation_space=spaces.Box(0, 255, (3, 20, 20), np.uint8)), name)
-    for _ in range(4):
-        shown = env._perturber(images)
-        assert not np.shares_memory(shown, images)
-        kept = shown.copy()
-        env._perturber(images[::-1])
-        np.testing.assert_array_equal(shown, kept)
-    np.testing.assert_array_equal(images, original)
-
-
-def test_a_large_batch_has_as_many_draws_as_images():
-    images = images_under("occlusion", 3, np.zeros((150, 3, 32, 32), np.uint8))
-    assert len(np.unique(images, axis=0)) == 150
-
-
-def test_what_is_brighter_than_white_is_white():
-    images = images_under("brightness", 5, np.full((12, 3, 8, 8), 250, np.uint8))
-    assert set(np.unique(images)) == {250 - 102, 255}
-
-
-def test_minmax_noise_stretches_each_image_to_the_bounds():
-    images = images_under("noise_minmax", 1, GREY)
-    assert (images.min(axis=(1, 2, 3)) == 0).all()
-    assert (images.max(axis=(1, 2, 3)) == 255).all()
-
-
-def test_a_change_of_brightness_is_one_offset():
-    offsets = images_under("brightness", 3, GREY.repeat(8, 0)).astype(int) - 100
-    assert set(np.unique(offsets)) == {-51, 51}
-    assert (offsets == offsets[:, :1, :1, :1]).all()
-
-
-def test_turning_hues_leaves_grey_as_it_is_and_takes_red_to_green():
-    np.testing.assert_array_equal(images_under("hue", 4, GREY), GREY)
-    red = np.zeros_like(GREY)
-    red[:, 0] = 200
-    turned = images_under("hue", 4, red)  # 120 degrees
-    assert all((image.max(axis=(1, 2)) >= 199).sum() == 1 and image[0].max() <= 1 for image in turned)
-
-
-def test_a_blur_keeps_the_mean_and_is_as_wide_for_any_resolution():
-    for side in (40, 80):
-        step = np.zeros((1, 3, side, side), np.uint8)
-        step[..., side // 2 :] = 200
-        blurred = images_under("blur", 5, step)
-        assert blurred.mean() == pytest.approx(100, abs=1)
-        width = (
-            np.diff(blurred[0, 0, 0].astype(float)) * (np.arange(side - 1) + 0.5 - side / 2 + 0.5) ** 2
-        ).sum() / 200
-        assert np.sqrt(width) == pytest.approx(0.06 * side, rel=0.05)
-
-
-def test_dropped_pixels_are_black_in_all_channels():
-    share = (images_under("dropped_pixels", 5, GREY) == 0).all(axis=1).mean()
-    assert share == pytest.approx(0.4, abs=0.05)
-    assert set(np.unique(images_under("dropped_pixels", 5, GREY))) == {0, 100}
-
-
-def test_a_shifted_image_is_the_image_elsewhere():
-    image = PictureEnv(layout="CHW", side=64)
-    image.reset(seed=0)
-    original = image._observe()[None]
-    shifted = images_under("camera_shift", 3, original)
-    matches = [
-        (down, right)
-        for down in range(-6, 7)
-        for right in range(-6, 7)
-        if np.array_equal(
-            shifted[0, :, 8:-8, 8:-8], original[0, :, 8 + down : 56 + down, 8 + right : 56 + right]
-        )
-    ]  # fmt: skip
-    assert len(matches) == 1
-    assert np.hypot(*matches[0]) == pytest.approx(0.07 * 64, abs=1)
-
-
-@pytest.mark.parametrize("layout", ["HWC", "CHW"])
-def test_the_order_of_the_channels_makes_no_difference(layout):
-    for name in ("noise", "hue", "blur", "occlusion", "texture_overlay", "camera_shift"):
-        both = {}
-        for each in ("HWC", "CHW"):
-            both[each] = run(perturbed(DummyVecEnv([lambda each=each: PictureEnv(layout=each)]), name)).observations
-        np.testing.assert_array_equal(both["HWC"], both["CHW"].transpose(0, 1, 3, 4, 2))
-
-
-# -- scales of vectors -----------------------------------------------------------------------------------------------
-
-
-def test_vectors_are_perturbed_in_multiples_of_their_scale():
-    scale = np.array([0.0, 1.0, 10.0])
-    shown = run(PerturbedVecEnv(countdown(), "vector_bias", 4, scale=scale, seed=0), 5).observations
-    offsets = np.abs(shown - run(countdown(), 5).observations)
-    np.testing.assert_allclose(offsets, np.broadcast_to([0.0, 0.4, 4.0], offsets.shape), atol=1e-5)
-
-
-def test_bounds_give_the_scale_where_there_are_some():
-    env = perturbed(dummy(pendulum, 2), "vector_bias", 1)
-    np.testing.assert_allclose(env._perturber.sensor.scale, np.array([2, 2, 16]) / np.sqrt(12))
-
-
-def test_without_bounds_the_scale_is_measured_and_the_episodes_stay_what_they_were():
-    env, plain = lava_env(50), lava_env(50)
-    for each in (env, plain):
-        each.seed(4)
-    wrapped = PerturbedVecEnv(env, "vector_bias", 1)
-    scale = wrapped._perturber.sensor.scale
-    assert scale[0] == pytest.approx(1.7, abs=0.4)  # the robot is anywhere between 0 and 5 m
-    wrapped.reset(), plain.reset()
-    for first, second in zip(env.reset_infos, plain.reset_infos, strict=True):
-        np.testing.assert_array_equal(first["state"], second["state"])
-
-
-def test_the_measurement_leaves_no_trace_in_unseeded_environments_either():
-    for make in (lambda: lava_env(3), lambda: dummy(lambda i: gym.make("CartPole-v1"), 2)):
-        first, second = make(), make()
-        for env in (first, second):
-            env.seed(0)
-            env.reset()
-        scale = observation_scale(first)
-        assert scale.shape == first.observation_space.shape
-        assert (scale > 0).all()
-        np.testing.assert_array_equal(first.reset(), second.reset())
-        np.testing.assert_array_equal(observation_scale(first), scale)
-
-
-def test_a_model_can_act_in_the_measurement():
-    env = lava_env(50)
-    model = tiny_tdpg(VecNormalize(lava_env(), norm_reward=False))
-    calls = []
-    predict = model.predict
-    model.predict = lambda *args, **kwargs: calls.append(args) or predict(*args, **kwargs)
-    assert observation_scale(env, model).shape == (2,)
-    assert len(calls) >= 5
-    assert calls[1][1] is not None  # the recurrent state of the step before
-
-
-def test_bounds_that_mean_none_are_none():
-    vast = float(np.finfo(np.float32).max)
-    env = toy_vec_env(observation_space=spaces.Box(-vast, vast, (2,), np.float32))
-    scale = perturbed(env, "vector_noise")._perturber.sensor.scale
-    assert (scale < 2).all()
 
 
 # -- bad input -------------------------------------------------------------------------------------------------------

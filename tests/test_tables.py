@@ -158,6 +158,14 @@ def test_the_markdown_table_over_seeds_shows_the_interval_and_says_so():
     assert "paper" not in text  # a model by another name than the paper's has nothing beside it
 
 
+def test_one_training_seed_has_no_interval():
+    text = comparison_markdown(
+        aggregate_seeds(some_records({"ours": {"a|b": [1.0, 2.0]}}, train_seed=0)), SCENARIOS[:1]
+    )
+    assert r"| a\|b | 1.50 |" in text
+    assert "Mean episode cost of one training seed, hence without an interval." in text
+
+
 def test_the_markdown_table_says_it_when_each_training_seed_had_its_own_evaluation_seed():
     records = pd.concat([some_records({"A": {"a|b": [1.0]}}, train_seed=i).assign(seed=i) for i in range(3)])
     assert "evaluation seed 0, 1, 2, stochastic" in comparison_markdown(aggregate_seeds(records), SCENARIOS[:1])

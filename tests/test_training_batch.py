@@ -9,6 +9,7 @@ from small_problems import TINY_CRITIC, assert_same_parameters, parameters, tiny
 
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.policy_update import PolicyUpdate
 from sb3_tdpg.runs import Run, complete_run, complete_runs, train_together
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training_batch import Member, MemberDivergedError, TrainingBatch, batch_key
@@ -204,15 +205,15 @@ def test_a_batch_that_was_killed_goes_on_from_the_checkpoints(tmp_path, alone, m
 
 def test_one_that_diverges_does_not_take_the_others_with_it(tmp_path, alone, monkeypatch):
     tasks = runs(tmp_path)
-    loss = TDPG.loss
+    loss = PolicyUpdate.loss
 
-    def diverge(model, *arguments):
-        value = loss(model, *arguments)
-        if model.seed == 1 and model.epoch == 2 and model.mi_coef > 50:
-            raise model._diverged("loss")
+    def diverge(update, *arguments):
+        value = loss(update, *arguments)
+        if update.model.seed == 1 and update.model.epoch == 2 and update.mi_coef > 50:
+            raise update._diverged("loss")
         return value
 
-    monkeypatch.setattr(TDPG, "loss", diverge)
+    monkeypatch.setattr(PolicyUpdate, "loss", diverge)
     train_together(tasks, n_eval_episodes=4)
     trained = [(folder / "attempt0" / "model.zip").exists() for _, folder, _ in tasks]
     assert trained == [True, True, True, False]

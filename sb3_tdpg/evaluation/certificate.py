@@ -34,9 +34,12 @@ _RANK_FACTOR = 1.04
 class CostDistribution(NamedTuple):
     """A distribution on M values that lies, with some confidence, stochastically above that of a cost."""
 
-    values: np.ndarray  # (M,), ascending
-    probabilities: np.ndarray  # (M,)
-    confidence: float | None  # None: no allowance for the sampling error was made
+    values: np.ndarray
+    """``(M,)``, ascending."""
+    probabilities: np.ndarray
+    """``(M,)``: of the values."""
+    confidence: float | None
+    """With which it lies above; None: no allowance for the sampling error was made."""
 
     def with_largest(self, probability: float) -> CostDistribution:
         """
@@ -68,10 +71,15 @@ class Certificate(NamedTuple):
     """A bound on an expected cost, and what it is made of: ``bound = risk + kl / beta``."""
 
     bound: float
-    beta: float  # inf: the bound is the largest cost; 0: it is the mean
-    risk: float  # the entropic risk at beta, with the allowance for the sampling error
-    kl: float  # nats
+    """On the expected cost."""
+    beta: float
+    """The best one, or the one given. inf: the bound is the largest cost; 0: it is the mean."""
+    risk: float
+    """The entropic risk at beta, with the allowance for the sampling error."""
+    kl: float
+    """The divergence in nats that the bound is for."""
     confidence: float | None
+    """With which the bound holds; None: no allowance for the sampling error was made."""
 
 
 def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:

@@ -269,7 +269,7 @@ def _short(row: str) -> str:
 
 def _legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    columns = min(len(labels), 3)
+    columns = -(-len(labels) // -(-len(labels) // 3))  # as few rows as hold them by three, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 

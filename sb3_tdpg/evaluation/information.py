@@ -93,9 +93,10 @@ def information_report(
     :param env: Any number of environments.
     :param n_episodes: N; with fewer environments they are run in rounds.
     :param seed: Of the episodes, the policy's sampling and the estimates.
-    :param names: Of the components of the state; default: ``x0``, ``x1``, ...
-    :raises ValueError: if there are too few episodes for an interval at any time step.
+    :param names: Of the components of the state; default: the environment's ``state_names``, or ``x0``, ``x1``, ...
+    :raises ValueError: if there are too few episodes for an interval at any time step, or the names do not fit.
     """
+    names = read_problem(env).state_names if names is None else names
     batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
     interval = information_interval(batch, seed=seed)
     return InformationReport(

@@ -65,19 +65,27 @@ class Shift:
 class Budget(NamedTuple):
     """How far a shift moves the TRVs; see :meth:`TrainingEpisodes.budgets`."""
 
-    kl: float  # nats
-    exceedance: float  # probability, in training, of episodes whose divergence is not counted in full
+    kl: float
+    """Nats."""
+    exceedance: float
+    """Probability, in training, of episodes whose divergence is not counted in full."""
 
 
 class ShiftCertificate(NamedTuple):
     """What is certified for one shift."""
 
-    bound: float  # the least of the following three
+    bound: float
+    """The least of the following three."""
     through_trvs: float
+    """By the divergence of the TRVs."""
     through_sensor: float
-    trivial: float  # cost_bound
+    """By that of the sensor, which does not know the policy."""
+    trivial: float
+    """What no episode can cost more than."""
     budget: Budget
-    sensor_kl: float  # of the whole episode, with the start's
+    """The divergence of the TRVs that ``through_trvs`` is for."""
+    sensor_kl: float
+    """Divergence of the sensor over the whole episode, with the start's, in nats."""
 
 
 class RecordedEpisodes(NamedTuple):

@@ -100,6 +100,8 @@ def _paper_cell(result: PaperResult, digits: int) -> str:
 
 
 def _our_cell(cell: pd.Series, digits: int) -> str:
+    if cell.get("n_seeds") == 1:
+        return f"{cell['iqm']:.{digits}f}"  # one seed says nothing of the others
     if "iqm" in cell:
         return f"{cell['iqm']:.{digits}f} [{cell['low']:.{digits}f}, {cell['high']:.{digits}f}]"
     return f"{cell['mean']:.{digits}f} ({cell['std']:.{digits}f})"
@@ -107,7 +109,9 @@ def _our_cell(cell: pd.Series, digits: int) -> str:
 
 def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult], quantity: str) -> str:
     """Say what the numbers are and how they were made."""
-    if "iqm" in summary.columns:
+    if "iqm" in summary.columns and (summary["n_seeds"] == 1).all():
+        what = f"Mean {quantity} of one training seed, hence without an interval"
+    elif "iqm" in summary.columns:
         what = (
             f"Interquartile mean of the {quantity} over {_all(summary['n_seeds'])} training seeds "
             f"[{summary['level'].iloc[0]:.0%} bootstrap interval over seeds]"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import accumulate
 from typing import Any
 
@@ -88,3 +90,50 @@ class FlatAdam:
         moments = state["moments"]
         # Copies, as torch.optim makes them: the steps are made in place.
         self._moments = None if moments is None else (moments[0].clone(), moments[1].clone(), moments[2].clone())
+
+
+class AveragedAdam(FlatAdam):
+    """
+    :class:`FlatAdam` that also keeps an exponential moving average of the parameters (Polyak and Juditsky, 1992).
+
+    The average is free of most of the noise of minibatches, so that the learning rate may be large.
+
+    :param learning_rate: See :class:`FlatAdam`.
+    :param decay: The weight **on the past** of the average: 0.98 averages over about 50 steps. The first steps have
+        less: after t of them it is t / (t + 10).
+    """
+
+    def __init__(self, learning_rate: float, decay: float = 0.98) -> None:
+        super().__init__(learning_rate)
+        self.decay = decay
+        self._average: th.Tensor | None = None
+        self._n_steps = 0
+
+    def attach(self, module: nn.Module) -> None:
+        """See :meth:`FlatAdam.attach`; the average begins with the parameters that are attached first."""
+        super().attach(module)
+        if self._average is None:
+            self._average = self._vector.clone()
+
+    def step(self) -> None:
+        """Descend along the gradients that the parameters hold, and move the average."""
+        assert self._average is not None, "attach() first"
+        super().step()
+        self._n_steps += 1
+        self._average.lerp_(self._vector, 1 - min(self.decay, self._n_steps / (self._n_steps + 10)))
+
+    @contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Give the module the average of its parameters, for as long as the context lasts."""
+        assert self._average is not None, "attach() first"
+        own = self._vector.clone()
+        self._vector.copy_(self._average)
+        try:
+            yield
+        finally:
+            self._vector.copy_(own)
+
+    def forget(self) -> None:
+        """Start anew with the moments and the average."""
+        super().forget()
+        self._average, self._n_steps = None, 0

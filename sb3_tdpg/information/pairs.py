@@ -1,26 +1,32 @@
 """
 The information between two variables from i.i.d. pairs of them, with no policy around: fitted and read by folds.
 
-Dimension key: M problems, K folds, S = 2 starts of the critic, N pairs, R marginal samples for each pair, X and Z the
-components of the two variables, V = (4 X + 1) + (4 Z + 1) inputs of a critic: normal scores, radius, cosines of ranks.
+Dimension key: M problems, K folds, N pairs, R marginal samples for each pair, X and Z the components of the two
+variables, D components of either or both, J = 4 features of each: its normal score and three cosines of its rank.
 """
 
 from __future__ import annotations
 
+from math import lgamma
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from scipy.special import stdtrit
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator, Scores
-from sb3_tdpg.information.flat_adam import FlatAdam
+from sb3_tdpg.information.flat_adam import AveragedAdam
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.networks import BatchedMLP, ELUGradient
 
 STEPS_PER_CHECK = 50
+DEGREES_OF_FREEDOM = tuple(1.5**i for i in range(11))  # 1 to 58
+NORMAL = 1e6  # degrees of freedom that are as good as infinitely many
+N_SCATTER_STEPS = 5
+MIN_VARIANCE = 1e-2  # of what is brought to variance 1
 MARGINAL_SAMPLES = 16  # partners of others that x is also read with
 MIN_PAIRS_PER_FOLD = 10
 N_WAVES = 3
@@ -43,9 +49,9 @@ def estimate_information(
     estimator: str | type[InformationEstimator] = "mine",
     *,
     n_folds: int = 5,
-    max_gradient_steps: int = 500,
-    patience: int = 4,
-    learning_rate: float = 5e-3,
+    max_gradient_steps: int = 1000,
+    patience: int = 2,
+    learning_rate: float = 2e-2,
     batch_size: int | None = None,
     seed: int = 0,
     **kwargs: Any,
@@ -53,14 +59,16 @@ def estimate_information(
     r"""
     Estimate I[x; z] in nats from i.i.d. pairs of two continuous variables, held out fold by fold.
 
-    Every component is first replaced by the normal quantile of its rank, which leaves the information as it is and
-    takes away heavy tails. The critic is :math:`F = F_0 + \text{network}`. It starts once from the logarithmic density
-    ratio :math:`F_0` of a Gaussian with the training folds' covariance, and once from :math:`F_0 = 0`. The covariance
-    is that of x and z or, where that does better on the held-out pairs of all folds, of these and their radii (the
-    normal quantile of the rank of the Mahalanobis norm), with which it sees tails that come together. The network's
-    inputs are all these and three cosines of each rank.
+    Only the ranks of each component are used, which leaves the information as it is. The critic is
+    :math:`F = F_0 + \text{network}`. It starts from the logarithmic density ratio :math:`F_0` of a t-copula (Demarta
+    and McNeil, 2005): a multivariate Student's t, which also has tails that come together, of the t quantiles of the
+    ranks. Its scatter matrix is that of the training folds, and its degrees of freedom are the most likely ones for all
+    pairs. Where that does better on the held-out pairs of all folds, they are infinitely many, which makes a Gaussian,
+    or :math:`F_0 = 0`. The network's inputs are the normal scores and three cosines of each rank, those of x and z
+    together brought to covariance 1: where x and z depend on each other closely, the little in which they differ is
+    what counts. The network is read with the moving average of its weights.
 
-    Each of K folds is held out once. Which start, and after how many gradient steps, is decided for a fold by the
+    Each of K folds is held out once. After how many gradient steps a critic is read is decided for a fold by the
     estimates on the *other* folds, so that a fold's own luck is not chosen.
 
     :param x: ``(N, X)``, or ``(M, N, X)`` for M problems at once; ``(N,)`` counts as ``(N, 1)``.
@@ -68,9 +76,10 @@ def estimate_information(
     :param estimator: One with a critic: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, or a class of one's own.
     :param n_folds: K
     :param max_gradient_steps: The most steps of gradient ascent for each critic.
-    :param patience: Training ends after this many checks, one every 50 steps, with no better held-out estimate.
+    :param patience: Training ends after this many checks, one every 50 steps, with no better held-out estimate: after
+        100 steps where the start cannot be bettered.
     :param learning_rate: Adam's learning rate.
-    :param batch_size: Minibatch B; None: 100, or 32 for InfoNCE, which cannot tell more than ``ln B``.
+    :param batch_size: Minibatch B; None: 200, or 32 for InfoNCE, which cannot tell more than ``ln B``.
     :param seed: Of folds, weights and minibatches. PyTorch's global random state is left as it was.
     :param kwargs: Further arguments of the estimator's constructor, such as ``hidden_sizes``.
     :return: the estimate between its lower and its upper guess. For a critic with p parameters in a large sample, the
@@ -93,7 +102,7 @@ def estimate_information(
         if value < 1:
             raise ValueError(f"{name}={value} must be at least 1")
     if batch_size is None:
-        batch_size = 32 if issubclass(estimator_class, InfoNCE) else 100
+        batch_size = 32 if issubclass(estimator_class, InfoNCE) else 200
     kwargs = dict(kwargs, learning_rate=learning_rate, batch_size=batch_size)
     with th.random.fork_rng(devices=[]), th.no_grad():
         held_out, trained_on = _cross_fit(x, z, estimator_class, n_folds, max_gradient_steps, patience, seed, kwargs)
@@ -120,13 +129,13 @@ def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor,
     if n_folds < 2:
         raise ValueError(f"n_folds={n_folds} must be at least 2: one fold is held out while the others are trained on")
     n = arrays[0].shape[-2]
-    inputs = sum(array.shape[-1] + 1 for array in arrays)
-    # The covariance of the inputs is estimated on all folds but one.
-    fewest = max(MIN_PAIRS_PER_FOLD * n_folds, 4 * inputs)
+    n_components = sum(array.shape[-1] for array in arrays)
+    # Their covariance is estimated on all folds but one.
+    fewest = max(MIN_PAIRS_PER_FOLD * n_folds, 4 * n_components)
     if n < fewest:
         raise ValueError(
-            f"{n} pairs are too few: with n_folds={n_folds} and {inputs - 2} components in all, at least {fewest} are "
-            "needed"
+            f"{n} pairs are too few: with n_folds={n_folds} and {n_components} components in all, at least {fewest} "
+            "are needed"
         )
     single = arrays[0].ndim == 2
     first, second = (th.as_tensor(array[None] if single else array) for array in arrays)
@@ -145,65 +154,148 @@ def _ranks(x: th.Tensor) -> th.Tensor:
     return (below + not_above).mT.double() / (2 * x.shape[-2])
 
 
-def _normal_scores(x: th.Tensor) -> th.Tensor:
-    """The normal quantiles of the ranks: ``(..., N, D)``; a constant component becomes 0."""
-    return th.special.ndtri(_ranks(x))
+def _features(ranks: th.Tensor) -> th.Tensor:
+    """Normal scores, and cosines with which a small network sees more detail: ``(M, N, D) -> (M, N, J, D)``."""
+    waves = [2**0.5 * th.cos(th.pi * j * ranks) for j in range(1, N_WAVES + 1)]
+    return th.stack([th.special.ndtri(ranks), *waves], -2)
 
 
-def _with_radius(x: th.Tensor) -> th.Tensor:
-    """Append the radius: it is a function of the others, so the information stays: ``(M, N, D) -> (M, N, D + 1)``."""
-    covariance = _covariance(x)
-    radius = ((x @ th.linalg.inv(covariance)) * x).sum(-1, keepdim=True)
-    return th.cat([x, _normal_scores(radius)], -1)
+def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Find the means and the maps after which the features of each kind are uncorrelated, with variance 1, in all rows.
+
+    Where x and z depend on each other closely, the little in which they differ is what a network has to see.
+
+    :param features: of x and z, ``(rows, n, J, D)``
+    :return: ``(rows, 1, J, D)`` and ``(rows, J, D, D)``
+    """
+    mean = features.mean(1, keepdim=True)
+    centred = features - mean
+    variances, axes = th.linalg.eigh(th.einsum("rnjd,rnje->rjde", centred, centred) / features.shape[1])
+    return mean, (axes * variances.clamp(min=MIN_VARIANCE).rsqrt()[..., None, :]) @ axes.mT
 
 
-def _waves(scores: th.Tensor) -> th.Tensor:
-    """Cosines of the ranks, with which a small network sees more detail: ``(..., N, D) -> (..., N, 3 D)``."""
-    ranks = th.special.ndtr(scores)
-    return th.cat([2**0.5 * th.cos(th.pi * j * ranks) for j in range(1, N_WAVES + 1)], -1)
+def _t_scores(ranks: th.Tensor, nu: th.Tensor) -> th.Tensor:
+    """Quantiles of Student's t at the ranks, for ``(M,)`` degrees of freedom: ``(M, N, D) -> (M, N, D)``."""
+    n_ranks = 2 * ranks.shape[1]
+    # Of every rank that there may be, since quantiles are dear and ranks few.
+    quantiles = th.as_tensor(stdtrit(nu[:, None].numpy(), np.arange(1, n_ranks) / n_ranks))
+    return quantiles[th.arange(len(ranks))[:, None, None], (n_ranks * ranks).round().long() - 1]
 
 
-def _covariance(x: th.Tensor) -> th.Tensor:
-    """Covariance, kept invertible where components are constant or copies of each other: ``(..., D, D)``."""
-    centred = x - x.mean(-2, keepdim=True)
-    return centred.mT @ centred / x.shape[-2] + 1e-4 * th.eye(x.shape[-1], dtype=x.dtype)
+def _quadratic(y: th.Tensor, matrix: th.Tensor) -> th.Tensor:
+    """``y' matrix y`` of every sample: ``(rows, n, D) -> (rows, n, 1)``."""
+    return ((y @ matrix) * y).sum(-1, keepdim=True)
 
 
-class Quadratic(NamedTuple):
-    """A critic ``constant - (v - mean)' matrix (v - mean) / 2`` for each row: a Gaussian's logarithmic ratio."""
+def _scatter(y: th.Tensor, nu: th.Tensor) -> th.Tensor:
+    """
+    Scatter matrix of a multivariate t around 0, by a few EM steps towards its maximum likelihood.
 
-    matrix: th.Tensor  # (rows, V, V)
-    mean: th.Tensor  # (rows, 1, V)
+    It is kept invertible where components are constant or copies of each other.
+
+    :param y: ``(rows, n, D)``
+    :param nu: degrees of freedom, ``(rows,)``
+    :return: ``(rows, D, D)``
+    """
+    n, dim = y.shape[1:]
+    nu = nu[:, None, None]
+    scatter = th.eye(dim, dtype=y.dtype).expand(len(y), -1, -1)
+    for _ in range(N_SCATTER_STEPS):
+        weights = (nu + dim) / (nu + _quadratic(y, th.linalg.inv(scatter)))
+        scatter = (weights * y).mT @ y / n + 1e-4 * th.eye(dim, dtype=y.dtype)
+    return scatter
+
+
+def _degrees_of_freedom(ranks: th.Tensor) -> th.Tensor:
+    """Those of :data:`DEGREES_OF_FREEDOM` for which the t-copula of all components is the most likely: ``(M,)``."""
+    dim = ranks.shape[-1]
+    likelihoods = []
+    for nu in DEGREES_OF_FREEDOM:
+        all_nu = th.full((len(ranks),), nu, dtype=th.double)
+        y = _t_scores(ranks, all_nu)
+        scatter = _scatter(y, all_nu)
+        joint = (nu + dim) / 2 * th.log1p(_quadratic(y, th.linalg.inv(scatter)) / nu).mean((1, 2))
+        marginals = (nu + 1) / 2 * th.log1p(y**2 / nu).sum(-1).mean(1)
+        constant = lgamma((nu + dim) / 2) + (dim - 1) * lgamma(nu / 2) - dim * lgamma((nu + 1) / 2)
+        likelihoods.append(constant + marginals - joint - th.logdet(scatter) / 2)
+    return th.tensor(DEGREES_OF_FREEDOM, dtype=th.double)[th.stack(likelihoods).argmax(0)]
+
+
+class Start(NamedTuple):
+    r"""
+    What the critics are before they are trained: the logarithmic density ratio of a multivariate t, for each row.
+
+    With A the inverse of the scatter matrix of (x, z), and B and C those of its blocks of x and of z,
+
+    .. math::
+        c + \tfrac{\nu + X}{2} \ln(1 + x^\top B x / \nu) + \tfrac{\nu + Z}{2} \ln(1 + z^\top C z / \nu)
+        - \tfrac{\nu + X + Z}{2} \ln(1 + (x, z)^\top A (x, z) / \nu).
+
+    Only :math:`2 x^\top A z` takes both: the rest is worked out once for each x and each z, in :meth:`sides`.
+    """
+
+    joint: th.Tensor  # A, (rows, X + Z, X + Z)
+    of_x: th.Tensor  # B, (rows, X, X)
+    of_z: th.Tensor  # C, (rows, Z, Z)
+    nu: th.Tensor  # (rows, 1, 1)
     constant: th.Tensor  # (rows, 1, 1)
+    weight: th.Tensor  # (rows, 1, 1), 0 where the critic is to start from a constant
 
-    def __call__(self, v: th.Tensor) -> th.Tensor:
-        """``(rows, n, V) -> (rows, n, 1)``."""
-        centred = v - self.mean
-        return self.constant - 0.5 * ((centred @ self.matrix) * centred).sum(-1, keepdim=True)
+    @classmethod
+    def fit(cls, y: th.Tensor, n_x: int, nu: th.Tensor, weight: th.Tensor, level: float) -> Start:
+        """
+        Fit the scatter matrix to t-scores.
 
+        :param y: of x and z, ``(rows, n, X + Z)``
+        :param n_x: X
+        :param nu: degrees of freedom, ``(rows,)``
+        :param weight: ``(rows,)``
+        :param level: what is added: the score at which the critic says "no information"
+        """
+        scatter = _scatter(y, nu)
+        blocks = scatter, scatter[:, :n_x, :n_x], scatter[:, n_x:, n_x:]
+        signs = (1, -1, -1)
+        constant = th.lgamma(nu / 2)
+        for block, sign in zip(blocks, signs, strict=True):
+            constant = constant + sign * (th.lgamma((nu + block.shape[-1]) / 2) - th.logdet(block) / 2)
+        numbers = (number[:, None, None] for number in (nu, level + weight * constant, weight))
+        return cls(*(th.linalg.inv(block) for block in blocks), *numbers)
 
-def _gaussian_ratio(v: th.Tensor, x_inputs: list[int], z_inputs: list[int]) -> Quadratic:
-    """Log p(x, z) / p(x) p(z) of Gaussians with the samples' covariance; other inputs do not count."""
-    used = th.tensor(x_inputs + z_inputs)
-    joint = _covariance(v[..., used].double())
-    product = joint.clone()
-    n_x = len(x_inputs)
-    product[..., :n_x, n_x:] = 0
-    product[..., n_x:, :n_x] = 0
-    matrix = v.new_zeros(len(v), v.shape[-1], v.shape[-1])
-    matrix[:, used[:, None], used] = (th.linalg.inv(joint) - th.linalg.inv(product)).to(v)
-    constant = 0.5 * (th.logdet(product) - th.logdet(joint))
-    return Quadratic(matrix, v.mean(1, keepdim=True), constant[:, None, None].to(v))
+    def sides(self, x: th.Tensor, z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """What x and z bring to the ratio of any pair: ``(rows, n, X)`` and ``(rows, n, Z) -> (rows, n, Z + 2)``."""
+        n_x, n_z = x.shape[-1], z.shape[-1]
+        x_marginal = (self.nu + n_x) / 2 * th.log1p(_quadratic(x, self.of_x) / self.nu)
+        z_marginal = (self.nu + n_z) / 2 * th.log1p(_quadratic(z, self.of_z) / self.nu)
+        x_side = [2 * x @ self.joint[:, :n_x, n_x:], _quadratic(x, self.joint[:, :n_x, :n_x]), x_marginal]
+        return th.cat(x_side, -1), th.cat([z, _quadratic(z, self.joint[:, n_x:, n_x:]), z_marginal], -1)
+
+    def __call__(self, v: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Take the critic's inputs apart.
+
+        :param v: for either side what it brings to the network's inputs, then to this ratio, ``(rows, n, V)``
+        :return: the network's inputs and the ratio, ``(rows, n, J * (X + Z))`` and ``(rows, n, 1)``
+        """
+        x_side, z_side = v.chunk(2, -1)
+        n_z = self.of_z.shape[-1]
+        product = (x_side[..., -n_z - 2 : -2] * z_side[..., -n_z - 2 : -2]).sum(-1, keepdim=True)
+        own, marginals = (x_side[..., -2:] + z_side[..., -2:]).split(1, -1)
+        # Rounding may take the quadratic form below 0.
+        logarithm = th.log1p((own + product).clamp(min=0) / self.nu)
+        ratio = marginals - (self.nu + self.joint.shape[-1]) / 2 * logarithm
+        return x_side[..., : -n_z - 2] + z_side[..., : -n_z - 2], self.constant + self.weight * ratio
 
 
 class StartedMLP(BatchedMLP):
     """Networks that are added to a fixed critic, and are zero at first."""
 
-    start: Quadratic
+    start: Start
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """``(rows, n, V) -> (rows, n, 1)``."""
-        return self.start(x) + super().forward(x)
+        inputs, start = self.start(x)
+        return start + super().forward(inputs)
 
     def gradient_by_hand(self) -> ELUGradient:
         """Return the means to evaluate and differentiate this critic; see :class:`ELUGradient`."""
@@ -212,12 +304,13 @@ class StartedMLP(BatchedMLP):
 
 
 class _StartedGradient(ELUGradient):
-    def __init__(self, network: ELUGradient, start: Quadratic) -> None:
+    def __init__(self, network: ELUGradient, start: Start) -> None:
         self.__dict__.update(network.__dict__)
         self._start = start
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        return self._start(x) + super().forward(x)
+        inputs, start = self._start(x)
+        return start + super().forward(inputs)
 
 
 # -- folds ----------------------------------------------------------------------------------------------------
@@ -233,46 +326,72 @@ def _cross_fit(
     seed: int,
     kwargs: dict[str, Any],
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Train the critics of all problems, starts and folds as one network; ``(M,)`` held out and trained on."""
+    """Train the critics of all problems and folds as one network; ``(M,)`` held out and trained on."""
     th.manual_seed(seed)
-    n_problems, n = x.shape[:2]
-    x, z = _with_radius(_normal_scores(x)), _with_radius(_normal_scores(z))
+    n_problems, n, n_x = x.shape
+    ranks = th.cat([_ranks(x), _ranks(z)], -1)
     order = th.randperm(n)
     size = n // n_folds
     held_out = order[: size * n_folds].view(n_folds, size)
     train = th.stack([order[~th.isin(order, fold)] for fold in held_out])  # (K, N - N // K)
-
-    def rows(pairs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Pairs of every fold: ``(M * K, n, ...)``."""
-        return x[:, pairs].flatten(0, 1), z[:, pairs].flatten(0, 1)
-
-    x, z = (th.cat([variable, _waves(variable[..., :-1])], -1).float() for variable in (x, z))
     # What a critic has seen is read on the pairs of the next fold: over all folds each pair is read once by a critic
     # that was fitted to it, and once by one that was not.
-    training, fresh, seen = (rows(pairs) for pairs in (train, held_out, held_out.roll(-1, 0)))
-    n_rows = 2 * n_problems * n_folds
-    estimator, half = (estimator_class(rows, x.shape[-1], z.shape[-1], **kwargs) for rows in (n_rows, n_rows // 2))
-    gaussian = _best_gaussian(half, training, fresh, n_folds)
-    zero = Quadratic(th.zeros_like(gaussian.matrix), gaussian.mean, th.full_like(gaussian.constant, _level(estimator)))
-    start = Quadratic(*(th.cat(parts) for parts in zip(gaussian, zero, strict=True)))
-    th.manual_seed(seed)  # anew: how much was drawn above depends on the number of problems
-    critic = _new_critic(estimator, start, n_folds)
-    # For either start.
-    training, fresh, seen = ((a.repeat(2, 1, 1), b.repeat(2, 1, 1)) for a, b in (training, fresh, seen))
+    parts = (train, held_out, held_out.roll(-1, 0))
 
-    def check() -> th.Tensor:
-        """Estimates held out and trained on: ``(2, S, M, K)``."""
-        values = [_read(estimator, critic, *pairs) for pairs in (fresh, seen)]
-        return th.stack([value.view(2, n_problems, n_folds) for value in values])
+    def rows(values: th.Tensor, pairs: th.Tensor) -> th.Tensor:
+        """Pairs of every fold: ``(M, N, ...) -> (M * K, n, ...)``."""
+        return values[:, pairs].flatten(0, 1)
 
-    history = [check()]
+    features = _features(ranks)
+    mean, axes = _whiten(rows(features, train))
+    n_inputs = features.shape[2] * features.shape[3]
+    n_sides = n_inputs + z.shape[-1] + 2
+    n_rows = n_problems * n_folds
+    estimator = estimator_class(n_rows, n_sides, n_sides, **kwargs)
+
+    def started(nu: th.Tensor, weight: th.Tensor) -> tuple[StartedMLP, list[tuple[th.Tensor, th.Tensor]]]:
+        """Critics, and their inputs on all ``parts``, for ``(M,)`` degrees of freedom and weights of the start."""
+        th.manual_seed(seed)
+        y = _t_scores(ranks, nu)
+        nu, weight = (number.repeat_interleave(n_folds) for number in (nu, weight))
+        start = Start.fit(rows(y, train), n_x, nu, weight, _level(estimator))
+        inputs = []
+        for pairs in parts:
+            centred, scores = rows(features, pairs) - mean, rows(y, pairs)
+            of_network = [
+                th.einsum("rnjd,rjde->rnje", centred[..., part], axes[:, :, part]).flatten(2)
+                for part in (slice(n_x), slice(n_x, None))
+            ]
+            of_start = start.sides(scores[..., :n_x], scores[..., n_x:])
+            x_side, z_side = (th.cat(both, -1).float() for both in zip(of_network, of_start, strict=True))
+            inputs.append((x_side, z_side))
+        sizes = (n_inputs, *estimator.sizes[1:])
+        return _new_critic(estimator, sizes, Start(*(field.float() for field in start)), n_folds), inputs
+
+    def read(critic: StartedMLP, *inputs: tuple[th.Tensor, th.Tensor]) -> th.Tensor:
+        """Estimates from each of the inputs: ``(len(inputs), M, K)``."""
+        return th.stack([_read(estimator, critic, *pair).view(n_problems, n_folds) for pair in inputs])
+
+    # The start is what the held-out pairs of all folds say: a t's ratio, a Gaussian's or none.
+    ones = th.ones(n_problems, dtype=th.double)
+    values = []
+    candidates = (NORMAL * ones, _degrees_of_freedom(ranks))
+    for nu in candidates:
+        critic, inputs = started(nu, ones)
+        values.append(read(critic, inputs[1])[0].mean(-1))
+    nu = th.where(values[1] > values[0], candidates[1], candidates[0])
+    critic, (training, fresh, seen) = started(nu, (th.fmax(*values) > 0).double())
+
+    optimizer = AveragedAdam(estimator.learning_rate)
+    optimizer.attach(critic)
+    history = [read(critic, fresh, seen)]
     best = history[0][0].mean(-1)
-    n_stale, last = th.zeros_like(best), th.full_like(best, th.inf)  # (S, M)
-    optimizer = FlatAdam(estimator.learning_rate)
+    n_stale, last = th.zeros_like(best), th.full_like(best, th.inf)  # (M,)
     while th.isinf(last).any() and (done := (len(history) - 1) * STEPS_PER_CHECK) < max_gradient_steps:
         n_steps = min(STEPS_PER_CHECK, max_gradient_steps - done)
         estimator._ascend(critic, optimizer, *training, None, th.arange(n_rows), n_steps)
-        history.append(check())
+        with optimizer.averaged():
+            history.append(read(critic, fresh, seen))
         current = history[-1][0].mean(-1)
         n_stale = th.where(current > best, 0.0, n_stale + 1)
         best = best.fmax(current)
@@ -285,33 +404,11 @@ def _level(estimator: CriticEstimator) -> float:
     return 1.0 if isinstance(estimator, Nwj) else 0.0
 
 
-def _best_gaussian(
-    estimator: CriticEstimator,
-    training: tuple[th.Tensor, th.Tensor],
-    fresh: tuple[th.Tensor, th.Tensor],
-    n_folds: int,
-) -> Quadratic:
-    """The Gaussian's log ratio for every problem and fold, with or without the radii, as its held-out pairs decide."""
-    v = th.cat(training, -1)
-    n_x, n_z = (part.shape[-1] // (1 + N_WAVES) for part in training)  # components, as _waves laid them out
-    candidates, values = [], []
-    for radius in (0, 1):
-        x_inputs, z_inputs = range(n_x + radius), range(training[0].shape[-1], training[0].shape[-1] + n_z + radius)
-        ratio = _gaussian_ratio(v, [*x_inputs], [*z_inputs])
-        ratio = ratio._replace(constant=ratio.constant + _level(estimator))
-        critic = _new_critic(estimator, ratio, n_folds)
-        value = _read(estimator, critic, *fresh)
-        candidates.append(ratio)
-        values.append(value.view(-1, n_folds).mean(1))
-    with_radius = (values[1] > values[0]).repeat_interleave(n_folds)[:, None, None]
-    return Quadratic(*(th.where(with_radius, b, a) for a, b in zip(*candidates, strict=True)))
-
-
-def _new_critic(estimator: CriticEstimator, start: Quadratic, n_folds: int) -> StartedMLP:
+def _new_critic(estimator: CriticEstimator, sizes: tuple[int, ...], start: Start, n_folds: int) -> StartedMLP:
     """Make critics that equal ``start``, whose networks begin alike in every problem: the batch changes no result."""
-    networks = BatchedMLP(n_folds, estimator.sizes, estimator.activation_fn)
+    networks = BatchedMLP(n_folds, sizes, estimator.activation_fn)
     with th.random.fork_rng(devices=[]):  # what is drawn here is overwritten
-        critic = StartedMLP(len(start.matrix), estimator.sizes, estimator.activation_fn)
+        critic = StartedMLP(len(start.nu), sizes, estimator.activation_fn)
     critic.start = start
     for parameter, fold in zip(critic.parameters(), networks.parameters(), strict=True):
         parameter.copy_(fold.repeat(len(parameter) // n_folds, 1, 1))
@@ -337,22 +434,20 @@ def _read(estimator: CriticEstimator, critic: BatchedMLP, x: th.Tensor, z: th.Te
 
 def _choose(history: th.Tensor, last: th.Tensor, lowest: float, highest: float) -> tuple[th.Tensor, th.Tensor]:
     """
-    Choose start and length of training for each fold by what the other folds say of them.
+    Choose the length of training for each fold by what the other folds say of it.
 
-    :param history: ``(checks, 2, S, M, K)``, held out and trained on
-    :param last: ``(S, M)``, the last check at which a problem was still in training
+    :param history: ``(checks, 2, M, K)``, held out and trained on
+    :param last: ``(M,)``, the last check at which a problem was still in training
     :param lowest: an estimate below it, of any fold, is that of a critic that has diverged, which is not chosen
     :param highest: likewise for one above it
     :return: ``(M,)`` held out and trained on
     """
-    n_checks = len(history)
-    counts = th.arange(n_checks)[:, None, None] <= last
+    counts = th.arange(len(history))[:, None] <= last
     counts &= ((history >= lowest) & (history <= highest)).all(-1).all(1)  # NaN compares false
-    options = history.transpose(0, 1).flatten(1, 2)  # (2, checks * S, M, K)
-    held_out = options[0].masked_fill(~counts.flatten(0, 1)[..., None], -th.inf)
+    held_out = history[:, 0].masked_fill(~counts[..., None], -th.inf)  # (checks, M, K)
     others = th.stack(
         [held_out[..., th.arange(held_out.shape[-1]) != k].sum(-1) for k in range(held_out.shape[-1])], -1
     )
     chosen = others.argmax(0, keepdim=True)  # (1, M, K)
-    first, second = (option.gather(0, chosen)[0].mean(-1) for option in options)
+    first, second = (history[:, i].gather(0, chosen)[0].mean(-1) for i in range(2))
     return first, second

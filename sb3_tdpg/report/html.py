@@ -14,8 +14,8 @@ h2 { border-bottom: 1px solid #ddd; padding-bottom: 0.2rem; }
 img { max-width: 100%; height: auto; display: block; margin: 0.8rem auto; }
 table { border-collapse: collapse; display: block; overflow-x: auto; font-size: 0.85rem; margin: 0.8rem 0;
   font-variant-numeric: tabular-nums; }
-th, td { padding: 0.25rem 0.7rem; border-bottom: 1px solid #e4e4e4; text-align: left; white-space: nowrap; }
-th { background: #f4f4f4; border-bottom: 2px solid #ccc; vertical-align: bottom; white-space: normal; }
+th, td { padding: 0.25rem 0.7rem; border-bottom: 1px solid #e4e4e4; text-align: left; vertical-align: top; }
+th { background: #f4f4f4; border-bottom: 2px solid #ccc; vertical-align: bottom; }
 tr:hover td { background: #fafaf2; }
 code { background: #f4f4f4; padding: 0.1rem 0.25rem; border-radius: 3px; font-size: 0.9em; overflow-wrap: anywhere; }
 li { margin: 0.25rem 0; }

@@ -57,7 +57,8 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
 
     A model's number is its mean cost over episodes, of a perturbation also over severities. A method's is the
     interquartile mean over its models, with a stratified bootstrap interval over them. Of a single model the interval
-    is that of its mean over episodes (normal approximation): it is about this model, and not about a method.
+    is that of its mean over episodes, by the normal approximation, or Wilson's where costs are 0 and 1 (failures): it
+    is about this model, and not about a method.
 
     :param records: Of all rows.
     :param level: Coverage of the intervals.
@@ -72,7 +73,8 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
 
     levels, summaries, by_seed = [], [], {}
     for label, cube in costs.items():
-        iqm, low, high = _aggregate(cube, how)
+        is_share = bool(np.isin(cube, (0.0, 1.0)).all())
+        iqm, low, high = _aggregate(cube, how, is_share)
         levels.append(
             pd.concat([rows, pd.DataFrame(dict(iqm=iqm, low=low, high=high))], axis=1).assign(
                 model=label, n_seeds=len(cube)
@@ -80,7 +82,7 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
         )
         cost = _mean_of_rows(cube, list(groups.values()))  # (S, G, E)
         added = cost - _mean_of_rows(cube, plain)
-        numbers = [*_aggregate(cost, how), *_aggregate(added, how)]
+        numbers = [*_aggregate(cost, how, is_share), *_aggregate(added, how)]
         names = ("iqm", "low", "high", "added", "added_low", "added_high")
         keys = pd.DataFrame(list(groups), columns=["perturbation", "kind"])
         table = pd.DataFrame(dict(zip(names, numbers, strict=True)))
@@ -125,17 +127,26 @@ def _mean_of_rows(cube: np.ndarray, groups: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack([cube[:, group].mean(axis=1) for group in groups], axis=1)
 
 
-def _aggregate(cube: np.ndarray, how: dict[str, float | int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _aggregate(
+    cube: np.ndarray, how: dict[str, float | int], is_share: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``(S, G, E)`` to the aggregate over models, and the ends of its interval: ``(G,)`` each."""
     if len(cube) > 1:
         return interquartile_means(cube.mean(axis=2), **how)  # type: ignore[arg-type]
     from scipy.stats import norm
 
-    mean = cube[0].mean(axis=1)
-    if cube.shape[2] == 1:
+    mean, n = cube[0].mean(axis=1), cube.shape[2]
+    if n == 1:
         return mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)
-    half = norm.ppf(0.5 + how["level"] / 2) * cube[0].std(axis=1, ddof=1) / np.sqrt(cube.shape[2])
-    return mean, mean - half, mean + half
+    z, variance = norm.ppf(0.5 + how["level"] / 2), cube[0].var(axis=1)
+    if not is_share:
+        half = z * np.sqrt(variance / (n - 1))
+        return mean, mean - half, mean + half
+    # Wilson's interval, with as many independent trials as give the mean this variance: n of a single row, more of
+    # several. No failure in n trials does not mean that there are none.
+    trials = np.divide(n * mean * (1 - mean), variance, out=np.full_like(mean, n), where=variance > 0)
+    center, half = mean + z**2 / (2 * trials), z * np.sqrt(mean * (1 - mean) / trials + (z / (2 * trials)) ** 2)
+    return mean, *(np.clip((center + sign * half) / (1 + z**2 / trials), 0.0, 1.0) for sign in (-1, 1))
 
 
 def _compare(

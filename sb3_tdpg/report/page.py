@@ -106,10 +106,11 @@ def write_page(numbers: Numbers, page: Page) -> str:
 
 
 def _introduction(numbers: Numbers, page: Page) -> str:
-    counts = " and ".join(
+    *first, last = (
         f"{len(names)} {'model' if len(names) == 1 else 'models'} of **{_text(label)}**"
         for label, names in page.sources.items()
     )
+    counts = f"{', '.join(first)} and {last}" if first else last
     n_rows = len(numbers.levels) // len(numbers.models)
     policy = "deterministic" if page.deterministic else "stochastic"
     kwargs = ", ".join(f"{name}={value!r}" for name, value in page.env_kwargs.items())
@@ -228,10 +229,10 @@ class Form:
         self.digits = 3 if np.isnan(size) else int(np.clip(2 - np.floor(np.log10(size)), 1, 4))
 
     def cell(self, row: pd.Series, name: str = "") -> str:
-        """``31.0 [30.1, 32.2]``"""
+        """``31.0 [30.1, 32.2]``; where a table is too wide, the interval goes to a line of its own, in one piece."""
         value, low, high = (row[column] for column in ((name, f"{name}_low", f"{name}_high") if name else LIMITS))
         sign = "+" if name else ""
-        interval = "" if np.isnan(low) else f" [{self.number(low, sign)}, {self.number(high, sign)}]"
+        interval = "" if np.isnan(low) else f" [{self.number(low, sign)},\N{NO-BREAK SPACE}{self.number(high, sign)}]"
         return f"{self.number(value, sign)}{interval}"
 
     def number(self, value: float, sign: str = "") -> str:

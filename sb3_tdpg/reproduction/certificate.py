@@ -254,7 +254,7 @@ def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float
     figure = _new_figure(WIDTH, 4.0)
     against_cost, against_size = figure.subplots(1, 2, sharey=True)
     shown = paper[paper["sensor_kl"] > 0]
-    for color, label in zip(cycle(reversed(PALETTE[:2])), random["model"].unique(), strict=False):
+    for color, label in zip(cycle(PALETTE), random["model"].unique(), strict=False):
         group, rows = (frame[frame["model"] == label] for frame in (random, shown))
         moved = group[group["sensor_kl"] > 0]
         against_cost.scatter(group["cost"], group["bound"], s=7, color=color, alpha=0.5, label=label, linewidths=0)

@@ -15,6 +15,9 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
 from sb3_tdpg.runs import Run, complete_runs
 
+RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
+"""What is kept of each episode."""
+
 
 @dataclass(frozen=True)
 class Method:

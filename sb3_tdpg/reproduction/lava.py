@@ -24,7 +24,14 @@ from sb3_tdpg.evaluation import (
     write_run_config,
 )
 from sb3_tdpg.files import write_atomically
-from sb3_tdpg.reproduction.common import commits_of, how_made, markdown_table, met, publish_files
+from sb3_tdpg.reproduction.common import (
+    RECORD_COLUMNS,
+    commits_of,
+    how_made,
+    markdown_table,
+    met,
+    publish_files,
+)
 from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress, torch_threads
 from sb3_tdpg.tdpg import TDPG
 
@@ -167,18 +174,7 @@ def reproduce_lava(
     for group in groups:
         records = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders[group]], ignore_index=True)
         records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
-        columns = [
-            "model",
-            "train_seed",
-            "attempts",
-            "selected",
-            "scenario",
-            "episode",
-            "cost",
-            "seed",
-            "deterministic",
-        ]
-        write_frame_atomically(records[columns].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
+        write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
         sections.append(_section(group, records, by_seed))

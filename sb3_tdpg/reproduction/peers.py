@@ -19,7 +19,7 @@ from sb3_tdpg.evaluation import aggregate_seeds, provenance, write_frame_atomica
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.reproduction.ball import GROUPS, with_groups
-from sb3_tdpg.reproduction.common import commits_of, how_made, publish_files
+from sb3_tdpg.reproduction.common import RECORD_COLUMNS, commits_of, how_made, publish_files
 from sb3_tdpg.reproduction.lava import MAX_ATTEMPTS
 from sb3_tdpg.runs import Run, complete_runs
 from sb3_tdpg.training import read_schedule, take_env
@@ -27,14 +27,6 @@ from sb3_tdpg.training import read_schedule, take_env
 # As long as TDPG's trainings. With the block's minibatches of 500 an update makes 50 steps of the optimiser, not 10,
 # and a training takes twice as long.
 LAVA_PPO = dict(n_timesteps=1.5e6, batch_size=2500)
-
-# With the block's settings the cost is above 3,000 from the fifth rollout on. These, with rewards scaled, were found on
-# seed 50.
-BALL_PPO: Mapping[str, Any] = dict(
-    learning_rate=5e-4,
-    policy_kwargs=dict(log_std_init=-1.0),
-    vec_env_wrapper=[{"stable_baselines3.common.vec_env.VecNormalize": dict(norm_obs=False, gamma=1.0)}],
-)
 
 RECORDS = Path("docs", "results")
 """Where the episodes of policy gradient and TDPG are, from ``make reproduce-lava`` and ``reproduce-ball-controls``."""
@@ -146,10 +138,9 @@ def with_weight_decay(block: str, weight_decay: float) -> dict[str, Any]:
 
 
 def with_perturbation(**strengths: float) -> dict[str, Any]:
-    """Return :data:`BALL_PPO` on images with these perturbations, and no others."""
+    """Return the override that gives images these perturbations, and no others."""
     none = dict(color=0.0, pattern=0.0, patch=0.0, contrast=0.0, noise=0.0)
-    perturbation = {"sb3_tdpg.perturbation.VecImagePerturbation": {**none, **strengths}}
-    return {**BALL_PPO, "vec_env_wrapper": [perturbation, *BALL_PPO["vec_env_wrapper"]]}
+    return dict(vec_env_wrapper=[{"sb3_tdpg.perturbation.VecImagePerturbation": {**none, **strengths}}])
 
 
 @dataclass(frozen=True)
@@ -221,7 +212,7 @@ BALL_PEERS = Comparison(
     env_id="BallCatch-v0",
     # The test rows' noise is 0.10 to 0.25; the patterns are those that TDPG is trained with.
     peers=(
-        Peer("PPO", "BallCatch-v0", "ppo", BALL_PPO),
+        Peer("PPO", "BallCatch-v0", "ppo"),
         Peer("PPO, pixel noise", "BallCatch-v0", "ppo", with_perturbation(noise=0.25)),
         Peer("PPO, random backgrounds", "BallCatch-v0", "ppo", with_perturbation(color=0.35, pattern=0.7, patch=0.5)),
     ),
@@ -237,18 +228,7 @@ BALL_PEERS = Comparison(
     },
 )
 
-COLUMNS = (
-    "env_id",
-    "model",
-    "train_seed",
-    "attempts",
-    "selected",
-    "scenario",
-    "episode",
-    "cost",
-    "seed",
-    "deterministic",
-)
+COLUMNS = ["env_id", *RECORD_COLUMNS]
 
 
 def reproduce_peers(
@@ -297,7 +277,7 @@ def reproduce_peers(
     for (each, _), in_env in zip(comparisons, folders, strict=True):
         trained = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in in_env], ignore_index=True)
         seeds = _seed_table(trained, in_env)
-        frames.append(trained[list(COLUMNS)])
+        frames.append(trained[COLUMNS])
         seed_tables.append(seeds)
         recorded = each.read_records(records, n_eval_episodes)
         order = {label: i for i, label in enumerate([*each.recorded.values(), *(peer.label for peer in each.peers)])}

@@ -7,8 +7,10 @@ Runs in an environment of its own: the package needs an old JAX and an old NumPy
     build/venv_bmi/bin/pip install benchmark-mi==0.1.3 "jax==0.4.33" "jaxlib==0.4.33" "numpy<2"
     build/venv_bmi/bin/python tests/benchmarks/benchmark_mi/generate.py
 
-It writes ``samples.npz`` and ``theirs.csv`` beside itself, and takes half an hour, nearly all of it for the package's
-MINE and InfoNCE. Rows that ``theirs.csv`` has already are kept, so that it can be stopped and started again.
+It writes ``ranks.npz`` and ``theirs.csv`` beside itself, and takes half an hour, nearly all of it for the package's
+MINE and InfoNCE. Rows that ``theirs.csv`` has already are kept, so that it can be stopped and started again. Of the
+samples only the ranks are kept, which are all that our estimators use: they are drawn anew each time, from the same
+seeds, and must have the ranks that the file has.
 
 Dimension key: S seeds, N samples, X and Z the components of the two variables.
 """
@@ -94,6 +96,15 @@ def draw() -> dict[str, np.ndarray]:
     return samples
 
 
+def rank(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Replace every value by its rank among the N of its component, equal values alike: uint16, from 0."""
+
+    def of_component(x: np.ndarray) -> np.ndarray:
+        return np.unique(x, return_inverse=True)[1]
+
+    return {name: np.apply_along_axis(of_component, 1, x).astype(np.uint16) for name, x in samples.items()}
+
+
 def main() -> None:
     """Draw the samples, then run the estimators on them until done or until the time is up."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
@@ -102,10 +113,15 @@ def main() -> None:
     args = parser.parse_args()
     start = time.perf_counter()
 
-    samples_file, results_file = HERE / "samples.npz", HERE / "theirs.csv"
-    if not samples_file.exists():
-        np.savez_compressed(samples_file, **draw())
-    samples = np.load(samples_file)
+    ranks_file, results_file = HERE / "ranks.npz", HERE / "theirs.csv"
+    samples = draw()
+    ranks = rank(samples)
+    if not ranks_file.exists():
+        np.savez_compressed(ranks_file, **ranks)
+    frozen = np.load(ranks_file)
+    changed = [name for name in ranks if not np.array_equal(ranks[name], frozen[name])]
+    if changed:
+        raise RuntimeError(f"{changed} are drawn otherwise than in {ranks_file}: use the versions named above")
     done = set()
     if results_file.exists():
         with results_file.open(newline="") as file:
