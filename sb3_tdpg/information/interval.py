@@ -149,7 +149,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     probability to miss, ``1 - confidence``. The rest is for what they neglect: the limits are asymptotic, they take the
     means over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too
     low comes with a standard error that is too small. What is spent is shared between the limits according to the gap
-    between the estimates (:func:`miss_of_each_limit`); above, a third of a share is for each of the bounds, since the
+    between the estimates (``miss_of_each_limit``); above, a third of a share is for each of the bounds, since the
     smallest is taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about
     ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 40)``.
 
