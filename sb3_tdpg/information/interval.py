@@ -7,12 +7,14 @@ Dimension key: T time steps, N episodes, n of them at a step or in a half, X sta
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 import torch as th
+from scipy.optimize import brentq
 
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.information.density_critic import (
@@ -20,7 +22,6 @@ from sb3_tdpg.information.density_critic import (
     DensityCritic,
     Encoded,
     log_gaussians,
-    log_mean_exp,
     varies,
 )
 
@@ -28,6 +29,10 @@ MIN_EPISODES = 20
 MAX_DRAWS = 16  # of the TRVs, for each episode
 MAX_VALUES = 1_000_000  # densities of all draws under all episodes; bounds the memory
 MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
+DIVISIONS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of quarters of the episodes into halves
+MAX_REDIVIDED = 300  # episodes that are divided more than once; bounds the time, and more gain little by it
+TINY = 1e-12  # nats
+SPENT = 0.4  # of the probability to miss; the rest is for the skewness that the limits neglect
 MIN_HITS = 10  # pairs of a state with another episode's TRVs at the clip, to estimate the critic's denominator from
 
 LOWER_BOUNDS = ("critic",)
@@ -76,11 +81,38 @@ def normal_quantile(miss: float) -> float:
     return NormalDist().inv_cdf(1 - miss)
 
 
+def miss_of_each_limit(miss: float, gap: float) -> float:
+    r"""
+    Share the probability to miss between two limits, whose bounds leave a gap that the truth lies in.
+
+    The further the truth is from one bound, the less its limit can miss. It is worst at either end of the gap, where
+    :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c standard errors from their bounds
+    (Imbens and Manski, 2004, Econometrica 72(6)): half of it each without a gap, all of it each with a wide one.
+
+    :param miss: Of both limits together.
+    :param gap: Upper less lower bound, in standard errors; below 0 and NaN count as 0.
+    :return: the probability to miss of each limit by itself
+    """
+    normal, gap = NormalDist(), max(0.0, gap)  # in this order also of NaN
+
+    def excess(c: float) -> float:
+        return normal.cdf(-c) + normal.cdf(-c - gap) - miss
+
+    c = brentq(excess, normal_quantile(miss), normal_quantile(miss / 2) + 1e-9)
+    return normal.cdf(-c)
+
+
 class Estimate(NamedTuple):
     """What a bound came to at one time step."""
 
     value: float  # nats
-    error: float  # standard error
+    parts: np.ndarray  # (n,): what each episode adds to the mean that the value is, but for a constant
+    least_variance: float = 0.0  # of the value
+
+    @property
+    def error(self) -> float:
+        """Standard error, nats."""
+        return math.sqrt(max(self.parts.var(ddof=1) / len(self.parts), self.least_variance))
 
 
 def min_episodes(trv_dim: int) -> int:
@@ -98,8 +130,9 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     which holds for any F that the samples have no part in. Half of the episodes fit the critic
     (:class:`~sb3_tdpg.information.density_critic.DensityCritic`), it is frozen, and the other half is fresh; then the
-    halves change places, and the mean of the two counts. Densities of the encoder alone give no such bound: they bound
-    the information of its *input*, which may be larger.
+    halves change places, and the mean of the two counts. Up to 300 episodes are divided in three ways, and the mean of
+    these counts, since a division leaves out the pairs of episodes that it parts. Densities of the encoder alone give
+    no such bound: they bound the information of its *input*, which may be larger.
 
     **Above** stands the smallest of three bounds on I[e_t; x~_t], which is not below I[x_t; x~_t], with
     e_t = (x~_{t-1}, y_t) the input of the encoder, whose density q is known:
@@ -112,15 +145,17 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     Since the encoder's density is known, its noise is drawn anew: each episode counts with the mean over several draws
     of x~ given e, which lessens the error and changes no expectation.
 
-    Each limit is an estimate less or plus a multiple of its standard error, and misses with probability
-    ``(1 - confidence) / 2``; above, a third of this for each of the bounds, since the smallest is taken (Bonferroni).
-    The limits are asymptotic: they take the means over episodes as Gaussian. The interval holds for each step by
-    itself, not for all of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot
-    exceed about ``ln(N^2 / 40)``.
+    Each limit is an estimate less or plus a multiple of its standard error. The multiples spend two fifths of the
+    probability to miss, ``1 - confidence``. The rest is for what they neglect: the limits are asymptotic, they take the
+    means over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too
+    low comes with a standard error that is too small. What is spent is shared between the limits according to the gap
+    between the estimates (``miss_of_each_limit``); above, a third of a share is for each of the bounds, since the
+    smallest is taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about
+    ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 40)``.
 
     :param batch: Rollouts ``(T, N, ...)`` that the encoder was not trained on since; the episodes are independent.
-    :param confidence: Probability that the interval of a step holds the truth.
-    :param seed: Of the division into halves and of the noise.
+    :param confidence: Probability, at least, with which the interval of a step holds the truth.
+    :param seed: Of the divisions into halves and of the noise.
     :raises ValueError: if the shapes do not fit, a value is not finite, or a standard deviation is not positive.
     """
     if not 0 < confidence < 1:
@@ -132,7 +167,6 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     limits = np.full((2, horizon), np.nan)
     named: tuple[list[str], list[str]] = ([""] * horizon, [""] * horizon)
     n_episodes = np.zeros(horizon, dtype=int)
-    miss = (1 - confidence) / 2  # probability on either side
     for t in range(horizon):
         at_t = batch.at(t)
         n_episodes[t] = at_t.trvs.shape[1]
@@ -144,9 +178,13 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
         uppers = dict(logdet=_log_det(step), loo=_leave_one_out(step), marginal=marginal)
         for name, estimate in (("critic", critic), *uppers.items()):
             estimates[name][t], errors[name][t] = estimate.value, estimate.error
+        uppers = {name: upper for name, upper in uppers.items() if np.isfinite(upper.value)}
+        nearest = min(uppers.values(), key=lambda upper: upper.value, default=critic)
+        gap = (nearest.value - critic.value) / max(critic.error, nearest.error, TINY)
+        miss = miss_of_each_limit(SPENT * (1 - confidence), gap)
         lower = critic.value - normal_quantile(miss) * critic.error
-        multiple = normal_quantile(miss / len(uppers))
-        candidates = {name: u.value + multiple * u.error for name, u in uppers.items() if np.isfinite(u.value)}
+        multiple = normal_quantile(miss / len(UPPER_BOUNDS))
+        candidates = {name: upper.value + multiple * upper.error for name, upper in uppers.items()}
         named[1][t], upper = min(candidates.items(), key=lambda item: item[1], default=("", math.inf))
         named[0][t] = "critic" if lower > 0 else "zero"  # also where it is NaN
         upper = max(upper, 0.0)
@@ -179,7 +217,8 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
         rng = np.random.default_rng((seed, t))
         step = draw_trvs(at_t, rng)
         for k in np.flatnonzero(varies(step.states)):
-            values[:, t, k], _ = critic_bounds(step._replace(states=step.states[:, [k]]), rng)
+            bound, _ = critic_bounds(step._replace(states=step.states[:, [k]]), rng)
+            values[:, t, k] = bound.value, bound.error
     return values[0], values[1]
 
 
@@ -222,28 +261,52 @@ def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
 
 def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Estimate]:
     """
-    Fit critics to halves of the episodes, and evaluate them on the other halves.
+    Fit critics to halves of the episodes, and evaluate them on the other halves; the mean over several divisions.
 
-    :param step: n episodes.
-    :param rng: For the division.
+    A division leaves out the pairs of episodes that it parts. Any two quarters of the episodes are together in one of
+    three divisions, which leave out none.
+
+    :param step: n episodes, an even number of draws each: the mirror images are the second half.
+    :param rng: For the quarters.
     :return: the lower bound of the critic and the upper bound of its marginal density
     """
-    n = len(step.states)
-    halves = np.array_split(rng.permutation(n), 2)
-    bounds = []
-    for train, fresh in (halves, halves[::-1]):
-        critic, evaluated = DensityCritic(step.select(train[:MAX_TRAINING])), step.select(fresh)
-        points = evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])
-        log_marginal = critic.log_marginal(points)
-        scores = critic.scores(evaluated.states, points, log_marginal)
-        bounds.append((donsker_varadhan(scores, log_clip=1 + math.log(n)), _marginal_bound(evaluated, log_marginal)))
-    lower, upper = zip(*bounds, strict=True)
-    return _average(lower), _average(upper)
+    n, n_pairs = len(step.states), step.trvs.shape[1] // 2
+    quarters = np.array_split(rng.permutation(n), 4)
+    divisions = DIVISIONS if n <= MAX_REDIVIDED else DIVISIONS[:1]
+    lowers, uppers = [], []
+    for i, division in enumerate(divisions):
+        first, second = ([quarters[q] for q in half] for half in division)
+        halves = np.concatenate(first), np.concatenate(second)
+        # The draws are shared out among the divisions, each with its mirror image.
+        mine = np.arange(i % n_pairs, n_pairs, len(divisions))
+        fresh_draws = step._replace(trvs=step.trvs[:, np.concatenate([mine, mine + n_pairs])])
+        bounds = []
+        for train, fresh in (halves[::-1], halves):
+            critic, evaluated = DensityCritic(step.select(train[:MAX_TRAINING])), fresh_draws.select(fresh)
+            points = evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])
+            log_marginal = critic.log_marginal(points)
+            scores = critic.scores(evaluated.states, points, log_marginal)
+            bounds.append(
+                (donsker_varadhan(scores, log_clip=1 + math.log(n)), _marginal_bound(evaluated, log_marginal))
+            )
+        order = np.argsort(np.concatenate(halves))
+        lower, upper = (_of_halves(of_bound, order) for of_bound in zip(*bounds, strict=True))
+        lowers.append(lower)
+        uppers.append(upper)
+    return _average(lowers), _average(uppers)
 
 
-def _average(halves: tuple[Estimate, ...]) -> Estimate:
-    values, errors = np.transpose(halves)
-    return Estimate(float(values.mean()), float(np.linalg.norm(errors) / len(halves)))
+def _of_halves(halves: tuple[Estimate, ...], order: np.ndarray) -> Estimate:
+    """Average what two halves of the episodes came to; ``order`` is that of the episodes in the halves."""
+    values, parts, least_variances = zip(*halves, strict=True)
+    centred = np.concatenate([part - part.mean() for part in parts])  # each half has a critic of its own
+    return Estimate(float(np.mean(values)), centred[order], sum(least_variances) / len(halves) ** 2)
+
+
+def _average(estimates: Iterable[Estimate]) -> Estimate:
+    """Average over divisions, whose parts and whose variances are taken as if they were wholly dependent."""
+    values, parts, least_variances = zip(*estimates, strict=True)
+    return Estimate(float(np.mean(values)), np.mean(parts, axis=0), float(np.mean(least_variances)))
 
 
 def donsker_varadhan(scores: np.ndarray, log_clip: float) -> Estimate:
@@ -267,16 +330,16 @@ def donsker_varadhan(scores: np.ndarray, log_clip: float) -> Estimate:
     floor = MIN_HITS * math.exp(log_clip) / n_pairs
     if mean < floor:
         mean, relative_variance = floor, 1 / MIN_HITS  # of the number of clipped pairs, which are rare events
-        variance = joint.var(ddof=1) / n + relative_variance
+        parts, least_variance = joint, joint.var(ddof=1) / n + relative_variance
     else:
         # An episode counts through its state and through its TRVs (Hoeffding's projection).
         influence = (ratios.sum(axis=0) + ratios.sum(axis=1)) / (n - 1) / mean
         relative_variance = influence.var(ddof=1) / n
         # Not less than that of as many independent pairs: by luck the projection can be next to constant.
-        of_pairs = (np.square(ratios).sum() / n_pairs / mean**2 - 1) / n_pairs
-        variance = max((joint - influence).var(ddof=1) / n, of_pairs)
+        parts = joint - influence
+        least_variance = float(np.square(ratios).sum() / n_pairs / mean**2 - 1) / n_pairs
     # The logarithm of a mean is biased downward by half its relative variance.
-    return Estimate(float(joint.mean() - math.log(mean) - relative_variance / 2), math.sqrt(variance))
+    return Estimate(float(joint.mean() - math.log(mean) - relative_variance / 2), parts, least_variance)
 
 
 def _marginal_bound(step: Encoded, log_marginal: np.ndarray) -> Estimate:
@@ -285,7 +348,7 @@ def _marginal_bound(step: Encoded, log_marginal: np.ndarray) -> Estimate:
     noise = (step.trvs - step.means[:, None]) / step.stds[:, None]
     log_own = -0.5 * (np.square(noise).sum(axis=2) + dim * LOG_2_PI) - np.log(step.stds).sum(axis=1)[:, None]
     gaps = (log_own - log_marginal.reshape(n, -1)).mean(axis=1)
-    return _mean(gaps)
+    return Estimate(float(gaps.mean()), gaps)
 
 
 def _log_det(step: Encoded) -> Estimate:
@@ -307,7 +370,7 @@ def _log_det(step: Encoded) -> Estimate:
     covariances[:, diagonal, diagonal] += (noise.sum(axis=0) - noise) / (n - 1)
     without = bound(covariances, (log_stds.sum() - log_stds) / (n - 1))  # (n,)
     value = n * whole - (n - 1) * without.mean()
-    return Estimate(float(value), _mean((n - 1) * without).error)
+    return Estimate(float(value), -(n - 1) * without)
 
 
 def _leave_one_out(step: Encoded) -> Estimate:
@@ -317,11 +380,9 @@ def _leave_one_out(step: Encoded) -> Estimate:
     draws, own = np.arange(n * n_draws), np.repeat(np.arange(n), n_draws)
     log_own = log_density[draws, own]
     log_density[draws, own] = -np.inf
-    log_mixture = log_mean_exp(log_density, n - 1)
-    gaps = (log_own - log_mixture).reshape(n, n_draws).mean(axis=1)
-    shares = np.exp(log_density - log_mixture[:, None] - math.log(n - 1)).sum(axis=0) / n_draws  # mean 1
-    return Estimate(float(gaps.mean()), _mean(gaps - shares).error)
-
-
-def _mean(values: np.ndarray) -> Estimate:
-    return Estimate(float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values))))
+    top = log_density.max(axis=1)
+    density = np.exp(log_density - top[:, None], out=log_density)
+    total = density.sum(axis=1)
+    gaps = (log_own - np.log(total) - top + math.log(n - 1)).reshape(n, n_draws).mean(axis=1)
+    shares = (1 / total) @ density / n_draws  # mean 1
+    return Estimate(float(gaps.mean()), gaps - shares)
