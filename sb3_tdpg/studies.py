@@ -133,7 +133,7 @@ def work(
 
     A trial is finished when it is complete or pruned. One that raises a ``ValueError`` is pruned, and keeps the message
     as its attribute ``reason``. Any other exception is recorded likewise, puts the trial back into the queue and ends
-    this worker. Ctrl-C and an :class:`UnfitWorkerError` put the trial back. One whose worker was killed is run again by
+    this worker. Ctrl-C and an ``UnfitWorkerError`` put the trial back. One whose worker was killed is run again by
     another, or by a later, worker. A worker that was suspended for so long that it counted as dead is interrupted in
     its trial, whose result is dropped, and goes on with the next one.
 
