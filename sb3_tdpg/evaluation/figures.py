@@ -159,7 +159,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     if upper.max() > 0.7 * cap:
         axes.axhline(cap, color=INK, linestyle=(0, (4, 3)), linewidth=1, label=r"$\ln N$: lower limits fall behind")
     axes.set_ylim(bottom=0, top=max(1.05 * upper.max(), 0.1))
-    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
     axes.set_xlabel("time step $t$", fontsize=9)
     axes.set_ylabel(r"$I[x_t; \tilde{x}_t]$ (nat)", fontsize=9)
     _legend_above(figure, axes)
@@ -183,7 +183,7 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
              (quantity, "nats_lower")}  # fmt: skip
     values = table[quantity].to_numpy()  # (X, T)
     n_rows, n_columns = values.shape
-    figure = _new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 14.0), 1.3 + 0.5 * n_rows)
+    figure = _new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 10.0), 1.3 + 0.5 * n_rows)
     axes = figure.add_subplot()
     top = 1.0 if quantity == "r2" else max(float(np.nanmax(values)), 0.1)
     axes.set_facecolor("#DDDDDD")
@@ -196,7 +196,7 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
             text = f"{value:.2f}" if is_known else f"({value:.2f})"
             axes.text(column, row, text, color=color, fontsize=8, ha="center", va="center")
     axes.set_yticks(range(n_rows), components, fontsize=9)
-    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
     axes.tick_params(labelsize=8, length=0)
     axes.set_xlabel("time step $t$", fontsize=9)
     axes.spines[:].set_visible(False)
