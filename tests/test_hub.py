@@ -221,6 +221,17 @@ def test_the_code_in_the_card_runs_the_policy(card, on_the_hub, capsys):
     assert (repo_id, filename) == (REPO_ID, "tdpg-Lava-v0.zip")
 
 
+def test_the_block_of_the_guide_loads_the_model(card, on_the_hub, monkeypatch):
+    names = [str(path.relative_to(card)) for path in card.rglob("*") if path.is_file()]
+    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda api, repo_id, revision: names)
+    guide = (REPOSITORY / "docs" / "guide" / "zoo.md").read_text()
+    (code,) = re.findall(r"<!-- no-run -->\n```python\n(from sb3_tdpg\.hub.*?)^```", guide, re.MULTILINE | re.DOTALL)
+    namespace = {}
+    exec(code.replace("me/tdpg-Lava-v0", REPO_ID), namespace)
+    assert isinstance(namespace["model"], TDPG)
+    assert [repo_id for repo_id, *_ in on_the_hub] == [REPO_ID]
+
+
 def test_a_model_from_the_hub_is_the_one_that_was_trained(card, runs, on_the_hub, monkeypatch):
     names = [str(path.relative_to(card)) for path in card.rglob("*") if path.is_file()]
     assert "pg-seed0/model.zip" in names

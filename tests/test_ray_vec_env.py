@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -289,6 +290,22 @@ def test_a_training_gives_the_log_that_it_gives_with_subproc_vec_env(env_id, alg
     ], strict=True)  # fmt: skip
     assert logs[0] == logs[1]
     assert_same_parameters(*policies)
+
+
+def test_the_block_of_the_guide_trains():
+    guide = (REPOSITORY / "docs" / "guide" / "zoo.md").read_text()
+    (code,) = re.findall(r"<!-- no-run -->\n```python\n(from stable.*?)^```", guide, re.MULTILINE | re.DOTALL)
+    small = {"n_envs=40": "n_envs=4", "n_actors=8": "n_actors=2", "seed=0": "seed=0, n_episodes=40", "40_000": "80"}
+    for full, brief in small.items():
+        assert code.count(full) == 1
+        code = code.replace(full, brief)
+    namespace = {}
+    exec(code, namespace)
+    try:
+        assert isinstance(namespace["env"], RayVecEnv)
+        assert namespace["model"].num_timesteps == 80
+    finally:
+        namespace["env"].close()
 
 
 # -- an actor that dies -----------------------------------------------------------------------------------------------
