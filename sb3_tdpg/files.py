@@ -1,10 +1,10 @@
 """Files that are never half-written."""
 
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -20,9 +20,8 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
 
     :param path: The file that is replaced, also by several workers at once.
     """
-    partial = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.partial")
-    try:
+    # In a folder of its own, since a compressed file tells its name: that must not differ from one time to the next.
+    with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder:
+        partial = Path(folder, path.name)
         yield partial
         os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
