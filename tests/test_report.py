@@ -321,21 +321,25 @@ def test_records_of_another_environment_are_no_records_of_this_one():
 
 
 @pytest.mark.parametrize(
-    "change, name",
-    [(["--seed", "1"], "seed"), (["--episodes", "7"], "n_episodes"), (["--deterministic"], "deterministic")],
+    "change, difference",
+    [
+        (["--seed", "1"], "seed: 0 there, 1 here"),
+        (["--episodes", "7"], "n_episodes: 12 there, 7 here"),
+        (["--deterministic"], "deterministic: false there, true here"),
+    ],
 )
-def test_a_folder_with_another_report_is_refused(report, change, name, capsys):
+def test_a_folder_with_another_report_is_refused(report, change, difference, capsys):
     arguments, out = report
     before = json.loads((out / "config.json").read_text())
     assert main([*arguments, *change]) == 2
-    assert f"holds a report with another {name}" in capsys.readouterr().err
+    assert f"holds a report with other settings, {difference}: choose" in capsys.readouterr().err
     assert json.loads((out / "config.json").read_text()) == before
 
 
 def test_a_report_of_other_models_is_refused(report, folder, capsys):
     arguments, _ = report
     assert main([arguments[0], *arguments[2:]]) == 2
-    assert "another models" in capsys.readouterr().err
+    assert re.search(r"models.PG: \[.*\] there, not here: choose", capsys.readouterr().err)
 
 
 def test_of_one_policy_that_fails_or_not_the_share_has_wilsons_interval():

@@ -165,7 +165,7 @@ def test_a_folder_with_another_run_is_refused_before_any_training_and_does_not_s
     storage = storage and str(tmp_path / storage)
     quick_sweep(tmp_path / "out", betas=["1/50"], n_seeds=1, n_timesteps=800)
     before = sorted(tmp_path.rglob("out/*"))
-    with pytest.raises(ValueError, match=r"beta-1-50-seed0 holds a run with another settings: choose another folder"):
+    with pytest.raises(ValueError, match=r"beta-1-50-seed0 holds .* settings.n_timesteps: 800 there, 400 here: choose"):
         quick_sweep(tmp_path / "out", storage=storage, betas=["inf", "1/50"], n_seeds=1)
     assert sorted(tmp_path.rglob("out/*")) == before
     quick_sweep(tmp_path / "elsewhere", storage=storage, betas=["inf", "1/50"], n_seeds=1)
@@ -178,7 +178,7 @@ def test_a_job_of_another_worker_for_which_there_is_no_place_here_is_left_to_oth
     quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
     study = optuna.load_study(study_name="sweep-Lava-v0", storage=open_storage(storage))
     enqueue_once(study, [dict(inverse_beta=50.0, seed=0)])
-    with pytest.raises(ValueError, match="holds a run with another settings"):
+    with pytest.raises(ValueError, match="holds a run with other settings"):
         quick_sweep(tmp_path / "out", storage=storage, betas=["inf"], n_seeds=1)
     quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
     assert_complete(tmp_path / "mine", 2)

@@ -155,7 +155,7 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     results = {path.name: path.read_bytes() for path in folder.iterdir()}
     elsewhere = ["--storage", "sqlite:///another.db", "--cost-limit", "1e5"]  # of the same name
     assert main([*command, *elsewhere]) == 2
-    assert "holds a study with another cost_limit" in capsys.readouterr().err
+    assert "study with other settings, cost_limit: 1000000.0 there, 100000.0 here: choose" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == results
     assert not (here / "another.db").exists()
 
