@@ -135,6 +135,22 @@ def test_it_goes_on_where_it_stopped_and_gives_the_same(report, monkeypatch):
     assert {name: (out / name).read_bytes() for name in before} == before
 
 
+def test_the_estimates_of_the_information_show_their_progress(tmp_path, capsys):
+    def report_of(folder, *models, progress_bar):
+        robustness_report(
+            {str(number): model for number, model in enumerate(models)}, "Lava-v0", out=tmp_path / folder,
+            perturbations=["vector_noise"], severities=[1], n_episodes=4, scenarios=(), progress_bar=progress_bar,
+        )  # fmt: skip
+        return capsys.readouterr().err
+
+    free = PPO("MlpPolicy", "Lava-v0", n_steps=10, batch_size=10, device="cpu")  # has none
+    shown = report_of("three", tiny_tdpg(), free, tiny_tdpg(seed=1), progress_bar=True)
+    assert re.search(r"100%.* 6/6 .*estimate", shown)
+    assert "information, 2" in shown
+    assert report_of("silent", tiny_tdpg(), progress_bar=False) == ""
+    assert "estimate" not in report_of("none", free, progress_bar=True)
+
+
 def test_other_perturbations_may_be_asked_for_later(report):
     arguments, out = report
     n_rows = len(list((out / "rows").iterdir()))

@@ -7,7 +7,7 @@ Dimension key: T horizon, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,6 +36,9 @@ from sb3_tdpg.problem import read_problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+ESTIMATES = ("interval", "knowledge", "checks")
+"""Of :func:`information_report`, in this order."""
 
 
 class EncodedEpisodes(NamedTuple):
@@ -84,7 +87,13 @@ class InformationReport:
 
 
 def information_report(
-    model: Any, env: VecEnv, n_episodes: int = 500, seed: int = 0, *, names: Sequence[str] | None = None
+    model: Any,
+    env: VecEnv,
+    n_episodes: int = 500,
+    seed: int = 0,
+    *,
+    names: Sequence[str] | None = None,
+    at_end: Callable[[], Any] | None = None,
 ) -> InformationReport:
     """
     Run fresh episodes, and tell what the policy's TRVs know of the state, when, and how sure that is.
@@ -94,14 +103,19 @@ def information_report(
     :param n_episodes: N; with fewer environments they are run in rounds.
     :param seed: Of the episodes, the policy's sampling and the estimates.
     :param names: Of the components of the state; default: the environment's ``state_names``, or ``x0``, ``x1``, ...
+    :param at_end: Called at the end of each of the three :data:`ESTIMATES`.
     :raises ValueError: if there are too few episodes for an interval at any time step, or the names do not fit.
     """
     names = read_problem(env).state_names if names is None else names
     batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
+    at_end = at_end or (lambda: None)
     interval = information_interval(batch, seed=seed)
-    return InformationReport(
-        interval, state_knowledge(batch, names, seed=seed), trust_checks(batch, interval, seed=seed), costs
-    )
+    at_end()
+    known = state_knowledge(batch, names, seed=seed)
+    at_end()
+    badge = trust_checks(batch, interval, seed=seed)
+    at_end()
+    return InformationReport(interval, known, badge, costs)
 
 
 def interval_frame(interval: InformationInterval) -> pd.DataFrame:
