@@ -19,7 +19,7 @@ from postgres import postgres  # noqa: E402, F401
 from sb3_tdpg import TDPG  # noqa: E402
 from sb3_tdpg.envs.scenarios import LAVA  # noqa: E402
 from sb3_tdpg.evaluation.information import information_bounds, rollout_information  # noqa: E402
-from sb3_tdpg.information import InformationBatch  # noqa: E402
+from sb3_tdpg.information import InformationBatch, own_sample_bound  # noqa: E402
 from sb3_tdpg.studies import enqueue_once, open_storage  # noqa: E402
 from sb3_tdpg.sweep import select, sweep  # noqa: E402
 from sb3_tdpg.sweep_runs import beta_label, parse_inverse_beta  # noqa: E402
@@ -267,6 +267,38 @@ def test_bounds_enclose_the_information_of_a_gaussian_channel():
     bounds = information_bounds(batch)
     assert bounds.upper == pytest.approx(exact, abs=0.1)
     assert bounds.lower == pytest.approx(exact, abs=0.2)
+
+
+def of_gaussian_noise(means, std):
+    return InformationBatch(means, means + std * th.randn_like(means), means, th.full_like(means, std))
+
+
+@pytest.mark.parametrize("n_episodes", [5, 40, 1000])
+@pytest.mark.parametrize("spread", [0.0, 0.02, 1.0])
+def test_the_bound_from_below_is_never_above_the_one_from_above(spread, n_episodes):
+    for _ in range(20):
+        bounds = information_bounds(of_gaussian_noise(spread * th.randn(5, n_episodes, 2), 1.0))
+        assert bounds.lower <= bounds.upper
+
+
+def test_a_policy_that_knows_next_to_nothing_is_told_so_by_both_bounds():
+    # The TRVs are a sample, which alone would give the lower bound an error of ten times what there is to be known.
+    exact = 5 * 2 * 0.5 * math.log(1 + 0.02**2)
+    for _ in range(5):
+        bounds = information_bounds(of_gaussian_noise(0.02 * th.randn(5, 1000, 2), 1.0))
+        assert bounds.lower == pytest.approx(exact, rel=0.25)
+        assert bounds.upper == pytest.approx(exact, rel=0.25)
+
+
+def test_the_bound_from_below_is_that_of_the_own_sample_with_less_noise():
+    modes = 3.0 * th.randint(0, 2, (40, 1, 400, 2)).float()
+    skew = th.randn(40, 1, 400, 2).exp()
+    for means in (modes, skew):
+        batches = [of_gaussian_noise(each, 1.0) for each in means]
+        plain = np.array([own_sample_bound(batch).item() for batch in batches])
+        lower = np.array([information_bounds(batch).lower for batch in batches])
+        assert (lower - plain).mean() == pytest.approx(0.0, abs=4 * (lower - plain).std() / math.sqrt(len(plain)))
+        assert lower.std() < 1.1 * plain.std()
 
 
 def test_steps_without_living_episodes_know_nothing():
