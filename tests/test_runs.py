@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -256,6 +257,17 @@ def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
     complete_runs(tasks, n_eval_episodes=4, jobs=2)
     models = [TDPG.load(tmp_path / name / "model.zip", device="cpu") for name in ("first", "second")]
     assert_same_parameters(*(parameters(model.policy) for model in models))
+
+
+def test_the_progress_bar_moves_before_a_run_is_finished(tmp_path, capsys):
+    run = Run("PG", "Lava-v0", "Lava-v0-pg", 0, dict(n_timesteps=1050, n_episodes=20))
+    complete_runs([(replace(run, seed=seed), tmp_path / str(seed), LAVA[:1]) for seed in range(2)], jobs=1)
+    bars = re.findall(r"\| ([\d.]+)/2 \[[^\]]*, ([\d,]+) epochs", capsys.readouterr().err)
+    assert ("1.8", bars[-1][1]) in bars, "both are trained as one batch, and are to be evaluated"
+    assert bars[-1][0] == "2.0"
+    assert float(bars[-1][1]) == 2 * 11
+    runs = [float(done) for done, _ in bars]
+    assert runs == sorted(runs)
 
 
 def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_path):
