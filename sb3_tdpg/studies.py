@@ -29,7 +29,7 @@ except ImportError as e:
 from sb3_tdpg.evaluation.provenance import differences, jsonable
 from sb3_tdpg.storages import open_storage, quiet_optuna, told_in_one_line
 from sb3_tdpg.study_jobs import JOB, job_of
-from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker
+from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker, values_of
 
 __all__ = ["UnfitWorkerError", "enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
 
@@ -112,6 +112,7 @@ def work(
     grace_period: float = GRACE_PERIOD,
     heartbeat_interval: float | None = None,
     report: Callable[[str], None] = print,
+    describe: Callable[[optuna.trial.FrozenTrial], str] = values_of,
 ) -> None:
     """
     Run trials of a study until it is finished, beside any number of workers that do the same.
@@ -131,6 +132,7 @@ def work(
     :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
     :param heartbeat_interval: Seconds; default: a sixth of the grace period.
     :param report: Gets a line of text whenever something happens.
+    :param describe: What the line says of a complete trial; default: its values.
     :raises ValueError: if the grace period is too short, or the storage stays away.
     """
     if n_trials is not None and n_trials < 1:
@@ -139,4 +141,4 @@ def work(
         heartbeat_interval = grace_period / 6
     if not 0 < 2 * heartbeat_interval <= grace_period:
         raise ValueError(f"{grace_period=} must be at least twice {heartbeat_interval=}, and both positive (seconds)")
-    Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report).run()
+    Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report, describe).run()

@@ -123,7 +123,6 @@ class TuningManager(TDPGExperimentManager):
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
                 raise optuna.TrialPruned(f"behind the others at expected cost {cost:.4g}, {information:.4g} nat")
-            print(f"trial {trial.number}: expected cost {cost:.4g}, {information:.4g} nat")
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
@@ -155,7 +154,7 @@ class TuningManager(TDPGExperimentManager):
         )
         # What every trial would fail of is told before the first one.
         self.create_envs(1, eval_env=True).close()
-        work(study, self.objective, self.max_total_trials or self.n_trials)
+        work(study, self.objective, self.max_total_trials or self.n_trials, describe=_result)
         self._write_results(study, description)
 
     def _described(self, description: dict[str, Any]) -> dict[str, Any]:
