@@ -27,8 +27,8 @@ from tqdm import tqdm
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios, write_frame_atomically, write_run_config
-from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
 from sb3_tdpg.training_batch import Member, MemberDivergedError, TrainingBatch, batch_key

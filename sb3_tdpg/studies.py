@@ -26,7 +26,7 @@ try:
 except ImportError as e:
     raise ImportError("studies need Optuna: pip install sb3_tdpg[zoo]") from e
 
-from sb3_tdpg.evaluation.provenance import differences, jsonable
+from sb3_tdpg.provenance import differences, jsonable
 from sb3_tdpg.storages import open_storage, quiet_optuna, told_in_one_line
 from sb3_tdpg.study_jobs import JOB, job_of
 from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker, values_of

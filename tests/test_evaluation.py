@@ -1,4 +1,3 @@
-import importlib
 import json
 import math
 import random
@@ -32,7 +31,7 @@ from sb3_tdpg.evaluation import (
     write_frame_atomically,
     write_run_config,
 )
-from sb3_tdpg.evaluation.provenance import check_same_config
+from sb3_tdpg.provenance import check_same_config
 
 TWO_ROWS = (LAVA[0], LAVA[-1])
 
@@ -378,9 +377,7 @@ def test_the_provenance_knows_no_commit_of_an_installed_package(in_checkout_of_s
     package = tmp_path / ".venv" / "sb3_tdpg"
     package.mkdir(parents=True)
     (package / "__init__.py").touch()
-    # The package's attribute of this name is the function.
-    module = importlib.import_module("sb3_tdpg.evaluation.provenance")
-    monkeypatch.setattr(module, "__file__", str(package / "evaluation" / "provenance.py"))
+    monkeypatch.setattr("sb3_tdpg.provenance.__file__", str(package / "provenance.py"))
     assert provenance()["git"] is None
 
 

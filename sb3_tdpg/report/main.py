@@ -15,8 +15,8 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import information_report, provenance, save_figure, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
-from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.files import write_atomically
+from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.report.figures import (
     comparison_figure,
     degradation_curves,

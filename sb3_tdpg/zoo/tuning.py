@@ -25,8 +25,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.files import write_atomically
+from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.studies import open_storage, open_study, quiet_optuna, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager

@@ -14,12 +14,14 @@ from datetime import datetime, timezone
 from importlib import metadata
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from sb3_tdpg.files import replaced_atomically, write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MAX_DIFFERENCES = 3
 MAX_LENGTH = 60  # of a value in a message
@@ -185,7 +187,7 @@ def as_typed(command: Sequence[str]) -> list[str]:
 
 def _git() -> dict[str, Any] | None:
     """Commit of the checkout that this package lies in, and whether a tracked file was changed since."""
-    package = Path(__file__).resolve().parents[1]
+    package = Path(__file__).resolve().parent
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(package), *arguments]
