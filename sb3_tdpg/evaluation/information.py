@@ -105,7 +105,7 @@ def information_report(
     :param n_episodes: N; with fewer environments they are run in rounds.
     :param seed: Of the episodes, the policy's sampling and the estimates.
     :param names: Of the components of the state; default: the environment's ``state_names``, or ``x0``, ``x1``, ...
-    :param at_end: Called at the end of each of the three :data:`ESTIMATES`.
+    :param at_end: Called at the end of each of the three ``ESTIMATES``.
     :raises ValueError: if there are too few episodes for an interval at any time step, or the names do not fit.
     """
     names = read_problem(env).state_names if names is None else names
