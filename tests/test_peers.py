@@ -16,10 +16,11 @@ from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import write_frame_atomically
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.reproduction import ball, grasp, peers
-from sb3_tdpg.reproduction.peers import BALL_PEERS, GRASP_PEERS, LAVA_PEERS, Peer, SB3Run, TimedRun
+from sb3_tdpg.reproduction import ball, grasp, peer_runs, peers
+from sb3_tdpg.reproduction.peer_runs import SB3Run, TimedRun, training_time
+from sb3_tdpg.reproduction.peers import BALL_PEERS, GRASP_PEERS, LAVA_PEERS, Peer
 from sb3_tdpg.runs import Run, complete_run
-from sb3_tdpg.training import take_env
+from sb3_tdpg.training import make_training, read_schedule, take_env
 
 COMPARISONS = (LAVA_PEERS, BALL_PEERS, GRASP_PEERS)
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -103,7 +104,7 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
     settings = run.settings
     n_timesteps, policy = settings.pop("n_timesteps"), settings.pop("policy")
     env = take_env("Lava-v0", settings)
-    peers.read_schedule(settings)
+    read_schedule(settings)
     model = cls(policy, env, **settings, seed=3, device="cpu").learn(n_timesteps)
     saved = cls.load(tmp_path / "run" / "model.zip", device="cpu")
     for name, value in model.policy.state_dict().items():
@@ -139,8 +140,8 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
             return self.now
 
     wall, cpu = Clock(), Clock()
-    monkeypatch.setattr(peers.time, "perf_counter", wall)
-    monkeypatch.setattr(peers.time, "process_time", cpu)
+    monkeypatch.setattr(peer_runs.time, "perf_counter", wall)
+    monkeypatch.setattr(peer_runs.time, "process_time", cpu)
 
     def train(run, attempt, folder, progress_bar):
         folder.mkdir(parents=True, exist_ok=True)
@@ -156,7 +157,7 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
         complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
     complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
     # The first attempt was called twice (its model was not kept here), the interrupted one leaves no time.
-    assert peers.training_time(tmp_path) == dict(wall_s=30.0, cpu_s=9.0)
+    assert training_time(tmp_path) == dict(wall_s=30.0, cpu_s=9.0)
 
 
 def test_the_time_of_a_second_stage_holds_that_of_the_first(tmp_path, monkeypatch):
@@ -180,9 +181,7 @@ def test_weight_decay_reaches_the_optimiser_and_changes_nothing_else():
     override = peers.with_weight_decay("Lava-v0-pg", 0.01)
     kwargs = load_hyperparams("Lava-v0-pg")["policy_kwargs"]
     assert override == dict(policy_kwargs={**kwargs, "optimizer_kwargs": {"weight_decay": 0.01}})
-    model = peers.TimedRun("PG", "Lava-v0", "Lava-v0-pg", 0, override)
-    from sb3_tdpg.training import make_training
-
+    model = TimedRun("PG", "Lava-v0", "Lava-v0-pg", 0, override)
     optimizer = make_training("Lava-v0", model.settings).model.policy.optimizer
     assert [group["weight_decay"] for group in optimizer.param_groups] == [0.01] * len(optimizer.param_groups)
 

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, PANDA_GRASP, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, provenance, write_frame_atomically, write_run_config
-from sb3_tdpg.files import replaced_atomically, write_atomically
+from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.reproduction.ball import GROUPS, with_groups
 from sb3_tdpg.reproduction.ball import SECOND_STAGE as BALL_SECOND_STAGE
@@ -24,8 +19,8 @@ from sb3_tdpg.reproduction.common import RECORD_COLUMNS, commits_of, how_made, p
 from sb3_tdpg.reproduction.grasp import COST_LIMIT as GRASP_COST_LIMIT
 from sb3_tdpg.reproduction.grasp import SECOND_STAGE as GRASP_SECOND_STAGE
 from sb3_tdpg.reproduction.lava import MAX_ATTEMPTS
+from sb3_tdpg.reproduction.peer_runs import SB3Run, TimedRun, training_time
 from sb3_tdpg.runs import Run, complete_runs
-from sb3_tdpg.training import read_schedule, take_env
 
 # As many environment steps as TDPG has, in both its stages where it has two.
 LAVA_STEPS, BALL_STEPS, GRASP_STEPS = 1.5e6, 1.6e5, 3.2e4
@@ -42,71 +37,6 @@ FOOTER = (
     "policies, evaluation seed 0. Lowest in bold. On grasping the cost is the share of failed grasps. Time of a "
     "training, all attempts and both stages together: median over the seeds trained here, one thread."
 )
-
-
-@dataclass(frozen=True)
-class TimedRun(Run):
-    """A run that leaves ``time.json`` in its folder: seconds that the training took, on the clock and of the CPU."""
-
-    def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        """Train as :class:`~sb3_tdpg.runs.Run` does; later calls add to its time, an interrupted one does not."""
-        path = folder / "time.json"
-        before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
-        wall, cpu = time.perf_counter(), time.process_time()
-        trained = self._learn(attempt, folder, progress_bar)
-        wall, cpu = before["wall_s"] + time.perf_counter() - wall, before["cpu_s"] + time.process_time() - cpu
-        write_atomically(path, json.dumps(dict(wall_s=round(wall, 3), cpu_s=round(cpu, 3))))
-        return trained
-
-    def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        return super().train(attempt, folder, progress_bar)
-
-
-@dataclass(frozen=True)
-class SB3Run(TimedRun):
-    """
-    A run of an algorithm that is not ours; it has no selection, and an interrupted training begins anew.
-
-    :param algo: ``"ppo"`` or ``"ppo_lstm"``; the block is one of ``hyperparams/<algo>.yml``.
-    """
-
-    algo: str = "ppo"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The block with the overrides."""
-        return {**load_hyperparams(self.block, self.algo), **self.overrides}
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """What makes this run."""
-        return {**super().config, "algo": self.algo}
-
-    def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        algorithm, path = _algorithm(self.algo), folder / "model.zip"
-        if path.exists():
-            return algorithm.load(path, device="cpu"), False
-        settings = self.settings
-        n_timesteps = int(settings.pop("n_timesteps"))
-        env = take_env(self.env_id, settings)
-        read_schedule(settings)
-        model = algorithm(settings.pop("policy"), env, **settings, seed=self.seed, device="cpu")
-        model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
-        model.learn(n_timesteps, progress_bar=progress_bar)
-        model.logger.close()
-        with replaced_atomically(path) as partial:
-            model.save(partial)
-        return model, False
-
-
-def _algorithm(name: str) -> Any:
-    if name == "ppo":
-        return PPO
-    try:
-        from sb3_contrib import RecurrentPPO
-    except ImportError as e:
-        raise ImportError("RecurrentPPO needs sb3-contrib: pip install sb3-contrib") from e
-    return RecurrentPPO
 
 
 @dataclass(frozen=True)
@@ -364,16 +294,6 @@ def reproduce_peers(
     if publish is not None:
         publish_files(out, publish)
     return summary
-
-
-def training_time(folder: Path) -> dict[str, float]:
-    """
-    Add up what the training of a run took, attempts in vain included.
-
-    :return: ``wall_s`` and ``cpu_s``
-    """
-    times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
-    return {name: sum(each[name] for each in times) for name in ("wall_s", "cpu_s")}
 
 
 def _seed_table(records: pd.DataFrame, runs: Mapping[Path, Run]) -> pd.DataFrame:
