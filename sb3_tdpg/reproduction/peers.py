@@ -185,7 +185,7 @@ BALL_PEERS = Comparison(
         Peer("PPO", "BallCatch-v0", "ppo"),
         Peer("PPO, pixel noise", "BallCatch-v0", "ppo", with_perturbation(noise=0.25)),
         Peer("PPO, random backgrounds", "BallCatch-v0", "ppo", with_perturbation(color=0.35, pattern=0.7, patch=0.5)),
-        Peer("RecurrentPPO", "BallCatch-v0", "ppo_lstm", max_seeds=1),
+        Peer("RecurrentPPO", "BallCatch-v0", "ppo_lstm"),
     ),
     rows=[row.with_kwargs(renderer="fast") for row in BALL_CATCH],
     columns=("Training", *GROUPS),
