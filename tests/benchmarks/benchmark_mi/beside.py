@@ -1,0 +1,116 @@
+"""
+Our MINE and that of ``benchmark-mi`` on the same samples, one right after the other on the same machine: times.
+
+The machine may be slower at one time than at another, so that a ratio of times that were taken hours apart says little.
+From the repository's root, in the project's environment, with the package's own as in ``generate.py``::
+
+    python tests/benchmarks/benchmark_mi/beside.py build/venv_bmi/bin/python
+    python tests/benchmarks/benchmark_mi/beside.py --table-only
+
+Each pass appends to ``beside.csv`` and takes seven minutes; ``--new`` removes what is there. The package's estimates
+must be those of ``theirs.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import time
+from pathlib import Path
+from typing import IO, cast
+
+import numpy as np
+import pandas as pd
+import torch as th
+from compare import HERE, KEYS  # before all else it sees to it that there is one thread
+
+from sb3_tdpg.information import estimate_information
+
+RESULTS = HERE / "beside.csv"
+N_OURS = 3  # estimates for each of theirs, which takes ten times as long
+AIM = 10  # times faster
+
+
+def measure(python: Path, tasks: list[str]) -> pd.DataFrame:
+    """Estimate every sample of seed 0 with both, in turn."""
+    theirs = pd.read_csv(HERE / "theirs.csv").query("estimator == 'mine' and seed == 0")
+    if tasks:
+        theirs = theirs[theirs["task"].isin(tasks)]
+    samples = np.load(HERE / "ranks.npz")  # all that our estimators use of them
+    rows = []
+    with subprocess.Popen(
+        [python, HERE / "generate.py", "--serve"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as worker:
+        requests, answers = cast("IO[str]", worker.stdin), cast("IO[str]", worker.stdout)
+
+        def ask(task: str, n: int) -> tuple[float, ...]:
+            print("mine", task, n, 0, file=requests, flush=True)
+            return tuple(map(float, answers.readline().split()))
+
+        for i, (task, n, truth, frozen) in enumerate(theirs[[*KEYS, "truth", "estimate"]].itertuples(index=False)):
+            x, z = (samples[f"{task}/{variable}"][0, :n] for variable in "xz")
+            if i == 0:  # the first estimate of either also loads what it needs
+                ask(task, n)
+                estimate_information(x, z)
+            estimate, _, cpu = ask(task, n)
+            if not np.isclose(estimate, frozen, atol=1e-4):
+                raise RuntimeError(f"{task}, n={n}: {estimate} is not the {frozen} of theirs.csv")
+            start = time.process_time()
+            for _ in range(N_OURS):
+                ours = estimate_information(x, z).estimate
+            our_cpu = (time.process_time() - start) / N_OURS
+            rows.append((task, n, truth, estimate, ours, cpu, our_cpu))
+            print(f"{task}, n={n}: {cpu:.2f} s, ours {our_cpu:.3f} s, {cpu / our_cpu:.1f} times", flush=True)
+        requests.close()
+    columns = [*KEYS, "truth", "theirs", "ours", "cpu_seconds_theirs", "cpu_seconds_ours"]
+    return pd.DataFrame(rows, columns=columns).round(6)
+
+
+def table(passes: pd.DataFrame) -> str:
+    """For every task and size the ratio of times of each pass, and the median of them, as Markdown."""
+    ratio = passes["cpu_seconds_theirs"] / passes["cpu_seconds_ours"]
+    groups = passes.assign(ratio=ratio).groupby(KEYS, sort=False)
+    both = groups.median(numeric_only=True)
+    error = both[["theirs", "ours"]].sub(both["truth"], axis=0).abs()
+    both["equal"] = error["ours"] <= error["theirs"]
+    lines = [
+        "| task | n | ours is at least as near | their CPU s | our CPU s | times faster (least to most) |",
+        "|" + "---|" * 6,
+    ]
+    for (task, n), row in both.iterrows():
+        least, most = groups.get_group((task, n))["ratio"].agg(["min", "max"])
+        lines.append(
+            f"| `{task}` | {n} | {'yes' if row['equal'] else 'no'} | {row['cpu_seconds_theirs']:.2f} | "
+            f"{row['cpu_seconds_ours']:.3f} | {row['ratio']:.1f} ({least:.1f} to {most:.1f}) |"
+        )
+    equal = both[both["equal"]]["ratio"]
+    medians = equal.groupby("n").median()
+    lines += [
+        "",
+        f"At least as near: {len(equal)} of {len(both)}; of these at least {AIM} times faster: {(equal >= AIM).sum()}. "
+        f"Least {equal.min():.1f}; median " + ", ".join(f"{value:.1f} at n = {n}" for n, value in medians.items()),
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure one pass more, print the table of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("python", type=Path, nargs="?", help="the interpreter of the package's environment")
+    parser.add_argument("--tasks", nargs="+", default=[], help="only these; nothing is stored")
+    parser.add_argument("--new", action="store_true", help="drop the passes that are stored")
+    parser.add_argument("--table-only", action="store_true", help="print the table of the beside.csv that is there")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    passes = pd.read_csv(RESULTS) if RESULTS.exists() and not args.new else pd.DataFrame()
+    if not args.table_only:
+        if args.python is None:
+            parser.error("which Python has benchmark-mi? See generate.py")
+        passes = pd.concat([passes, measure(args.python, args.tasks)])
+        if not args.tasks:
+            passes.to_csv(RESULTS, index=False)
+    print(table(passes))
+
+
+if __name__ == "__main__":
+    main()
