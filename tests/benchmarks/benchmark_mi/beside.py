@@ -7,13 +7,15 @@ From the repository's root, in the project's environment, with the package's own
     python tests/benchmarks/benchmark_mi/beside.py build/venv_bmi/bin/python
     python tests/benchmarks/benchmark_mi/beside.py --table-only
 
-Each pass appends to ``beside.csv`` and takes seven minutes; ``--new`` removes what is there. The package's estimates
-must be those of ``theirs.csv``.
+It takes five minutes of one core, and adds a row to ``beside.csv`` for each sample: those that have the fewest rows
+come first, and of these the ones at which ours takes the longest. So it can be stopped and started again. Rows of an
+older version of ours are to be removed by hand. The package's estimates must be those of ``theirs.csv``.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import subprocess
 import time
 from pathlib import Path
@@ -27,27 +29,36 @@ from compare import HERE, KEYS  # before all else it sees to it that there is on
 from sb3_tdpg.information import estimate_information
 
 RESULTS = HERE / "beside.csv"
+COLUMNS = [*KEYS, "truth", "theirs", "ours", "cpu_seconds_theirs", "cpu_seconds_ours"]
 N_OURS = 3  # estimates for each of theirs, which takes ten times as long
 AIM = 10  # times faster
 
 
-def measure(python: Path, tasks: list[str]) -> pd.DataFrame:
-    """Estimate every sample of seed 0 with both, in turn."""
-    theirs = pd.read_csv(HERE / "theirs.csv").query("estimator == 'mine' and seed == 0")
-    if tasks:
-        theirs = theirs[theirs["task"].isin(tasks)]
+def jobs(minimum: int) -> pd.DataFrame:
+    """Samples of seed 0 with fewer than ``minimum`` rows, in the order in which they are to be estimated."""
+    first = [pd.read_csv(HERE / name).query("seed == 0").set_index(KEYS) for name in ("theirs.csv", "ours.csv")]
+    theirs, ours = (found[found["estimator"] == name] for found, name in zip(first, ("mine", "our mine"), strict=True))
+    n_rows = pd.read_csv(RESULTS).groupby(KEYS).size() if RESULTS.exists() else pd.Series(dtype=int)
+    theirs = theirs.assign(n_rows=n_rows.reindex(theirs.index, fill_value=0), ours=ours["cpu_seconds"])
+    theirs = theirs.sort_values(["n_rows", "ours"], ascending=[True, False])
+    return theirs[theirs["n_rows"] < minimum].reset_index()
+
+
+def measure(python: Path, todo: pd.DataFrame, minutes: float) -> None:
+    """Estimate every sample with both, in turn."""
     samples = np.load(HERE / "ranks.npz")  # all that our estimators use of them
-    rows = []
-    with subprocess.Popen(
-        [python, HERE / "generate.py", "--serve"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as worker:
+    begin = time.perf_counter()
+    command = [python, HERE / "generate.py", "--serve"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
         requests, answers = cast("IO[str]", worker.stdin), cast("IO[str]", worker.stdout)
 
         def ask(task: str, n: int) -> tuple[float, ...]:
             print("mine", task, n, 0, file=requests, flush=True)
             return tuple(map(float, answers.readline().split()))
 
-        for i, (task, n, truth, frozen) in enumerate(theirs[[*KEYS, "truth", "estimate"]].itertuples(index=False)):
+        for i, (task, n, truth, frozen) in enumerate(todo[[*KEYS, "truth", "estimate"]].itertuples(index=False)):
+            if time.perf_counter() - begin > 60 * minutes:
+                break
             x, z = (samples[f"{task}/{variable}"][0, :n] for variable in "xz")
             if i == 0:  # the first estimate of either also loads what it needs
                 ask(task, n)
@@ -59,17 +70,16 @@ def measure(python: Path, tasks: list[str]) -> pd.DataFrame:
             for _ in range(N_OURS):
                 ours = estimate_information(x, z).estimate
             our_cpu = (time.process_time() - start) / N_OURS
-            rows.append((task, n, truth, estimate, ours, cpu, our_cpu))
+            row = pd.DataFrame([(task, n, truth, estimate, ours, cpu, our_cpu)], columns=COLUMNS)
+            row.round(6).to_csv(RESULTS, mode="a", header=not RESULTS.exists(), index=False)
             print(f"{task}, n={n}: {cpu:.2f} s, ours {our_cpu:.3f} s, {cpu / our_cpu:.1f} times", flush=True)
         requests.close()
-    columns = [*KEYS, "truth", "theirs", "ours", "cpu_seconds_theirs", "cpu_seconds_ours"]
-    return pd.DataFrame(rows, columns=columns).round(6)
 
 
 def table(passes: pd.DataFrame) -> str:
-    """For every task and size the ratio of times of each pass, and the median of them, as Markdown."""
+    """For every task and size the ratio of times, the median where there are several rows, as Markdown."""
     ratio = passes["cpu_seconds_theirs"] / passes["cpu_seconds_ours"]
-    groups = passes.assign(ratio=ratio).groupby(KEYS, sort=False)
+    groups = passes.assign(ratio=ratio).groupby(KEYS)
     both = groups.median(numeric_only=True)
     error = both[["theirs", "ours"]].sub(both["truth"], axis=0).abs()
     both["equal"] = error["ours"] <= error["theirs"]
@@ -94,22 +104,19 @@ def table(passes: pd.DataFrame) -> str:
 
 
 def main() -> None:
-    """Measure one pass more, print the table of all."""
+    """Measure, print the table of all rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("python", type=Path, nargs="?", help="the interpreter of the package's environment")
-    parser.add_argument("--tasks", nargs="+", default=[], help="only these; nothing is stored")
-    parser.add_argument("--new", action="store_true", help="drop the passes that are stored")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this long; start again to go on")
+    parser.add_argument("--rows", type=int, default=1, help="rows that each sample is to have")
     parser.add_argument("--table-only", action="store_true", help="print the table of the beside.csv that is there")
     args = parser.parse_args()
     th.set_num_threads(1)
-    passes = pd.read_csv(RESULTS) if RESULTS.exists() and not args.new else pd.DataFrame()
     if not args.table_only:
         if args.python is None:
             parser.error("which Python has benchmark-mi? See generate.py")
-        passes = pd.concat([passes, measure(args.python, args.tasks)])
-        if not args.tasks:
-            passes.to_csv(RESULTS, index=False)
-    print(table(passes))
+        measure(args.python, jobs(args.rows), args.minutes)
+    print(table(pd.read_csv(RESULTS)))
 
 
 if __name__ == "__main__":
