@@ -13,8 +13,10 @@ from sb3_tdpg.information import estimate_information
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.pairs import (
     Start,
-    _choose,
+    StartedMLP,
+    _Choice,
     _degrees_of_freedom,
+    _elu_,
     _features,
     _ranks,
     _scatter,
@@ -161,10 +163,37 @@ def test_the_start_is_the_log_density_ratio_of_a_multivariate_t():
         return stats.multivariate_t(shape=fitted[part, part], df=3.0).logpdf(y[:, part])
 
     expected = log_density(slice(3)) - log_density(slice(2)) - log_density(slice(2, 3))
-    for weight in (1.0, 0.0):
-        start = Start.fit(samples, 2, nu, th.full_like(nu, weight), level=0.5)
-        _, ratio = start(th.cat(start.sides(samples[..., :2], samples[..., 2:]), -1))
-        np.testing.assert_allclose(ratio[0, :, 0], 0.5 + weight * expected)
+    everything = th.arange(len(y))
+    start = Start.fit(samples, everything[None], 2, nu, level=0.5)
+    own = everything[None, :, None].expand(-1, -1, 2)  # x and z of the same pair
+    np.testing.assert_allclose(start(own)[0, :, 0], 0.5 + expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(start.flat_like(0.5)(own)[0, :, 0], 0.5)
+    shifted = th.stack([everything, everything.roll(1)], -1)[None]
+    y[:, 2] = np.roll(y[:, 2], 1)
+    expected = log_density(slice(3)) - log_density(slice(2)) - log_density(slice(2, 3))
+    np.testing.assert_allclose(start(shifted)[0, :, 0], 0.5 + expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_networks_gradient_by_hand_is_that_of_autograd():
+    n_rows, n = 2, 30
+    generator = th.Generator().manual_seed(0)
+    critic = StartedMLP(n_rows, (6, 8, 8, 1))
+    critic.of_x, critic.of_z, of_x, of_z = (th.randn(n_rows * n, size, generator=generator) for size in (6, 6, 4, 4))
+    critic.start = Start(of_x.abs(), of_z.abs(), th.ones(n_rows, 1, 1))
+    row = th.arange(n_rows)[:, None, None]
+    pairs = row * n + th.randint(n, (n_rows, 50, 2), generator=generator)
+    weights = th.randn(n_rows, 50, 1, generator=generator)
+    values = critic(pairs)
+    expected = th.autograd.grad((weights * values).sum(), list(critic.parameters()))
+    for parameter in critic.parameters():
+        parameter.grad = th.full_like(parameter, th.nan)
+    with th.no_grad():
+        by_hand = critic.gradient_by_hand()
+        th.testing.assert_close(by_hand.forward(pairs), values)
+        by_hand.backward(weights)
+    th.testing.assert_close([parameter.grad for parameter in critic.parameters()], list(expected))
+    x = th.linspace(-100, 20, 500)
+    th.testing.assert_close(_elu_(x.clone()), th.nn.functional.elu(x), rtol=0, atol=1e-6)
 
 
 def test_whitened_features_have_covariance_1():
@@ -177,19 +206,34 @@ def test_whitened_features_have_covariance_1():
     np.testing.assert_allclose(covariance, th.eye(2).expand_as(covariance), atol=1e-6)
 
 
+def consider(*checks, training=True):
+    """What is chosen of a start that reads 0 everywhere and of checks, each held out and trained on, ``(K,)``."""
+    n_folds = len(checks[0][0])
+    choice = _Choice(-2.0, 10.0, th.zeros(1, n_folds), th.zeros(1, n_folds))
+    for held_out, trained_on in checks:
+        choice.consider(th.tensor([held_out]), lambda seen=trained_on: th.tensor([seen]), th.tensor([training]))
+    return choice.held_out[0].tolist(), choice.trained_on[0].tolist()
+
+
 def test_a_fold_does_not_choose_by_its_own_luck():
-    history = th.zeros(2, 2, 1, 3)  # two checks, one problem, three folds
-    history[1, 0, 0] = th.tensor([5.0, -1.0, -1.0])  # one fold lucky at the second check
-    held_out, _ = _choose(history, th.full((1,), th.inf), -2.0, 10.0)
-    # Fold 0 is told by the others to take the first check; these are told by fold 0 to take the second.
-    assert held_out.item() == pytest.approx(-2 / 3)
+    # Fold 0 is told by the others to stay with the start; these are told by fold 0, which was lucky, to leave it.
+    held_out, trained_on = consider(([5.0, -1.0, -1.0], [6.0, 7.0, 8.0]))
+    assert held_out == [0, -1, -1] and trained_on == [0, 7, 8]
+    assert consider(([5.0, -1.0, -1.0], [6.0, 7.0, 8.0]), training=False) == ([0, 0, 0], [0, 0, 0])
 
 
-def test_a_critic_out_of_bounds_in_one_fold_is_not_chosen_in_any():
-    history = th.zeros(2, 2, 1, 3)
-    history[1, :, 0] = th.tensor([5.0, 5.0, th.nan])
-    held_out, trained_on = _choose(history, th.full((1,), th.inf), -2.0, 10.0)
-    assert held_out.item() == trained_on.item() == 0
+@pytest.mark.parametrize("bad", [th.nan, th.inf, 11.0, -3.0])
+def test_a_critic_out_of_bounds_in_one_fold_is_not_chosen_in_any(bad):
+    good = [2.0, 3.0, 4.0]
+    for check in ((good, [5.0, 5.0, bad]), ([5.0, 5.0, bad], good)):
+        assert consider(check) == ([0, 0, 0], [0, 0, 0])
+        assert consider(check, (good, good)) == consider((good, good), check) == (good, good)
+
+
+def test_seen_pairs_are_read_only_where_a_critic_may_be_chosen():
+    choice = _Choice(-2.0, 10.0, th.ones(1, 3), th.ones(1, 3))
+    choice.consider(th.zeros(1, 3), lambda: pytest.fail("read"), th.tensor([True]))
+    assert (choice.held_out == 1).all()
 
 
 @pytest.mark.parametrize(

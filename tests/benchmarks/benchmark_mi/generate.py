@@ -21,6 +21,7 @@ import argparse
 import csv
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -105,11 +106,27 @@ def rank(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: np.apply_along_axis(of_component, 1, x).astype(np.uint16) for name, x in samples.items()}
 
 
+def timed(estimator: str, x: np.ndarray, z: np.ndarray) -> tuple[float, float, float]:
+    """Estimate, elapsed seconds and CPU seconds."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    estimate = float(build(estimator, len(x))(x, z))
+    return estimate, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def serve(samples: dict[str, np.ndarray]) -> None:
+    """Estimate what each line of the input names, ``estimator task n seed``: for ``beside.py``."""
+    for line in sys.stdin:
+        estimator, task, n, seed = line.split()
+        x, z = (samples[f"{task}/{variable}"][int(seed), : int(n)] for variable in "xz")
+        print(*timed(estimator, x, z), flush=True)
+
+
 def main() -> None:
     """Draw the samples, then run the estimators on them until done or until the time is up."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this long; start again to go on")
     parser.add_argument("--estimators", nargs="+", default=sorted({name for name, _ in PLAN}))
+    parser.add_argument("--serve", action="store_true", help="estimate what the input asks for; see beside.py")
     args = parser.parse_args()
     start = time.perf_counter()
 
@@ -122,6 +139,9 @@ def main() -> None:
     changed = [name for name in ranks if not np.array_equal(ranks[name], frozen[name])]
     if changed:
         raise RuntimeError(f"{changed} are drawn otherwise than in {ranks_file}: use the versions named above")
+    if args.serve:
+        serve(samples)
+        return
     done = set()
     if results_file.exists():
         with results_file.open(newline="") as file:
@@ -139,9 +159,7 @@ def main() -> None:
                 if time.perf_counter() - start > 60 * args.minutes:
                     return
                 x, z = samples[f"{task}/x"][seed, :n], samples[f"{task}/z"][seed, :n]
-                wall, cpu = time.perf_counter(), time.process_time()
-                estimate = float(build(estimator, n)(x, z))
-                wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+                estimate, wall, cpu = timed(estimator, x, z)
                 truth = float(BENCHMARK_TASKS[task].mutual_information)
                 row = (task, n, seed, f"{truth:.6f}", estimator, f"{estimate:.6f}", f"{wall:.4f}", f"{cpu:.4f}")
                 writer.writerow(row)
