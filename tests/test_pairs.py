@@ -10,16 +10,14 @@ from information_problems import CRITICS
 from scipy import stats
 
 from sb3_tdpg.information import estimate_information
+from sb3_tdpg.information.copula_start import Start, _scatter, degrees_of_freedom
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.pairs import (
-    Start,
     StartedMLP,
     _Choice,
-    _degrees_of_freedom,
     _elu_,
     _features,
     _ranks,
-    _scatter,
     _whiten,
 )
 
@@ -148,7 +146,7 @@ def draw_t(nu, n=2000, seed=0):
 @pytest.mark.parametrize("nu", [1.5, 5.0, 100.0])
 def test_the_degrees_of_freedom_are_those_of_the_sample(nu):
     y, _ = draw_t(nu)
-    found = _degrees_of_freedom(_ranks(th.as_tensor(np.exp(y / 1e4)))[None])  # of the copula: the marginals are others
+    found = degrees_of_freedom(_ranks(th.as_tensor(np.exp(y / 1e4)))[None])  # of the copula: the marginals are others
     assert (found > 20) if nu == 100 else (nu / 1.6 < found < nu * 1.6)
 
 
