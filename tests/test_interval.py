@@ -31,12 +31,11 @@ from sb3_tdpg.information import interval as interval_module
 from sb3_tdpg.information.density_critic import DensityCritic, Encoded, Regression
 from sb3_tdpg.information.interval import (
     component_estimates,
-    donsker_varadhan,
-    draw_trvs,
     min_episodes,
     miss_of_each_limit,
     normal_quantile,
 )
+from sb3_tdpg.information.interval_bounds import donsker_varadhan, draw_trvs
 from sb3_tdpg.information.trust import TrustBadge, TrustCheck, trust_checks
 
 PROBLEM = "Lava-v0"
