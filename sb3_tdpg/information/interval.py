@@ -48,8 +48,8 @@ class InformationInterval:
     upper: np.ndarray
     """``(T,)``: upper confidence limits."""
     lower_name: tuple[str, ...]
-    """For each step the bound that the lower limit comes from: ``"critic"``, ``"zero"`` where information is never
-    negative says more, ``""`` where there is none."""
+    """For each step the bound that the lower limit comes from: ``"critic"`` or ``"gaussian"``, ``"zero"`` where
+    information is never negative says more, ``""`` where there is none."""
     upper_name: tuple[str, ...]
     """Likewise ``"logdet"``, ``"loo"`` or ``"marginal"``."""
     estimates: dict[str, np.ndarray]
@@ -156,11 +156,18 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
-    which holds for any F that the samples have no part in. Half of the episodes fit the critic
-    (:class:`~sb3_tdpg.information.density_critic.DensityCritic`), it is frozen, and the other half is fresh; then the
-    halves change places, and the mean of the two counts. Up to 300 episodes are divided in three ways, and the mean of
-    these counts, since a division leaves out the pairs of episodes that it parts. Densities of the encoder alone give
-    no such bound: they bound the information of its *input*, which may be larger.
+    which holds for any F that the samples have no part in: critics are fitted to some of the episodes, frozen, and
+    evaluated on the others. There are two kinds, and the larger bound counts.
+
+    - ``"critic"``: :class:`~sb3_tdpg.information.density_critic.DensityCritic`, fitted to one half of the episodes and
+      evaluated on the other; then the halves change places. Up to 300 episodes are divided in three ways, since a
+      division leaves out the pairs of episodes that it parts.
+    - ``"gaussian"``: :class:`~sb3_tdpg.information.gaussian_critic.GaussianCritic`, which knows one shape only and is
+      fitted at once, therefore often and to more episodes: to all but two of eight groups, and evaluated on the two
+      (five groups with more than 300 episodes). It is tighter where states and TRVs are about Gaussian together.
+
+    The means over the episodes and over the pairs are those of all critics of a kind, taken before the logarithm.
+    Densities of the encoder alone give no such bound: they bound the information of its *input*, which may be larger.
 
     **Above** stands the smallest of three bounds on I[e_t; x~_t], which is not below I[x_t; x~_t], with
     e_t = (x~_{t-1}, y_t) the input of the encoder, whose density q is known:
@@ -171,15 +178,17 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
       episodes, too.
 
     Since the encoder's density is known, its noise is drawn anew: each episode counts with the mean over several draws
-    of x~ given e, which lessens the error and changes no expectation.
+    of x~ given e. And since the mean square of the noise is known, what the draws have too much or too little of it is
+    taken off (control variates). Both lessen the error, and change no expectation.
 
     Each limit is an estimate less or plus a multiple of its standard error. The multiples spend two fifths of the
     probability to miss, ``1 - confidence``. The rest is for what they neglect: the limits are asymptotic, they take the
     means over episodes as Gaussian. But what an episode adds is skewed like a chi-square, so that a mean that is too
     low comes with a standard error that is too small. What is spent is shared between the limits according to the gap
-    between the estimates (``miss_of_each_limit``); above, a third of a share is for each of the bounds, since the
-    smallest is taken (Bonferroni). The interval holds for each step by itself, not for all of them at once. Above about
-    ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 40)``.
+    between the estimates (``miss_of_each_limit``), and a share is for all bounds of a side at once, since the tightest
+    is taken: the closer they go together, the less that costs (``joint_quantile``). The interval holds for each step by
+    itself, not for all of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot
+    exceed about ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` that the encoder was not trained on since; the episodes are independent.
     :param confidence: Probability, at least, with which the interval of a step holds the truth.
