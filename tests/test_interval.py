@@ -84,7 +84,7 @@ def test_the_limit_is_the_tightest_and_allows_for_the_others():
     for sign, bounds in ((1, (near, noisy, far)), (-1, [e._replace(value=-e.value) for e in (near, noisy, far)])):
         name, value = limit(dict(zip("abc", bounds, strict=True)), 0.02, sign)
         assert name == "a"
-        expected = near.value + joint_quantile(0.02, [noisy.correlation(near), noisy.correlation(far)]) * near.error
+        expected = near.value + joint_quantile(0.02, [near.correlation(noisy), near.correlation(far)]) * near.error
         assert sign * value == pytest.approx(expected)
     assert limit({}, 0.02, 1) == ("", math.inf)
     assert limit(dict(a=near), 0.02, 1)[1] == pytest.approx(1 + normal_quantile(0.02) * near.error)
