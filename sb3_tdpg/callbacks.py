@@ -34,7 +34,7 @@ class _TDPGCallback(BaseCallback):
 
 class MINECallback(_TDPGCallback):
     """
-    Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of alg:trv-policy).
+    Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of Algorithm 2, alg:trv-policy).
 
     :class:`TDPG` installs it by itself, before the callbacks of the user, so that those find ``model.information``
     up to date; one that is in the user's list takes its place. It does nothing in an epoch without a penalty

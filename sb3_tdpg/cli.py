@@ -56,8 +56,9 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
     given = {name: value for name, value in options.items() if value is not None}
     if "controls" in given and not experiment.startswith("ball"):
         raise ValueError(f"--no-controls is for ball and ball-varying: {experiment} does not do without any")
-    if "n_ball_seeds" in given and experiment != "peers":
-        raise ValueError(f"--n-ball-seeds is for peers: {experiment} has --n-seeds alone")
+    for name in ("n_ball_seeds", "n_grasp_seeds"):
+        if name in given and experiment != "peers":
+            raise ValueError(f"--{name.replace('_', '-')} is for peers: {experiment} has --n-seeds alone")
     if "n_paper_seeds" in given and experiment == "peers":
         raise ValueError("--n-paper-seeds is for lava and ball: the peers are not the paper's")
     if experiment == "peers":
@@ -199,6 +200,7 @@ def _make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument(
         "--n-ball-seeds", type=int, help="peers: training seeds on ball catching, 0: none; --n-seeds: on lava"
     )
+    reproduce.add_argument("--n-grasp-seeds", type=int, help="peers: training seeds on grasping, 0: none (default: 1)")
     reproduce.add_argument(
         "--no-controls", action="store_false", dest="controls", default=None,
         help="ball: only PG and TDPG; without it, a later call adds the controls",

@@ -9,8 +9,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from sb3_tdpg.evaluation.provenance import jsonable
 from sb3_tdpg.evaluation.tables import one_or_all, summary_table
+from sb3_tdpg.provenance import jsonable
 from sb3_tdpg.publication import Publication
 from sb3_tdpg.rerun import with_numbers
 

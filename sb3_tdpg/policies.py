@@ -321,7 +321,7 @@ class TRVPolicy(BasePolicy):
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (eq:grad phi).
+        Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (equation 13, eq:grad phi).
 
         The stored TRVs are constants here: ``Normal.log_prob(rsample())`` without a detach has no gradient in the mean.
 
@@ -332,7 +332,7 @@ class TRVPolicy(BasePolicy):
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Log pi(u_t | x~_t) at the stored actions (eq:grad psi).
+        Log pi(u_t | x~_t) at the stored actions (equation 12, eq:grad psi).
 
         :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
         :return: ``(T, N)``
@@ -345,7 +345,7 @@ class TRVPolicy(BasePolicy):
 
     def rebuild_trvs(self, features: th.Tensor, noise: th.Tensor, start: th.Tensor | None = None) -> RebuiltTRVs:
         """
-        Unroll eq:lg, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
+        Unroll equation 15, eq:lg, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
 
         :param features: ``(T, N, F)``
         :param noise: eps_t, ``(T, N, Z)``
@@ -393,7 +393,7 @@ class TRVPolicy(BasePolicy):
 
     def rebuild_trvs_in_parts(self, features: th.Tensor, batch: EpisodeBatch, n_steps: int) -> RebuiltTRVs:
         """
-        Unroll eq:lg in parts of the horizon, side by side as if each were an episode: truncated back-propagation.
+        Unroll equation 15, eq:lg, in parts of the horizon, as if each were an episode: truncated back-propagation.
 
         A part begins with the stored TRVs of the step before it, through which no gradient flows.
 

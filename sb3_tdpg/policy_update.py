@@ -1,5 +1,5 @@
 """
-The update of the policy from the rollouts of one epoch (line 6 of alg:trv-policy).
+The update of the policy from the rollouts of one epoch (line 6 of Algorithm 2, alg:trv-policy).
 
 Dimension key: T horizon, N episodes of an epoch, n episodes of a minibatch.
 """

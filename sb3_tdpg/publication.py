@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
-from sb3_tdpg.evaluation.provenance import as_typed
+from sb3_tdpg.provenance import as_typed
 from sb3_tdpg.rerun import scenarios_of, with_numbers
 from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG

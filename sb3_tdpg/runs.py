@@ -9,11 +9,11 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.sharedctypes import Synchronized, SynchronizedArray
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ from tqdm import tqdm
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios, write_frame_atomically, write_run_config
-from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.training import make_training
 from sb3_tdpg.training_batch import Member, MemberDivergedError, TrainingBatch, batch_key
@@ -40,6 +40,9 @@ MAX_CHECKPOINT_EPOCHS = 50
 MAX_BATCH = 10
 # Attempts must not share their seeds with other runs.
 SEEDS_BETWEEN_ATTEMPTS = 1000
+# Of a run, for the progress bar: the rest is its evaluation.
+TRAINING = 0.9
+BAR = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
 
 @dataclass(frozen=True)
@@ -222,8 +225,8 @@ def _prepare(run: Run, attempt: int, folder: Path) -> Member:
     log = make_output_format("csv", str(folder), log_suffix=f"_{model.num_timesteps:08d}")
     model.set_logger(Logger(str(folder), [log]))
     callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, checkpoint_epochs)]
-    if _EPOCHS is not None:
-        callbacks.append(_CountEpochs(_EPOCHS))
+    if _SHARED is not None:
+        callbacks.append(_CountEpochs(_SHARED, folder.parent))
     if training.selection is not None:
         training.selection.save_path = folder / "selected.zip"
     return Member(model, n_timesteps, callbacks, reset_num_timesteps=not resumes)
@@ -311,10 +314,11 @@ def complete_runs(
     in_batch = {folder for batch in batches for _, folder, _ in batch}
     running: dict[Future[Any], list[Path]] = {}
     context = mp.get_context("spawn")
-    epochs = context.Value("L", 0)
+    folders = [folder for _, folder, _ in tasks]
+    shared = _Shared(folders, context.Value("L", 0), context.Array("d", len(tasks)))
     with (
-        tqdm(total=len(tasks), unit="run", smoothing=0.1) as progress,
-        ProcessPoolExecutor(jobs, context, initializer=_init_worker, initargs=(epochs,)) as pool,
+        tqdm(total=len(tasks), unit="run", smoothing=0.1, bar_format=BAR) as progress,
+        ProcessPoolExecutor(jobs, context, initializer=_init_worker, initargs=(shared,)) as pool,
     ):
         try:
             for batch in batches:
@@ -329,14 +333,14 @@ def complete_runs(
                     raise ValueError(f"these runs wait for each other: {[task[0].folder_name for task in waiting]}")
                 # With a timeout, so that Ctrl-C is seen at once.
                 finished, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
-                progress.set_postfix_str(f"{epochs.value:,} epochs of training")
                 for future in finished:
                     folder = future.result()
                     in_batch.difference_update(running.pop(future))
-                    if folder is None:  # a batch: its runs are evaluated next
-                        continue
-                    unfinished.remove(folder)
-                    progress.update()
+                    if folder is not None:  # of a batch: its runs are evaluated next
+                        unfinished.remove(folder)
+                progress.set_postfix_str(f"{shared.epochs.value:,} epochs of training", refresh=False)
+                progress.update(shared.runs(unfinished) - progress.n)
+                progress.refresh()
         except BaseException:
             workers = list(getattr(pool, "_processes", {}).values())  # shutdown() forgets them
             pool.shutdown(wait=False, cancel_futures=True)
@@ -363,27 +367,49 @@ def _batches(tasks: Sequence[Task], jobs: int) -> list[list[Task]]:
     return [batch for batch in batches if len(batch) > 1]
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """
+    What the workers tell the process that shows the progress.
+
+    :param folders: Of the runs.
+    :param epochs: How many there were in all.
+    :param trained: For each run, how much of its training is done, 0 to 1.
+    """
+
+    folders: Sequence[Path]
+    epochs: Synchronized[int]
+    trained: SynchronizedArray[float]
+
+    def runs(self, unfinished: Collection[Path]) -> float:
+        """How many runs are done, with the parts of those that are on their way."""
+        parts = (TRAINING * x if f in unfinished else 1.0 for f, x in zip(self.folders, self.trained[:], strict=True))
+        return sum(parts)
+
+
 class _CountEpochs(BaseCallback):
     """Let the process that shows the progress know that there is some."""
 
-    def __init__(self, epochs: Synchronized[int]) -> None:
+    def __init__(self, shared: _Shared, folder: Path) -> None:
         super().__init__()
-        self._epochs = epochs
+        self._shared, self._index = shared, shared.folders.index(folder)
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        with self._epochs.get_lock():
-            self._epochs.value += 1
+        with self._shared.epochs.get_lock():
+            self._shared.epochs.value += 1
+        # The last epoch may go beyond it.
+        self._shared.trained[self._index] = min(1.0, self.model.num_timesteps / self.model._total_timesteps)
 
 
-_EPOCHS: Synchronized[int] | None = None  # in a worker: the count that all of them share
+_SHARED: _Shared | None = None  # in a worker
 
 
-def _init_worker(epochs: Synchronized[int]) -> None:
-    global _EPOCHS
-    _EPOCHS = epochs
+def _init_worker(shared: _Shared) -> None:
+    global _SHARED
+    _SHARED = shared
     end_with_parent()
     th.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides

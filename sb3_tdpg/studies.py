@@ -26,10 +26,10 @@ try:
 except ImportError as e:
     raise ImportError("studies need Optuna: pip install sb3_tdpg[zoo]") from e
 
-from sb3_tdpg.evaluation.provenance import jsonable
+from sb3_tdpg.provenance import differences, jsonable
 from sb3_tdpg.storages import open_storage, quiet_optuna, told_in_one_line
 from sb3_tdpg.study_jobs import JOB, job_of
-from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker
+from sb3_tdpg.study_worker import Objective, UnfitWorkerError, Worker, values_of
 
 __all__ = ["UnfitWorkerError", "enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
 
@@ -61,7 +61,7 @@ def open_study(
     :raises ValueError: if the study was made with another space or other directions; it says what differs. Likewise if
         the storage does not answer.
     """
-    wanted = json.loads(json.dumps(jsonable({SPACE: space, "directions": list(directions)})))
+    wanted = jsonable(space)
     kinds: list[Any] = list(directions)
     try:
         study = optuna.create_study(storage=storage, study_name=name, directions=kinds, sampler=sampler, pruner=pruner)
@@ -76,31 +76,16 @@ def open_study(
                 f"study {name!r} was made by another program and does not say what its trials are: choose another name"
             ) from None
         if SPACE in study.user_attrs:
-            found = {SPACE: study.user_attrs[SPACE], "directions": [d.name.lower() for d in study.directions]}
-            if changed := _differences(found, wanted):
+            found = [d.name.lower() for d in study.directions]
+            changed = differences({"directions": found}, {"directions": list(directions)})
+            if changed := changed or differences(study.user_attrs[SPACE], wanted):
                 raise ValueError(
-                    f"study {name!r} is there with other settings, {'; '.join(changed)}: choose another name for the "
-                    "study, or the settings that it was made with"
+                    f"study {name!r} is there with other settings, {changed}: choose another name for the study, or "
+                    "the settings that it was made with"
                 ) from None
             return study
-    study.set_user_attr(SPACE, wanted[SPACE])
+    study.set_user_attr(SPACE, wanted)
     return study
-
-
-def _differences(found: Any, wanted: Any, where: str = "") -> list[str]:
-    """Name what differs in two values of JSON's types."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        keys = sorted({*found, *wanted})
-        inside = [_differences(found.get(k), wanted.get(k), f"{where}.{k}" if where else k) for k in keys]
-        return [line for lines in inside for line in lines]
-    return (
-        [] if found == wanted else [f"{where.removeprefix(SPACE + '.')}: {_short(found)} there, {_short(wanted)} here"]
-    )
-
-
-def _short(value: Any) -> str:
-    text = "nothing" if value is None else json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 @told_in_one_line()
@@ -127,6 +112,7 @@ def work(
     grace_period: float = GRACE_PERIOD,
     heartbeat_interval: float | None = None,
     report: Callable[[str], None] = print,
+    describe: Callable[[optuna.trial.FrozenTrial], str] = values_of,
 ) -> None:
     """
     Run trials of a study until it is finished, beside any number of workers that do the same.
@@ -146,6 +132,7 @@ def work(
     :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
     :param heartbeat_interval: Seconds; default: a sixth of the grace period.
     :param report: Gets a line of text whenever something happens.
+    :param describe: What the line says of a complete trial; default: its values.
     :raises ValueError: if the grace period is too short, or the storage stays away.
     """
     if n_trials is not None and n_trials < 1:
@@ -154,4 +141,4 @@ def work(
         heartbeat_interval = grace_period / 6
     if not 0 < 2 * heartbeat_interval <= grace_period:
         raise ValueError(f"{grace_period=} must be at least twice {heartbeat_interval=}, and both positive (seconds)")
-    Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report).run()
+    Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report, describe).run()

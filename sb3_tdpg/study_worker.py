@@ -79,8 +79,10 @@ class Worker:
         heartbeat_interval: float,
         grace_period: float,
         report: Callable[[str], None],
+        describe: Callable[[FrozenTrial], str],
     ) -> None:
-        self.study, self.objective, self.report = study, objective, report
+        self.study, self.objective = study, objective
+        self.report, self.describe = report, describe
         self.n_trials, self.max_retries = n_trials, max_retries
         self.heartbeat_interval, self.grace_period = heartbeat_interval, grace_period
         self.next_number: int | None = 0  # if this worker is alone with the study
@@ -218,8 +220,10 @@ class Worker:
         if told is None or told.state != state:
             self._say_taken_over(trial)
             return
-        values_text = ", ".join(f"{value:.4g}" for value in told.values or ())
-        text = {TrialState.COMPLETE: values_text, TrialState.PRUNED: "pruned"}.get(state, "failed")
+        if state == TrialState.COMPLETE:
+            text = self.describe(told)
+        else:
+            text = "pruned" if state == TrialState.PRUNED else "failed"
         text += f": {reason}" if reason else ""
         total = "" if self.n_trials is None else f" of {self.n_trials}"
         self.report(f"trial {trial.number}: {text} ({len(self._read().done)}{total} finished)")
@@ -251,6 +255,11 @@ class Worker:
                     reason = " ".join(str(getattr(e.__cause__, "orig", None) or e).split())
                     raise StorageAwayError(f"the storage has not answered for {PATIENCE:g} s: {reason}") from e
                 time.sleep(1.0)
+
+
+def values_of(trial: FrozenTrial) -> str:
+    """Print the values of a complete trial."""
+    return ", ".join(f"{value:.4g}" for value in trial.values)
 
 
 def _reason(error: Exception) -> str:

@@ -57,8 +57,9 @@ def sweep_summary(
         "## Every run",
         "Cost and its standard deviation over episodes; information in nats, summed over time, on fresh rollouts: the "
         "log-det bound from above, which the selection goes by, and a bound from below on what the encoder's input "
-        "tells of the TRVs. `met_block_limits`: whether an epoch met the limits of the block's own selection, if it "
-        "has one; otherwise the model is that of the last epoch.",
+        "tells of the TRVs. Both are estimates from the same rollouts, the second one never above the first; on other "
+        "rollouts both would be a little different. `met_block_limits`: whether an epoch met the limits of the block's "
+        "own selection, if it has one; otherwise the model is that of the last epoch.",
         markdown_table(shown.rename(columns={"label": "beta"}), digits=4),
     ]
     if failures:

@@ -1,5 +1,5 @@
 """
-Task-Driven Policy Gradient (alg:trv-policy) as a Stable-Baselines3 algorithm.
+Task-Driven Policy Gradient (Algorithm 2, alg:trv-policy) as a Stable-Baselines3 algorithm.
 
 Dimension key: T horizon, N episodes of an epoch, X state, Z task-relevant variables (TRVs), U action.
 """
@@ -46,7 +46,7 @@ class TDPG(OnPolicyAlgorithm):
     Task-Driven Policy Gradient (Pacelli and Majumdar, 2020).
 
     Minimises the expected cost of an episode plus the information that the task-relevant variables carry about the
-    state (eq:robust pomdp, divided by beta):
+    state (equation 3, eq:robust pomdp, divided by beta):
 
     .. math:: E[c(\tau)] + \frac1\beta \sum_t I[x_t; \tilde x_t]
 
@@ -79,9 +79,9 @@ class TDPG(OnPolicyAlgorithm):
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step;
         ``"mean"``: cost of the whole episode minus the mean over the batch, as in the paper.
-    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (eq:grad phi), as in the paper;
-        ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased; the
-        second varies less. Default: ``"score"`` and ``"pathwise"``.
+    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (equation 13, eq:grad phi), as in the
+        paper; ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased;
+        the second varies less. Default: ``"score"`` and ``"pathwise"``.
     :param bptt_steps: Steps that a gradient flows back through the memory: the pathwise one, and the information's.
         ``None``: to the start of the episode. For long horizons: the horizon is cut into parts of so many steps, which
         are computed side by side; what a TRV does for the steps beyond its part is then not credited to it. The steps
@@ -339,7 +339,7 @@ class TDPG(OnPolicyAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         """
-        Roll out N whole episodes with the current policy (line 2 of alg:trv-policy).
+        Roll out N whole episodes with the current policy (line 2 of Algorithm 2, alg:trv-policy).
 
         Each of E environments runs N / E episodes one after the other. A quota per environment, not the first N that
         finish: those would be the short ones. All environments begin an epoch at t = 0.
@@ -418,7 +418,7 @@ class TDPG(OnPolicyAlgorithm):
         super().dump_logs(iteration)
 
     def train(self) -> None:
-        """Update encoder and action head (line 6 of alg:trv-policy)."""
+        """Update encoder and action head (line 6 of Algorithm 2, alg:trv-policy)."""
         update = PolicyUpdate(self)
         for _ in range(self.n_epochs):
             for episodes in update.minibatches():

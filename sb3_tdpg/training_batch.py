@@ -208,7 +208,7 @@ class TrainingBatch:
             model.rollout_buffer.full = True
 
     def _fit_critics(self) -> None:
-        """Lines 3 to 5 of alg:trv-policy, for the callbacks to hand over to their models."""
+        """Lines 3 to 5 of Algorithm 2, alg:trv-policy, for the callbacks to hand over to their models."""
         batches = (model.rollout_buffer.episode_batch() for model in self.models)
         self.batch = EpisodeBatch(*(th.cat(x) for x in zip(*batches, strict=True)))
         if not self.has_penalty:

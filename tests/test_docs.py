@@ -218,3 +218,21 @@ def test_a_label_of_the_paper_that_the_code_cites_is_in_the_map():
     ]
     unknown = [rest.splitlines()[0] for rest in cited if not any(rest.startswith(label) for label in PAPER_LABELS)]
     assert len(cited) > 15 and not unknown
+
+
+def test_labels_of_the_paper_come_with_the_numbers_that_its_pdf_shows():
+    (numbers,) = re.findall(r"^The PDF shows numbers.*?\n\n", PAPER_MAP.read_text(), re.M | re.S)
+    pairs = re.findall(r"((?:Theorem|Algorithm|equation) [\w.]+) `(\w+:[^`]+)`", " ".join(numbers.split()))
+    number_of = {label: number for number, label in pairs}
+    assert len(number_of) == 16
+    cited = r"(?:eq|alg|thm):[a-z]+(?:[ -](?:psi|phi|mine|pomdp|policy|risk|bound))?"
+    n_cited = 0
+    for path in sorted((ROOT / "sb3_tdpg").rglob("*.py")):
+        if path.parent.name == "information":
+            continue
+        for number, label in re.findall(
+            rf"((?:Theorem|Algorithm|equation) [\w.]+)?,?\s+\(?({cited})", path.read_text()
+        ):
+            assert number_of[label] == number, f"{path}: {label}"
+            n_cited += 1
+    assert n_cited > 10

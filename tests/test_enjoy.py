@@ -180,6 +180,22 @@ def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
     assert frames_of(tmp_path / "film.gif")[1] == [20, 20, 20, 1000]
 
 
+def test_a_film_that_could_not_be_written_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):
+    pictures = [np.zeros((40, 500, 3), np.uint8)] * 4
+    episodes, path = [Episode(pictures, np.zeros((3, 2)), np.ones(3))], tmp_path / "film.gif"
+    path.write_bytes(b"old")
+
+    def interrupted(image, file, *args, **kwargs):
+        file.write_bytes(b"ne")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Image.Image, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save_animation(episodes, path, horizon=3, fps=10)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_an_mp4_is_written_without_an_ffmpeg_on_the_path(lava, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", "")
     enjoy(lava, "Lava-v0", record=tmp_path / "film.mp4")

@@ -12,14 +12,17 @@ from small_problems import complete_runs_here
 from stable_baselines3 import PPO
 
 from sb3_tdpg.cli import main
-from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA
+from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import write_frame_atomically
+from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.reproduction import peers
-from sb3_tdpg.reproduction.peers import BALL_PEERS, LAVA_PEERS, Peer, SB3Run, TimedRun
+from sb3_tdpg.reproduction import ball, grasp, peer_runs, peers
+from sb3_tdpg.reproduction.peer_runs import SB3Run, TimedRun, training_time
+from sb3_tdpg.reproduction.peers import BALL_PEERS, GRASP_PEERS, LAVA_PEERS, Peer
 from sb3_tdpg.runs import Run, complete_run
-from sb3_tdpg.training import take_env
+from sb3_tdpg.training import make_training, read_schedule, take_env
 
+COMPARISONS = (LAVA_PEERS, BALL_PEERS, GRASP_PEERS)
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 
@@ -27,7 +30,7 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 def results(tmp_path):
     """Records of policies that are not trained again: each seed's costs are its number, and 50 for others' policies."""
     folder = tmp_path / "results"
-    for each in (LAVA_PEERS, BALL_PEERS):
+    for each in COMPARISONS:
         rows = [
             (model, seed, row.name, episode, 50.0 if model == "another" else float(seed), 0, False)
             for model in ("another", *each.recorded)
@@ -58,22 +61,29 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
 
     assert (published / "summary.md").read_text() == summary
     assert {path.name for path in published.iterdir()} == {"summary.md", "seeds.csv", "episodes.csv.xz", "config.json"}
-    for each in (LAVA_PEERS, BALL_PEERS):
+    for each in COMPARISONS:
         assert each.title in summary
-        for label in (*each.recorded.values(), *(peer.label for peer in each.peers)):
+        for label in (*each.recorded.values(), *(peer.label for peer in each.peers if peer.is_shown)):
             assert f"| {label} | " in summary
+    assert "first stage" not in summary
     # Of a method with records the table has these, of its first five seeds, and not the training for its time.
     plain = summary.replace("**", "")
     assert "| TDPG (log-det) | 5 | 302.00 " in plain
     assert "| TDPG, perturbed images | 5 | 102.00 " in plain
     assert "| VIB | 2 | " in plain
-    n_lava = sum(min(2, peer.max_seeds or 2) for peer in LAVA_PEERS.peers)
+    # One seed has no interval.
+    assert "| PPO | 1 | " in plain
+    assert "[" not in plain.split("## Grasping")[1].split("| PPO | 1 | ")[1].split("\n")[0]
+    n_runs = [
+        sum(min(n, peer.max_seeds or n) for peer in each.peers) for each, n in zip(COMPARISONS, (2, 1, 1), strict=True)
+    ]
     records = pd.read_csv(out / "episodes.csv.xz")
-    assert len(records) == 2 * (n_lava * len(LAVA) + len(BALL_PEERS.peers) * len(BALL_CATCH))
+    assert len(records) == 2 * sum(n * len(each.rows) for each, n in zip(COMPARISONS, n_runs, strict=True))
     assert not records.isna().any().any()
     assert records.groupby("env_id")["train_seed"].unique().map(list).to_dict() == {
         "Lava-v0": [300, 301],
         "BallCatch-v0": [100],
+        "PandaGrasp-v0": [100],
     }
     seeds = pd.read_csv(out / "seeds.csv")
     assert (seeds[["cpu_s", "wall_s"]] > 0).all().all()
@@ -94,7 +104,7 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
     settings = run.settings
     n_timesteps, policy = settings.pop("n_timesteps"), settings.pop("policy")
     env = take_env("Lava-v0", settings)
-    peers.read_schedule(settings)
+    read_schedule(settings)
     model = cls(policy, env, **settings, seed=3, device="cpu").learn(n_timesteps)
     saved = cls.load(tmp_path / "run" / "model.zip", device="cpu")
     for name, value in model.policy.state_dict().items():
@@ -130,8 +140,8 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
             return self.now
 
     wall, cpu = Clock(), Clock()
-    monkeypatch.setattr(peers.time, "perf_counter", wall)
-    monkeypatch.setattr(peers.time, "process_time", cpu)
+    monkeypatch.setattr(peer_runs.time, "perf_counter", wall)
+    monkeypatch.setattr(peer_runs.time, "process_time", cpu)
 
     def train(run, attempt, folder, progress_bar):
         folder.mkdir(parents=True, exist_ok=True)
@@ -147,23 +157,38 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
         complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
     complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
     # The first attempt was called twice (its model was not kept here), the interrupted one leaves no time.
-    assert peers.training_time(tmp_path) == dict(wall_s=30.0, cpu_s=9.0)
+    assert training_time(tmp_path) == dict(wall_s=30.0, cpu_s=9.0)
+
+
+def test_the_time_of_a_second_stage_holds_that_of_the_first(tmp_path, monkeypatch):
+    runs = {path: run for path, run in BALL_PEERS.runs(1, tmp_path).items() if run.method[:3] in ("fir", "VIB")}
+    for (path, run), seconds in zip(runs.items(), (100.0, 30.0), strict=True):
+        write_atomically(path_of_time(path), json.dumps(dict(wall_s=seconds, cpu_s=seconds / 2)))
+        assert run.start == (None if run.method == "first stage" else next(iter(runs)))
+    rows = [("BallCatch-v0", run.method, 100, 1, False, "Training", 1.0) for run in runs.values()]
+    columns = ["env_id", "model", "train_seed", "attempts", "selected", "scenario", "cost"]
+    table = peers._seed_table(pd.DataFrame(rows, columns=columns), runs)
+    assert list(table["wall_s"]) == [100.0, 130.0]
+    assert list(table["cpu_s"]) == [50.0, 65.0]
+
+
+def path_of_time(folder):
+    folder.mkdir(parents=True)
+    return folder / "time.json"
 
 
 def test_weight_decay_reaches_the_optimiser_and_changes_nothing_else():
     override = peers.with_weight_decay("Lava-v0-pg", 0.01)
     kwargs = load_hyperparams("Lava-v0-pg")["policy_kwargs"]
     assert override == dict(policy_kwargs={**kwargs, "optimizer_kwargs": {"weight_decay": 0.01}})
-    model = peers.TimedRun("PG", "Lava-v0", "Lava-v0-pg", 0, override)
-    from sb3_tdpg.training import make_training
-
+    model = TimedRun("PG", "Lava-v0", "Lava-v0-pg", 0, override)
     optimizer = make_training("Lava-v0", model.settings).model.policy.optimizer
     assert [group["weight_decay"] for group in optimizer.param_groups] == [0.01] * len(optimizer.param_groups)
 
 
 def test_each_augmentation_changes_images_and_only_as_it_says():
     images = {}
-    for label, peer in {peer.label: peer for peer in BALL_PEERS.peers}.items():
+    for label, peer in {peer.label: peer for peer in BALL_PEERS.peers if peer.algo == "ppo"}.items():
         settings = {**load_hyperparams("BallCatch-v0", "ppo"), **peer.overrides, "n_envs": 3}
         env = take_env("BallCatch-v0", settings)
         env.seed(0)
@@ -175,15 +200,42 @@ def test_each_augmentation_changes_images_and_only_as_it_says():
     assert np.abs((other - plain).mean(axis=(2, 3))).max() > 10
 
 
-def test_the_peers_of_one_table_have_the_same_length_and_differ_in_what_their_name_says():
-    for peer in LAVA_PEERS.peers:
-        steps = peer.run("Lava-v0", 0).settings["n_timesteps"]
-        assert steps == (1e6 if peer.label.startswith("PG") else 1.5e6), peer
-    tdpg, vib = (peer.run("Lava-v0", 0) for peer in LAVA_PEERS.peers if peer.label in ("TDPG (log-det)", "VIB"))
-    assert {key for key in tdpg.settings if tdpg.settings[key] != vib.settings[key]} == {"mi_estimator"}
-    assert tdpg.max_attempts == vib.max_attempts
-    for peer in BALL_PEERS.peers:
-        assert peer.run("BallCatch-v0", 0).settings["n_timesteps"] == 1.6e5
+def settings_of(comparison):
+    return {peer.label: peer.run(comparison.env_id, 0).settings for peer in comparison.peers}
+
+
+def changed(one, other):
+    return {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
+
+
+@pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda comparison: comparison.env_id)
+def test_the_peers_of_one_table_have_as_many_steps_as_tdpg_in_all_stages(comparison):
+    of_tdpg = {
+        "Lava-v0": load_hyperparams("Lava-v0-logdet")["n_timesteps"],
+        "BallCatch-v0": load_hyperparams("BallCatch-v0-perturbed-pg")["n_timesteps"] + ball.SECOND_STAGE["n_timesteps"],
+        "PandaGrasp-v0": load_hyperparams("PandaGrasp-v0-pg")["n_timesteps"] + grasp.SECOND_STAGE["n_timesteps"],
+    }
+    settings = settings_of(comparison)
+    for peer in comparison.peers:
+        if peer.is_shown:
+            steps = sum(settings[label]["n_timesteps"] for label in (peer.label, peer.start) if label)
+            assert steps == of_tdpg[comparison.env_id], peer
+
+
+def test_a_peer_differs_in_what_its_name_says():
+    lava, on_ball, on_grasp = (settings_of(comparison) for comparison in COMPARISONS)
+    assert changed(lava["TDPG (log-det)"], lava["VIB"]) == {"mi_estimator"}
+    assert changed(lava["PG"], lava["PG, weight decay"]) == {"policy_kwargs"}
+    assert changed(on_ball["TDPG, perturbed images"], on_ball["VIB, perturbed images"]) == {"mi_estimator"}
+    attempts = {peer.label: peer.max_attempts for peer in LAVA_PEERS.peers}
+    assert attempts["TDPG (log-det)"] == attempts["VIB"]
+    # And from the methods of the tables of which the records are.
+    for methods, vib in (
+        (ball.METHODS, on_ball["VIB, perturbed images"]),
+        (grasp.EXPERIMENTS["fixed"].methods, on_grasp["VIB"]),
+    ):
+        (tdpg,) = (method for method in methods if method.label == "TDPG")
+        assert changed({**load_hyperparams(tdpg.block), **tdpg.overrides}, vib) == {"mi_estimator"}
 
 
 def test_without_the_records_it_says_how_to_make_them_and_trains_nothing(tmp_path, capsys, monkeypatch):
@@ -193,14 +245,16 @@ def test_without_the_records_it_says_how_to_make_them_and_trains_nothing(tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["lava", "--n-ball-seeds", "2"], ["peers", "--n-paper-seeds", "2"]])
+@pytest.mark.parametrize(
+    "arguments", [["lava", "--n-ball-seeds", "2"], ["grasp", "--n-grasp-seeds", "2"], ["peers", "--n-paper-seeds", "2"]]
+)
 def test_an_option_of_another_experiment_is_refused(arguments, capsys):
     assert main(["reproduce", *arguments]) == 2
     assert arguments[1] in capsys.readouterr().err
 
 
 def test_the_records_in_the_documentation_have_what_the_table_takes_from_them():
-    for each in (LAVA_PEERS, BALL_PEERS):
+    for each in COMPARISONS:
         records = each.read_records(RESULTS, 1000)
         counts = records.groupby(["model", "train_seed", "scenario"]).size()
         assert len(counts) == len(each.recorded) * peers.N_RECORDED_SEEDS * len(each.rows)

@@ -7,7 +7,11 @@ In float64, so that nothing is left of rounding and 1e-5 is generous. Dimension 
 from __future__ import annotations
 
 import math
+import re
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -237,3 +241,12 @@ def test_batched_update_of_the_policy_equals_the_loop(case: Case) -> None:
 def test_the_case_with_a_penalty_has_one() -> None:
     information = run_both(Case()).information
     assert information is not None and information.max() > 0.05, "clamped to nothing, the comparison says nothing"
+
+
+def test_every_topic_of_the_benchmark_is_run():
+    folder = Path(__file__).parent / "benchmarks"
+    written = set(re.findall(r"^def (bench_\w+)", "".join(p.read_text() for p in folder.glob("speed/*.py")), re.M))
+    show = f"import runpy; print(*(b.__name__ for b in runpy.run_path({str(folder / 'run.py')!r})['BENCHES']))"
+    printed = subprocess.check_output([sys.executable, "-c", show], text=True, cwd=folder.parents[1])
+    assert written
+    assert written <= set(printed.split())

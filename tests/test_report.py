@@ -135,6 +135,22 @@ def test_it_goes_on_where_it_stopped_and_gives_the_same(report, monkeypatch):
     assert {name: (out / name).read_bytes() for name in before} == before
 
 
+def test_the_estimates_of_the_information_show_their_progress(tmp_path, capsys):
+    def report_of(folder, *models, progress_bar):
+        robustness_report(
+            {str(number): model for number, model in enumerate(models)}, "Lava-v0", out=tmp_path / folder,
+            perturbations=["vector_noise"], severities=[1], n_episodes=4, scenarios=(), progress_bar=progress_bar,
+        )  # fmt: skip
+        return capsys.readouterr().err
+
+    free = PPO("MlpPolicy", "Lava-v0", n_steps=10, batch_size=10, device="cpu")  # has none
+    shown = report_of("three", tiny_tdpg(), free, tiny_tdpg(seed=1), progress_bar=True)
+    assert re.search(r"100%.* 6/6 .*estimate", shown)
+    assert "information, 2" in shown
+    assert report_of("silent", tiny_tdpg(), progress_bar=False) == ""
+    assert "estimate" not in report_of("none", free, progress_bar=True)
+
+
 def test_other_perturbations_may_be_asked_for_later(report):
     arguments, out = report
     n_rows = len(list((out / "rows").iterdir()))
@@ -321,21 +337,25 @@ def test_records_of_another_environment_are_no_records_of_this_one():
 
 
 @pytest.mark.parametrize(
-    "change, name",
-    [(["--seed", "1"], "seed"), (["--episodes", "7"], "n_episodes"), (["--deterministic"], "deterministic")],
+    "change, difference",
+    [
+        (["--seed", "1"], "seed: 0 there, 1 here"),
+        (["--episodes", "7"], "n_episodes: 12 there, 7 here"),
+        (["--deterministic"], "deterministic: false there, true here"),
+    ],
 )
-def test_a_folder_with_another_report_is_refused(report, change, name, capsys):
+def test_a_folder_with_another_report_is_refused(report, change, difference, capsys):
     arguments, out = report
     before = json.loads((out / "config.json").read_text())
     assert main([*arguments, *change]) == 2
-    assert f"holds a report with another {name}" in capsys.readouterr().err
+    assert f"holds a report with other settings, {difference}: choose" in capsys.readouterr().err
     assert json.loads((out / "config.json").read_text()) == before
 
 
 def test_a_report_of_other_models_is_refused(report, folder, capsys):
     arguments, _ = report
     assert main([arguments[0], *arguments[2:]]) == 2
-    assert "another models" in capsys.readouterr().err
+    assert re.search(r"models.PG: \[.*\] there, not here: choose", capsys.readouterr().err)
 
 
 def test_of_one_policy_that_fails_or_not_the_share_has_wilsons_interval():

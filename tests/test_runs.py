@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -78,7 +79,7 @@ def test_demo_called_again_trains_nothing_and_prints_the_same(tmp_path, capsys, 
 def test_a_folder_with_another_run_is_refused_and_left_alone(tmp_path, capsys):
     complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match=r"holds a run with another seed: choose another folder or remove it"):
+    with pytest.raises(ValueError, match=r"with other settings, seed: 0 there, 1 here: choose another folder"):
         complete_run(tiny_run(seed=1), tmp_path, LAVA[:1], n_eval_episodes=4)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -131,14 +132,14 @@ def test_a_run_keeps_the_selected_policy_and_says_whether_an_epoch_met_the_limit
 
 def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
     complete_run(tiny_run(), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
-    with pytest.raises(ValueError, match="another scenarios"):
+    with pytest.raises(ValueError, match=r"scenarios\[1\]: not there, \{.* here"):
         complete_run(tiny_run(), tmp_path / "first", LAVA[:2], n_eval_episodes=4)
     second = replace(tiny_run(), start=tmp_path / "first")
     complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
     complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
     shutil.rmtree(tmp_path / "first")
     complete_run(tiny_run(seed=5), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
-    with pytest.raises(ValueError, match="another start_policy"):
+    with pytest.raises(ValueError, match=r"settings, start_policy: \"\w+\" there, \"\w+\" here: choose"):
         complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
 
 
@@ -256,6 +257,17 @@ def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
     complete_runs(tasks, n_eval_episodes=4, jobs=2)
     models = [TDPG.load(tmp_path / name / "model.zip", device="cpu") for name in ("first", "second")]
     assert_same_parameters(*(parameters(model.policy) for model in models))
+
+
+def test_the_progress_bar_moves_before_a_run_is_finished(tmp_path, capsys):
+    run = Run("PG", "Lava-v0", "Lava-v0-pg", 0, dict(n_timesteps=1050, n_episodes=20))
+    complete_runs([(replace(run, seed=seed), tmp_path / str(seed), LAVA[:1]) for seed in range(2)], jobs=1)
+    bars = re.findall(r"\| ([\d.]+)/2 \[[^\]]*, ([\d,]+) epochs", capsys.readouterr().err)
+    assert ("1.8", bars[-1][1]) in bars, "both are trained as one batch, and are to be evaluated"
+    assert bars[-1][0] == "2.0"
+    assert float(bars[-1][1]) == 2 * 11
+    runs = [float(done) for done, _ in bars]
+    assert runs == sorted(runs)
 
 
 def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_path):

@@ -364,7 +364,7 @@ def test_a_worker_that_sees_a_slow_trial_of_another_waits_for_it(tmp_path):
 def test_a_study_with_other_settings_is_refused_and_says_what_differs(url):
     open_quick(url, space={"x": [-1, 1], "env": {"id": "Lava-v0", "noise": 0.1}})
     assert open_quick(url, space={"x": (-1, 1), "env": {"id": "Lava-v0", "noise": 0.1}}).user_attrs["space"]
-    with pytest.raises(ValueError, match=r"study 's' .* env.noise: 0.1 there, 0.2 here; x: \[-1, 1\] there, nothing"):
+    with pytest.raises(ValueError, match=r"study 's' .* env.noise: 0.1 there, 0.2 here; x: \[-1, 1\] there, not here"):
         open_quick(url, space={"env": {"id": "Lava-v0", "noise": 0.2}})
     with pytest.raises(ValueError, match=r'directions: \["minimize"\] there, \["maximize"\] here'):
         open_quick(url, space={"x": [-1, 1], "env": {"id": "Lava-v0", "noise": 0.1}}, directions=["maximize"])

@@ -19,7 +19,7 @@ from postgres import postgres  # noqa: E402, F401
 from sb3_tdpg import TDPG  # noqa: E402
 from sb3_tdpg.envs.scenarios import LAVA  # noqa: E402
 from sb3_tdpg.evaluation.information import information_bounds, rollout_information  # noqa: E402
-from sb3_tdpg.information import InformationBatch  # noqa: E402
+from sb3_tdpg.information import InformationBatch, own_sample_bound  # noqa: E402
 from sb3_tdpg.studies import enqueue_once, open_storage  # noqa: E402
 from sb3_tdpg.sweep import select, sweep  # noqa: E402
 from sb3_tdpg.sweep_runs import beta_label, parse_inverse_beta  # noqa: E402
@@ -165,7 +165,7 @@ def test_a_folder_with_another_run_is_refused_before_any_training_and_does_not_s
     storage = storage and str(tmp_path / storage)
     quick_sweep(tmp_path / "out", betas=["1/50"], n_seeds=1, n_timesteps=800)
     before = sorted(tmp_path.rglob("out/*"))
-    with pytest.raises(ValueError, match=r"beta-1-50-seed0 holds a run with another settings: choose another folder"):
+    with pytest.raises(ValueError, match=r"beta-1-50-seed0 holds .* settings.n_timesteps: 800 there, 400 here: choose"):
         quick_sweep(tmp_path / "out", storage=storage, betas=["inf", "1/50"], n_seeds=1)
     assert sorted(tmp_path.rglob("out/*")) == before
     quick_sweep(tmp_path / "elsewhere", storage=storage, betas=["inf", "1/50"], n_seeds=1)
@@ -178,7 +178,7 @@ def test_a_job_of_another_worker_for_which_there_is_no_place_here_is_left_to_oth
     quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
     study = optuna.load_study(study_name="sweep-Lava-v0", storage=open_storage(storage))
     enqueue_once(study, [dict(inverse_beta=50.0, seed=0)])
-    with pytest.raises(ValueError, match="holds a run with another settings"):
+    with pytest.raises(ValueError, match="holds a run with other settings"):
         quick_sweep(tmp_path / "out", storage=storage, betas=["inf"], n_seeds=1)
     quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
     assert_complete(tmp_path / "mine", 2)
@@ -267,6 +267,38 @@ def test_bounds_enclose_the_information_of_a_gaussian_channel():
     bounds = information_bounds(batch)
     assert bounds.upper == pytest.approx(exact, abs=0.1)
     assert bounds.lower == pytest.approx(exact, abs=0.2)
+
+
+def of_gaussian_noise(means, std):
+    return InformationBatch(means, means + std * th.randn_like(means), means, th.full_like(means, std))
+
+
+@pytest.mark.parametrize("n_episodes", [5, 40, 1000])
+@pytest.mark.parametrize("spread", [0.0, 0.02, 1.0])
+def test_the_bound_from_below_is_never_above_the_one_from_above(spread, n_episodes):
+    for _ in range(20):
+        bounds = information_bounds(of_gaussian_noise(spread * th.randn(5, n_episodes, 2), 1.0))
+        assert bounds.lower <= bounds.upper
+
+
+def test_a_policy_that_knows_next_to_nothing_is_told_so_by_both_bounds():
+    # The TRVs are a sample, which alone would give the lower bound an error of ten times what there is to be known.
+    exact = 5 * 2 * 0.5 * math.log(1 + 0.02**2)
+    for _ in range(5):
+        bounds = information_bounds(of_gaussian_noise(0.02 * th.randn(5, 1000, 2), 1.0))
+        assert bounds.lower == pytest.approx(exact, rel=0.25)
+        assert bounds.upper == pytest.approx(exact, rel=0.25)
+
+
+def test_the_bound_from_below_is_that_of_the_own_sample_with_less_noise():
+    modes = 3.0 * th.randint(0, 2, (40, 1, 400, 2)).float()
+    skew = th.randn(40, 1, 400, 2).exp()
+    for means in (modes, skew):
+        batches = [of_gaussian_noise(each, 1.0) for each in means]
+        plain = np.array([own_sample_bound(batch).item() for batch in batches])
+        lower = np.array([information_bounds(batch).lower for batch in batches])
+        assert (lower - plain).mean() == pytest.approx(0.0, abs=4 * (lower - plain).std() / math.sqrt(len(plain)))
+        assert lower.std() < 1.1 * plain.std()
 
 
 def test_steps_without_living_episodes_know_nothing():

@@ -135,6 +135,10 @@ def test_the_best_trial_meets_the_limit():
 def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here, capsys):  # noqa: F811
     command = ["tune", *TINY, "--cost-limit", "1e6"]
     assert main([*command, "--n-trials", "3"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("trial ")]
+    assert len(lines) == 3
+    number = r"[\d.e+-]+"
+    assert re.fullmatch(rf"trial 0: expected cost {number}, {number} nat \(1 of 3 finished\)", lines[0])
     folder = here / "logs" / "tdpg" / "study-Lava-v0-logdet-information"
     assert {p.name for p in folder.iterdir()} >= {"best.yml", "trials.csv", "study.json", "study.log"}
     assert main([*command, "--n-trials", "5"]) == 0
@@ -155,7 +159,7 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     results = {path.name: path.read_bytes() for path in folder.iterdir()}
     elsewhere = ["--storage", "sqlite:///another.db", "--cost-limit", "1e5"]  # of the same name
     assert main([*command, *elsewhere]) == 2
-    assert "holds a study with another cost_limit" in capsys.readouterr().err
+    assert "study with other settings, cost_limit: 1000000.0 there, 100000.0 here: choose" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == results
     assert not (here / "another.db").exists()
 

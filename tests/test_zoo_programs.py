@@ -34,6 +34,15 @@ def test_a_block_of_ours_trains_for_a_hundred_steps(env, here):  # noqa: F811
     assert loaded(here, env).num_timesteps >= 100
 
 
+def test_train_does_not_load_what_only_other_programs_need():
+    show = "import sys; print(*(name for name in sys.modules if '.' not in name))"
+    ours, theirs = (
+        set(subprocess.check_output([sys.executable, "-c", f"import {module}; {show}"], text=True).split())
+        for module in ("sb3_tdpg.zoo.programs, sb3_tdpg.provenance", "rl_zoo3.train")
+    )
+    assert not {"pandas", "requests"} & (ours - theirs)
+
+
 def test_the_keywords_of_the_environments_are_those_of_the_command(here, monkeypatch):  # noqa: F811
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 

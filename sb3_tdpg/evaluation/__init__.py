@@ -14,11 +14,11 @@ from sb3_tdpg.evaluation.figures import (
 )
 from sb3_tdpg.evaluation.information import InformationReport, information_report, interval_frame
 from sb3_tdpg.evaluation.knowledge import draw_mugs, encode_mugs, grasp_knowledge, state_knowledge, trv_knowledge
-from sb3_tdpg.evaluation.provenance import provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.records import evaluate_scenarios
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table
 from sb3_tdpg.evaluation.trajectories import Trajectories, rollout_states
+from sb3_tdpg.provenance import provenance, write_frame_atomically, write_run_config
 
 __all__ = [
     "InformationReport",

@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from sb3_tdpg.evaluation.figures import INK, PALETTE
+from sb3_tdpg.files import replaced_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,10 +97,9 @@ def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *,
     check_animation_path(path)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.stem}.partial{path.suffix}")  # ffmpeg tells the format by the ending
     film = _Film(episodes, horizon)
-    (_write_gif if path.suffix == ".gif" else _write_mp4)(film, partial, fps)
-    os.replace(partial, path)
+    with replaced_atomically(path) as partial:
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(film, partial, fps)
 
 
 class _Film:

@@ -7,8 +7,8 @@ The Donsker-Varadhan formula gives, for every :math:`\beta > 0`,
     \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
     \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c},
 
-and the right side is known from costs under p alone. It corrects the paper's thm:robustness; the derivation is in
-``docs/guide/certificate.md``.
+and the right side is known from costs under p alone. It corrects the paper's Theorem II.1,
+thm:robustness; the derivation is in ``docs/guide/certificate.md``.
 
 Dimension key: N episodes, M points of a distribution.
 """
@@ -84,7 +84,9 @@ class Certificate(NamedTuple):
 
 def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:
     r"""
-    Entropic risk :math:`\rho_\beta[c] = \frac1\beta \log \mathbb E\, e^{\beta c}` (eq:entropic risk), without overflow.
+    Entropic risk :math:`\rho_\beta[c] = \frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
+
+    It is equation 4, eq:entropic risk.
 
     :param costs: ``(N,)``
     :param beta: At least 0; 0 gives the limit, the mean.
@@ -211,7 +213,7 @@ def certificate(
     beta: float | None = None,
 ) -> Certificate:
     """
-    Bound the expected cost under a shift from costs in training (eq:cost bound, corrected).
+    Bound the expected cost under a shift from costs in training (equation 6, eq:cost bound, corrected).
 
     :param costs: Of independent episodes in training, ``(N,)``.
     :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.

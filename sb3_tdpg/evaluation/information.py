@@ -7,7 +7,8 @@ Dimension key: T horizon, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,13 +30,17 @@ from sb3_tdpg.information import (
     LogDet,
     TrustBadge,
     information_interval,
-    own_sample_bound,
     trust_checks,
 )
+from sb3_tdpg.information.loo import log_density_matrix
 from sb3_tdpg.problem import read_problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+TINY = 1e-30
+ESTIMATES = ("interval", "knowledge", "checks")
+"""Of :func:`information_report`, in this order."""
 
 
 class EncodedEpisodes(NamedTuple):
@@ -84,7 +89,13 @@ class InformationReport:
 
 
 def information_report(
-    model: Any, env: VecEnv, n_episodes: int = 500, seed: int = 0, *, names: Sequence[str] | None = None
+    model: Any,
+    env: VecEnv,
+    n_episodes: int = 500,
+    seed: int = 0,
+    *,
+    names: Sequence[str] | None = None,
+    at_end: Callable[[], Any] | None = None,
 ) -> InformationReport:
     """
     Run fresh episodes, and tell what the policy's TRVs know of the state, when, and how sure that is.
@@ -94,14 +105,19 @@ def information_report(
     :param n_episodes: N; with fewer environments they are run in rounds.
     :param seed: Of the episodes, the policy's sampling and the estimates.
     :param names: Of the components of the state; default: the environment's ``state_names``, or ``x0``, ``x1``, ...
+    :param at_end: Called at the end of each of the three ``ESTIMATES``.
     :raises ValueError: if there are too few episodes for an interval at any time step, or the names do not fit.
     """
     names = read_problem(env).state_names if names is None else names
     batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
+    at_end = at_end or (lambda: None)
     interval = information_interval(batch, seed=seed)
-    return InformationReport(
-        interval, state_knowledge(batch, names, seed=seed), trust_checks(batch, interval, seed=seed), costs
-    )
+    at_end()
+    known = state_knowledge(batch, names, seed=seed)
+    at_end()
+    badge = trust_checks(batch, interval, seed=seed)
+    at_end()
+    return InformationReport(interval, known, badge, costs)
 
 
 def interval_frame(interval: InformationInterval) -> pd.DataFrame:
@@ -191,6 +207,10 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     A step at which too few episodes live on for an estimate counts as much as the last one with enough: counted as
     nothing, it would make policies with many TRVs, which need more episodes, look as if they knew less.
 
+    Both are estimates from the same episodes, and the one from below is never above the other: what the TRVs tell of
+    which of these N encoder's inputs they were drawn from is not more than the log-det bound of these inputs. Only the
+    estimate could be, since the TRVs are a sample, too: it is made precise where the bounds are close, and cut there.
+
     :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
     :raises ValueError: if there are too few episodes from the start.
     """
@@ -206,7 +226,29 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     for t in range(len(batch.trvs)):
         at_t = batch.at(t)
         if at_t.trvs.shape[1] >= trv_dim + 2:
-            at_step = InformationBounds(log_det(at_t).item(), own_sample_bound(at_t).item())
+            upper = log_det(at_t).item()
+            at_step = InformationBounds(upper, min(_lower_bound(at_t), upper))
         if at_t.trvs.shape[1] > 0:
             total += at_step
     return InformationBounds(*total.tolist())
+
+
+def _lower_bound(at_t: InformationBatch) -> float:
+    r"""
+    Estimate what :func:`~sb3_tdpg.information.own_sample_bound` estimates, with less of the TRVs' sampling noise.
+
+    With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
+    :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0
+    given the encoder's inputs. It serves as a control variate: were the mixture Gaussian, it would be all of the noise.
+
+    :param at_t: One step, ``(1, N, ...)``.
+    """
+    log_density = log_density_matrix(at_t)[0].double()
+    own = log_density.diagonal() - log_density.logsumexp(dim=1) + math.log(len(log_density))  # (N,)
+    trvs, means, stds = (x[0].double() for x in (at_t.trvs, at_t.means, at_t.stds))  # (N, Z)
+    centre = means.mean(dim=0)
+    covariance = (means - centre).T @ (means - centre) / len(means) + stds.square().mean(dim=0).diag()
+    scaled = th.linalg.solve(covariance, (trvs - centre).T).T
+    known = ((trvs - means) / stds).square().sum(dim=1) - ((trvs - centre) * scaled).sum(dim=1)
+    weight = (own * (known - known.mean())).mean() / known.var(correction=0).clamp(min=TINY)
+    return (own - weight * known).mean().item()

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from tqdm import tqdm
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import information_report, provenance, save_figure, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
-from sb3_tdpg.evaluation.provenance import check_same_config
+from sb3_tdpg.evaluation.information import ESTIMATES
 from sb3_tdpg.files import write_atomically
+from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.report.figures import (
     comparison_figure,
     degradation_curves,
@@ -115,8 +117,7 @@ def robustness_report(
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     page = Page(env_id, kwargs, n_episodes, deterministic, names)
     page.figures = _draw(numbers, plan, rows, loaded, space, out)
-    with torch_threads(1):
-        page.knowledge = [_measure(plan, rows[0], *each, out) for each in _firsts(loaded)]
+    page.knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
     how = provenance()
     page.made = how_made(how["command"], how, [])
     write_frame_atomically(records, out / "episodes.csv.xz")
@@ -211,13 +212,28 @@ def _save(figure: Any, out: Path, name: str) -> str:
     return path
 
 
-def _measure(plan: Plan, row: Row, number: int, label: str, model: Any, out: Path) -> Knowledge:
-    """Tell what a model knows of the state."""
+def _measure_all(
+    plan: Plan, row: Row, models: Mapping[str, Sequence[Any]], out: Path, progress_bar: bool
+) -> list[Knowledge]:
+    """Tell what the first model of each method knows of the state: a minute for each where episodes are long."""
+    firsts = _firsts(models)
+    total = len(ESTIMATES) * sum(isinstance(model, TDPG) for _, _, model in firsts)
+    known = []
+    with torch_threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
+        for number, label, model in firsts:
+            progress.set_postfix_str(f"information, {label}")
+            known.append(_measure(plan, row, number, label, model, out, progress.update))
+    return known
+
+
+def _measure(
+    plan: Plan, row: Row, number: int, label: str, model: Any, out: Path, at_end: Callable[[], Any]
+) -> Knowledge:
     if not isinstance(model, TDPG):
         return Knowledge(label, f"not measured: {type(model).__name__} has no task-relevant variables.")
     env = scenario_env(row.scenario, model, n_episodes=N_INFORMATION)
     with contextlib.closing(env):
-        report = information_report(model, env, N_INFORMATION, plan.seed)
+        report = information_report(model, env, N_INFORMATION, plan.seed, at_end=at_end)
     figures = [_save(figure, out, f"information-{number}-{name}") for name, figure in report.figures().items()]
     lower, upper = report.interval.total
     trust = "all checks passed" if report.badge.passed else "**not to be trusted**: a check failed"

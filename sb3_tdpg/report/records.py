@@ -16,8 +16,8 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
-from sb3_tdpg.evaluation.provenance import write_frame_atomically
 from sb3_tdpg.evaluation.records import run_episodes
+from sb3_tdpg.provenance import write_frame_atomically
 from sb3_tdpg.report.models import Source, load_all
 from sb3_tdpg.report.rows import Row
 from sb3_tdpg.robustness import PerturbedVecEnv

@@ -2,108 +2,41 @@
 
 from __future__ import annotations
 
-import json
-import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import Logger, make_output_format
 
-from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, Scenario
+from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, PANDA_GRASP, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.reproduction.ball import GROUPS, with_groups
+from sb3_tdpg.reproduction.ball import SECOND_STAGE as BALL_SECOND_STAGE
 from sb3_tdpg.reproduction.common import RECORD_COLUMNS, commits_of, how_made, publish_files
+from sb3_tdpg.reproduction.grasp import COST_LIMIT as GRASP_COST_LIMIT
+from sb3_tdpg.reproduction.grasp import SECOND_STAGE as GRASP_SECOND_STAGE
 from sb3_tdpg.reproduction.lava import MAX_ATTEMPTS
+from sb3_tdpg.reproduction.peer_runs import SB3Run, TimedRun, training_time
 from sb3_tdpg.runs import Run, complete_runs
-from sb3_tdpg.training import read_schedule, take_env
 
-# As long as TDPG's trainings. With the block's minibatches of 500 an update makes 50 steps of the optimiser, not 10,
-# and a training takes twice as long.
-LAVA_PPO = dict(n_timesteps=1.5e6, batch_size=2500)
+# As many environment steps as TDPG has, in both its stages where it has two.
+LAVA_STEPS, BALL_STEPS, GRASP_STEPS = 1.5e6, 1.6e5, 3.2e4
+# With the block's minibatches of 500 an update makes 50 steps of the optimiser, not 10, and a training takes twice as
+# long.
+LAVA_PPO = dict(n_timesteps=LAVA_STEPS, batch_size=2500)
 
 RECORDS = Path("docs", "results")
-"""Where the episodes of policy gradient and TDPG are, from ``make reproduce-lava`` and ``reproduce-ball-controls``."""
+"""Where the episodes of methods are that are not trained again, from the other reproductions."""
 N_RECORDED_SEEDS = 5
 
 FOOTER = (
     "Interquartile mean of the episode cost over training seeds [95% bootstrap interval over seeds]; stochastic "
-    "policies, evaluation seed 0. Lowest in bold. Time of a training, all attempts together: median over the seeds "
-    "trained here, one thread."
+    "policies, evaluation seed 0. Lowest in bold. On grasping the cost is the share of failed grasps. Time of a "
+    "training, all attempts and both stages together: median over the seeds trained here, one thread."
 )
-
-
-@dataclass(frozen=True)
-class TimedRun(Run):
-    """A run that leaves ``time.json`` in its folder: seconds that the training took, on the clock and of the CPU."""
-
-    def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        """Train as :class:`~sb3_tdpg.runs.Run` does; later calls add to its time, an interrupted one does not."""
-        path = folder / "time.json"
-        before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
-        wall, cpu = time.perf_counter(), time.process_time()
-        trained = self._learn(attempt, folder, progress_bar)
-        wall, cpu = before["wall_s"] + time.perf_counter() - wall, before["cpu_s"] + time.process_time() - cpu
-        write_atomically(path, json.dumps(dict(wall_s=round(wall, 3), cpu_s=round(cpu, 3))))
-        return trained
-
-    def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        return super().train(attempt, folder, progress_bar)
-
-
-@dataclass(frozen=True)
-class SB3Run(TimedRun):
-    """
-    A run of an algorithm that is not ours; it has no selection, and an interrupted training begins anew.
-
-    :param algo: ``"ppo"`` or ``"ppo_lstm"``; the block is one of ``hyperparams/<algo>.yml``.
-    """
-
-    algo: str = "ppo"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The block with the overrides."""
-        return {**load_hyperparams(self.block, self.algo), **self.overrides}
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """What makes this run."""
-        return {**super().config, "algo": self.algo}
-
-    def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        algorithm, path = _algorithm(self.algo), folder / "model.zip"
-        if path.exists():
-            return algorithm.load(path, device="cpu"), False
-        settings = self.settings
-        n_timesteps = int(settings.pop("n_timesteps"))
-        env = take_env(self.env_id, settings)
-        read_schedule(settings)
-        model = algorithm(settings.pop("policy"), env, **settings, seed=self.seed, device="cpu")
-        model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
-        model.learn(n_timesteps, progress_bar=progress_bar)
-        model.logger.close()
-        partial = folder / "model.partial.zip"  # so that there is never half a model
-        model.save(partial)
-        os.replace(partial, path)
-        return model, False
-
-
-def _algorithm(name: str) -> Any:
-    if name == "ppo":
-        return PPO
-    try:
-        from sb3_contrib import RecurrentPPO
-    except ImportError as e:
-        raise ImportError("RecurrentPPO needs sb3-contrib: pip install sb3-contrib") from e
-    return RecurrentPPO
 
 
 @dataclass(frozen=True)
@@ -117,6 +50,8 @@ class Peer:
     :param overrides: Settings that replace those of the block.
     :param max_attempts: See :class:`~sb3_tdpg.runs.Run`.
     :param max_seeds: Not more training seeds than this, for what takes long.
+    :param start: Label of the peer whose policy it starts from, with the same seed; ``None``: from scratch.
+    :param is_shown: Whether the table has a row of it; what others start from need not.
     """
 
     label: str
@@ -125,13 +60,15 @@ class Peer:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
     max_seeds: int | None = None
+    start: str | None = None
+    is_shown: bool = True
 
-    def run(self, env_id: str, seed: int, **overrides: Any) -> Run:
+    def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
         """Name the run with one seed."""
         settings = {**self.overrides, **overrides}
         if self.algo == "tdpg":
-            return TimedRun(self.label, env_id, self.block, seed, settings, self.max_attempts)
-        return SB3Run(self.label, env_id, self.block, seed, settings, self.max_attempts, algo=self.algo)
+            return TimedRun(self.label, env_id, self.block, seed, settings, self.max_attempts, start)
+        return SB3Run(self.label, env_id, self.block, seed, settings, self.max_attempts, start, algo=self.algo)
 
 
 def with_weight_decay(block: str, weight_decay: float) -> dict[str, Any]:
@@ -159,6 +96,7 @@ class Comparison:
     :param first_seed: First training seed, as in the records.
     :param records: File with the episodes of policies that are not trained again, in the folder of results.
     :param recorded: What they are called there -> here.
+    :param digits: Of the costs in the table.
     """
 
     title: str
@@ -169,16 +107,27 @@ class Comparison:
     first_seed: int
     records: Path
     recorded: Mapping[str, str]
+    digits: int = 2
 
-    def runs(self, n_seeds: int, n_timesteps: int | None = None) -> list[Run]:
-        """List the runs, seed by seed: an interrupted reproduction has as many of one peer as of another."""
+    def runs(self, n_seeds: int, folder: Path, n_timesteps: int | None = None) -> dict[Path, Run]:
+        """List folders and runs, seed by seed: an interrupted reproduction has as many of one peer as of another."""
         overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
-        return [
-            peer.run(self.env_id, self.first_seed + i, **overrides)
-            for i in range(n_seeds)
-            for peer in self.peers
-            if peer.max_seeds is None or i < peer.max_seeds
-        ]
+        runs: dict[Path, Run] = {}
+        for i in range(n_seeds):
+            folders: dict[str, Path] = {}
+            for peer in self.peers:
+                if peer.max_seeds is None or i < peer.max_seeds:
+                    start = None if peer.start is None else folders[peer.start]
+                    run = peer.run(self.env_id, self.first_seed + i, start, **overrides)
+                    folders[peer.label] = folder / self.env_id / run.folder_name
+                    runs[folders[peer.label]] = run
+        return runs
+
+    @property
+    def labels(self) -> list[str]:
+        """Methods in the order of the table's rows."""
+        shown = [peer.label for peer in self.peers if peer.is_shown]
+        return list(dict.fromkeys([*self.recorded.values(), *shown]))
 
     def read_records(self, folder: Path, n_eval_episodes: int) -> pd.DataFrame:
         """Read the episodes of policies that are not trained again, with the names that they have here."""
@@ -194,20 +143,24 @@ LAVA_PEERS = Comparison(
     title="Lava (the text's reading)",
     env_id="Lava-v0",
     peers=(
-        # Once each, for its time.
-        Peer("PG", "Lava-v0-pg", max_seeds=1),
+        # Once, for its time.
         Peer("TDPG (log-det)", "Lava-v0-logdet", max_attempts=MAX_ATTEMPTS, max_seeds=1),
+        Peer("PG", "Lava-v0-pg", overrides=dict(n_timesteps=LAVA_STEPS)),
         # 1e-3 was the better one of 1e-3 and 1e-2 on seed 350.
-        Peer("PG, weight decay", "Lava-v0-pg", overrides=with_weight_decay("Lava-v0-pg", 1e-3)),
+        Peer(
+            "PG, weight decay",
+            "Lava-v0-pg",
+            overrides=dict(n_timesteps=LAVA_STEPS, **with_weight_decay("Lava-v0-pg", 1e-3)),
+        ),
         Peer("VIB", "Lava-v0-logdet", overrides=dict(mi_estimator="vib"), max_attempts=MAX_ATTEMPTS),
         Peer("PPO", "Lava-v0", "ppo", LAVA_PPO),
-        Peer("RecurrentPPO", "Lava-v0", "ppo_lstm", LAVA_PPO, max_seeds=1),
+        Peer("RecurrentPPO", "Lava-v0", "ppo_lstm", LAVA_PPO),
     ),
     rows=LAVA,
     columns=[row.name for row in LAVA],
     first_seed=300,
     records=Path("lava", "episodes_text.csv.gz"),
-    recorded={"PG": "PG", "TDPG (log-det)": "TDPG (log-det)"},
+    recorded={"TDPG (log-det)": "TDPG (log-det)"},
 )
 
 BALL_PEERS = Comparison(
@@ -215,9 +168,24 @@ BALL_PEERS = Comparison(
     env_id="BallCatch-v0",
     # The test rows' noise is 0.10 to 0.25; the patterns are those that TDPG is trained with.
     peers=(
+        Peer("first stage", "BallCatch-v0-perturbed-pg", is_shown=False),
+        # Once, for its time.
+        Peer("TDPG, perturbed images", "BallCatch-v0", overrides=BALL_SECOND_STAGE, max_seeds=1, start="first stage"),
+        Peer(
+            "VIB, perturbed images",
+            "BallCatch-v0",
+            overrides=dict(mi_estimator="vib", **BALL_SECOND_STAGE),
+            start="first stage",
+        ),
+        Peer(
+            "PG, weight decay",
+            "BallCatch-v0-pg",
+            overrides=dict(n_timesteps=BALL_STEPS, **with_weight_decay("BallCatch-v0-pg", 1e-3)),
+        ),
         Peer("PPO", "BallCatch-v0", "ppo"),
         Peer("PPO, pixel noise", "BallCatch-v0", "ppo", with_perturbation(noise=0.25)),
         Peer("PPO, random backgrounds", "BallCatch-v0", "ppo", with_perturbation(color=0.35, pattern=0.7, patch=0.5)),
+        Peer("RecurrentPPO", "BallCatch-v0", "ppo_lstm"),
     ),
     rows=[row.with_kwargs(renderer="fast") for row in BALL_CATCH],
     columns=("Training", *GROUPS),
@@ -231,6 +199,33 @@ BALL_PEERS = Comparison(
     },
 )
 
+GRASP_PEERS = Comparison(
+    title="Grasping",
+    env_id="PandaGrasp-v0",
+    # An episode is one step: there is nothing that a recurrent policy could remember.
+    peers=(
+        Peer("first stage", "PandaGrasp-v0-pg", is_shown=False),
+        Peer(
+            "VIB",
+            "PandaGrasp-v0",
+            overrides=dict(mi_estimator="vib", cost_limit=GRASP_COST_LIMIT, **GRASP_SECOND_STAGE),
+            start="first stage",
+        ),
+        Peer(
+            "PG, weight decay",
+            "PandaGrasp-v0-pg",
+            overrides=dict(n_timesteps=GRASP_STEPS, **with_weight_decay("PandaGrasp-v0-pg", 1e-3)),
+        ),
+        Peer("PPO", "PandaGrasp-v0", "ppo", dict(n_timesteps=GRASP_STEPS)),
+    ),
+    rows=PANDA_GRASP,
+    columns=[row.name for row in PANDA_GRASP],
+    first_seed=100,
+    records=Path("panda_grasp", "episodes.csv.xz"),
+    recorded={"its control": "PG", "TDPG": "TDPG"},
+    digits=3,
+)
+
 COLUMNS = ["env_id", *RECORD_COLUMNS]
 
 
@@ -239,6 +234,7 @@ def reproduce_peers(
     *,
     n_seeds: int = 5,
     n_ball_seeds: int = 5,
+    n_grasp_seeds: int = 1,
     n_eval_episodes: int = 1000,
     n_timesteps: int | None = None,
     jobs: int | None = None,
@@ -246,52 +242,48 @@ def reproduce_peers(
     records: Path = RECORDS,
 ) -> str:
     """
-    Train the peers with several seeds, evaluate them on the rows of Tables I and II; write table, seeds and records.
+    Train the peers with several seeds, evaluate them on the rows of the paper's tables; write table, seeds and records.
 
     Finished runs are kept: the same call goes on where an interrupted one stopped.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each method on the lava problem.
     :param n_ball_seeds: Training seeds of each peer on ball catching; 0 leaves it out.
+    :param n_grasp_seeds: Training seeds of each peer on grasping; 0 leaves it out.
     :param n_eval_episodes: Episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as many as TDPG has (policy gradient: fewer).
+    :param n_timesteps: Environment steps of each training; default: as many as TDPG has.
     :param jobs: Runs at a time; default: the number of cores.
     :param publish: Folder that gets a copy of everything but ``runs/``.
-    :param records: Folder of results, with the episodes of policy gradient and TDPG, which are not trained again.
+    :param records: Folder of results, with the episodes of those methods that are not trained again.
     :return: the summary, as Markdown
     :raises ValueError: if the records are not there; nothing has been trained by then.
     """
-    comparisons = [(each, n) for each, n in ((LAVA_PEERS, n_seeds), (BALL_PEERS, n_ball_seeds)) if n > 0]
+    numbers = ((LAVA_PEERS, n_seeds), (BALL_PEERS, n_ball_seeds), (GRASP_PEERS, n_grasp_seeds))
+    comparisons = [(each, n) for each, n in numbers if n > 0]
     if missing := [str(records / each.records) for each, _ in comparisons if not (records / each.records).exists()]:
         raise ValueError(
             f"{' and '.join(missing)} are not there: run this in the folder of the repository, or make them first with "
-            "'make reproduce-lava reproduce-ball-controls'"
+            "'make reproduce-lava reproduce-ball-controls reproduce-grasp'"
         )
-    runs = [each.runs(n, n_timesteps) for each, n in comparisons]
-    folders = [[out / "runs" / run.env_id / run.folder_name for run in of_env] for of_env in runs]
-    tasks = [
-        (run, folder, each.rows)
-        for (each, _), of_env, in_env in zip(comparisons, runs, folders, strict=True)
-        for run, folder in zip(of_env, in_env, strict=True)
-    ]
+    runs = [(each, each.runs(n, out / "runs", n_timesteps)) for each, n in comparisons]
+    tasks = [(run, folder, each.rows) for each, in_env in runs for folder, run in in_env.items()]
     complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
     sections, frames, seed_tables = ["# Peers"], [], []
-    for (each, _), in_env in zip(comparisons, folders, strict=True):
+    for each, in_env in runs:
         trained = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in in_env], ignore_index=True)
         seeds = _seed_table(trained, in_env)
         frames.append(trained[COLUMNS])
         seed_tables.append(seeds)
         recorded = each.read_records(records, n_eval_episodes)
-        order = {label: i for i, label in enumerate([*each.recorded.values(), *(peer.label for peer in each.peers)])}
         # What is in the records was trained here once more for its time only.
-        new = trained[~trained["model"].isin(list(each.recorded.values()))]
+        new = trained[trained["model"].isin(set(each.labels) - set(each.recorded.values()))]
         table = pd.concat([recorded, new], ignore_index=True)
         table = with_groups(table) if set(GROUPS) <= set(each.columns) else table
-        table = table.sort_values("model", key=lambda column, order=order: column.map(order), kind="stable")
-        sections += [f"## {each.title}", peers_table(table, each.columns, seeds)]
+        table = table.sort_values("model", key=lambda column, each=each: column.map(each.labels.index), kind="stable")
+        sections += [f"## {each.title}", peers_table(table, each.columns, seeds, each.digits)]
         if set(GROUPS) <= set(each.columns):
-            sections += ["Row by row:", peers_table(table, [row.name for row in each.rows[1:]])]
+            sections += ["Row by row:", peers_table(table, [row.name for row in each.rows[1:]], digits=each.digits)]
     write_frame_atomically(pd.concat(frames, ignore_index=True).round({"cost": 4}), out / "episodes.csv.xz")
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True).round(4), out / "seeds.csv")
     how = provenance()
@@ -304,36 +296,29 @@ def reproduce_peers(
     return summary
 
 
-def training_time(folder: Path) -> dict[str, float]:
-    """
-    Add up what the training of a run took, attempts in vain included.
-
-    :return: ``wall_s`` and ``cpu_s``
-    """
-    times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
-    return {name: sum(each[name] for each in times) for name in ("wall_s", "cpu_s")}
-
-
-def _seed_table(records: pd.DataFrame, folders: Sequence[Path]) -> pd.DataFrame:
-    """Return for each run what its training took, and its mean cost in each row."""
+def _seed_table(records: pd.DataFrame, runs: Mapping[Path, Run]) -> pd.DataFrame:
+    """Return for each run what its training took, with that of what it starts from, and its mean cost in each row."""
     keys = ["env_id", "model", "train_seed"]
-    runs = records.groupby(keys, sort=False)[["attempts", "selected"]].first().reset_index()
-    times = pd.DataFrame([training_time(folder) for folder in folders])  # in the order of the runs, as the records
+    labels = records.groupby(keys, sort=False)[["attempts", "selected"]].first().reset_index()
+    stages = [[folder] if run.start is None else [run.start, folder] for folder, run in runs.items()]
+    # In the order of the runs, as the records.
+    times = pd.DataFrame([pd.DataFrame(map(training_time, folders)).sum() for folders in stages])
     costs = records.pivot_table("cost", keys, "scenario", sort=False).reset_index()
     return (
-        pd.concat([runs, times], axis=1)
+        pd.concat([labels, times], axis=1)
         .merge(costs, on=keys)
         .melt([*keys, "attempts", "selected", "cpu_s", "wall_s"], var_name="scenario", value_name="cost")
     )
 
 
-def peers_table(records: pd.DataFrame, rows: Sequence[str], seeds: pd.DataFrame | None = None) -> str:
+def peers_table(records: pd.DataFrame, rows: Sequence[str], seeds: pd.DataFrame | None = None, digits: int = 2) -> str:
     """
     Write a line for each method: its cost in each row, and what its training took.
 
     :param records: Episodes of several seeds.
     :param rows: The scenarios that are shown.
     :param seeds: With ``cpu_s`` and ``wall_s`` of trainings, of which the median is shown.
+    :param digits: Of the costs.
     """
     shown = records[records["scenario"].isin(rows)]
     aggregated = aggregate_seeds(shown).set_index(["model", "scenario"])
@@ -344,7 +329,9 @@ def peers_table(records: pd.DataFrame, rows: Sequence[str], seeds: pd.DataFrame 
         line = [model, str(aggregated.loc[(model, rows[0]), "n_seeds"])]
         for row in rows:
             cell = aggregated.loc[(model, row)]
-            text = f"{cell['iqm']:.2f} [{cell['low']:.2f}, {cell['high']:.2f}]"
+            text = f"{cell['iqm']:.{digits}f}"
+            if cell["n_seeds"] > 1:
+                text += f" [{cell['low']:.{digits}f}, {cell['high']:.{digits}f}]"
             line.append(f"**{text}**" if cell["iqm"] == lowest[row] else text)
         if seeds is not None:
             of_model = seeds[seeds["model"] == model]

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import rl_zoo3.enjoy
 import rl_zoo3.train
 from rl_zoo3.utils import StoreDict
 
@@ -104,6 +103,8 @@ def _read_record(folder: Path, others: Sequence[str]) -> dict[str, Any]:
 
 
 def _enjoy(arguments: list[str]) -> None:
+    import rl_zoo3.enjoy
+
     with _flags("enjoy", [*_playing(arguments), *arguments]):
         rl_zoo3.enjoy.enjoy()
 

@@ -25,8 +25,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.evaluation.provenance import check_same_config
 from sb3_tdpg.files import write_atomically
+from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.studies import open_storage, open_study, quiet_optuna, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
@@ -123,7 +123,6 @@ class TuningManager(TDPGExperimentManager):
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
                 raise optuna.TrialPruned(f"behind the others at expected cost {cost:.4g}, {information:.4g} nat")
-            print(f"trial {trial.number}: expected cost {cost:.4g}, {information:.4g} nat")
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
@@ -155,7 +154,7 @@ class TuningManager(TDPGExperimentManager):
         )
         # What every trial would fail of is told before the first one.
         self.create_envs(1, eval_env=True).close()
-        work(study, self.objective, self.max_total_trials or self.n_trials)
+        work(study, self.objective, self.max_total_trials or self.n_trials, describe=_result)
         self._write_results(study, description)
 
     def _described(self, description: dict[str, Any]) -> dict[str, Any]:

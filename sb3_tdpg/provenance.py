@@ -9,17 +9,22 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from importlib import metadata
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from sb3_tdpg.files import replaced_atomically, write_atomically
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_DIFFERENCES = 3
+MAX_LENGTH = 60  # of a value in a message
 PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "pandas", "pybullet")
 
 
@@ -64,8 +69,11 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
 
+    What one of the two leaves out counts as a difference, too: it may be a file of an earlier version, which does not
+    say what it was made with.
+
     :param path: The file; if there is none, all is well.
-    :param config: What it must hold.
+    :param config: What it must hold, and nothing else.
     :param what: What lies in its folder, for the message.
     """
     if not path.exists():
@@ -75,12 +83,54 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
         found.pop("provenance")
     except (ValueError, KeyError, AttributeError, TypeError) as e:
         raise ValueError(f"{path} is there already and is not that of a {what}: choose another folder") from e
-    wanted = jsonable(config)
-    changed = sorted(key for key in found if found[key] != wanted.get(key))
-    if changed:
+    if changed := differences(found, jsonable(config)):
         raise ValueError(
-            f"{path.parent} holds a {what} with another {', '.join(changed)}: choose another folder or remove it"
+            f"{path.parent} holds a {what} with other settings, {changed}: choose another folder or remove it"
         )
+
+
+def differences(found: Any, wanted: Any) -> str:
+    """
+    Name the first few differences of two values of JSON's types, in a line; nothing if there are none.
+
+    :param found: What is there.
+    :param wanted: What it is compared with.
+    :return: as in ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
+    """
+    lines = list(_differences(found, wanted))
+    shown, more = lines[:MAX_DIFFERENCES], len(lines) - MAX_DIFFERENCES
+    return "; ".join([*shown, f"and {more} more"] if more > 0 else shown)
+
+
+def _differences(found: Any, wanted: Any, where: str = "") -> Iterator[str]:
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in sorted({*found, *wanted}):
+            inside = f"{where}.{key}" if where else key
+            yield from _differences(found.get(key, _MISSING), wanted.get(key, _MISSING), inside)
+    elif _has_dicts(found) and _has_dicts(wanted):  # rows; a list of numbers is told as a whole
+        for i, (old, new) in enumerate(zip_longest(found, wanted, fillvalue=_MISSING)):
+            yield from _differences(old, new, f"{where}[{i}]")
+    elif found != wanted:
+        old, new = ("" if value is _MISSING else json.dumps(value) for value in (found, wanted))
+        begin = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), 0)
+        texts = (f"{_excerpt(old, begin)} there" if old else "not there", f"{_excerpt(new, begin)} here")
+        yield f"{where}: {texts[0]}, {texts[1] if new else 'not here'}"
+
+
+_MISSING = object()  # None is a value
+
+
+def _has_dicts(value: Any) -> bool:
+    return isinstance(value, list) and any(isinstance(item, dict) for item in value)
+
+
+def _excerpt(text: str, begin: int) -> str:
+    """Shorten a long text, so that what begins to differ there can be seen."""
+    if len(text) <= MAX_LENGTH:
+        return text
+    start = max(0, min(begin - MAX_LENGTH // 2, len(text) - MAX_LENGTH))
+    end = start + MAX_LENGTH
+    return f"{'...' * (start > 0)}{text[start:end]}{'...' * (end < len(text))}"
 
 
 def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) -> None:
@@ -137,7 +187,7 @@ def as_typed(command: Sequence[str]) -> list[str]:
 
 def _git() -> dict[str, Any] | None:
     """Commit of the checkout that this package lies in, and whether a tracked file was changed since."""
-    package = Path(__file__).resolve().parents[1]
+    package = Path(__file__).resolve().parent
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(package), *arguments]

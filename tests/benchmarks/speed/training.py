@@ -1,0 +1,92 @@
+"""An epoch of TDPG, trainings as one batch, and a step of training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_tdpg import TDPG, make_episodes_env
+from sb3_tdpg.training_batch import Member, TrainingBatch
+from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
+from tests.reference_loop import LoopTDPG, draw_randomness
+
+
+def make_tdpg(n_episodes: int, *, beta: float = 1 / 75, baseline: str = "value") -> TDPG:
+    """TDPG on Lava with its default sizes."""
+    return TDPG("TRVPolicy", "Lava-v0", beta=beta, baseline=baseline, n_episodes=n_episodes, seed=SEED, device="cpu")
+
+
+def learner(model: BaseAlgorithm, epochs: int, steps_per_epoch: int) -> Callable[[], None]:
+    """Return a function that trains a model on for some epochs; the first, with its warm-up, is made here."""
+    model.learn(steps_per_epoch)
+    return lambda: model.learn(epochs * steps_per_epoch, reset_num_timesteps=False)
+
+
+def bench_epoch(sizes: Sizes) -> Iterable[Row]:
+    """Compare an epoch of TDPG with the loop over samples, time steps and critics."""
+    n = sizes.n_episodes
+    # The mean baseline of the paper; the loop makes no regression.
+    model = make_tdpg(n, baseline="mean")
+    loop = LoopTDPG.copy_of(model)
+    learn = learner(model, sizes.epochs, n * model.horizon)
+    rng = np.random.default_rng(SEED)
+    yield compare(
+        f"policy epoch, N={n}, T={model.horizon}, {model.estimator.gradient_steps} MINE steps of "
+        f"{model.estimator.batch_size}: TDPG against a loop over samples",
+        lambda: seconds(learn, sizes.epochs),
+        lambda: seconds(lambda: loop.epoch(draw_randomness(model, rng))),
+        sizes.loop_repetitions,
+        goal=100,
+    )
+
+
+def bench_batch(sizes: Sizes) -> Iterable[Row]:
+    """Compare eight trainings as one batch with one alone, for each training; the critics' warm-up counts."""
+    n_timesteps = 5 * sizes.n_episodes * 4 * sizes.epochs
+
+    def models(n: int, estimator: str) -> list[TDPG]:
+        return [
+            TDPG("TRVPolicy", "Lava-v0", mi_estimator=estimator, n_episodes=sizes.n_episodes, seed=seed, device="cpu")
+            for seed in range(n)
+        ]
+
+    for estimator in ("logdet", "mine"):
+        yield compare(
+            f"training on Lava, N={sizes.n_episodes}, {4 * sizes.epochs} epochs, {estimator}: eight seeds as one batch "
+            "against one by one, for each seed",
+            lambda name=estimator: seconds(
+                TrainingBatch([Member(model, n_timesteps) for model in models(8, name)]).learn, units=8
+            ),
+            lambda name=estimator: seconds(lambda: models(1, name)[0].learn(n_timesteps)),
+            sizes.loop_repetitions,
+        )
+
+
+def bench_training(sizes: Sizes) -> Iterable[Row]:
+    """Compare the time of training for each environment step with that of RecurrentPPO."""
+    n = sizes.n_episodes
+    for name, beta in (("PG (beta=inf)", float("inf")), ("TDPG (penalty on)", 1 / 75)):
+        model = make_tdpg(n, beta=beta)
+        steps = n * model.horizon
+        learn = learner(model, sizes.epochs, steps)
+        # One pass over all samples at once, as TDPG makes one: smaller minibatches are slower.
+        ppo = RecurrentPPO(
+            "MlpLstmPolicy",
+            make_episodes_env("Lava-v0", n),
+            n_steps=model.horizon,
+            batch_size=steps,
+            n_epochs=1,
+            seed=SEED,
+            device="cpu",
+        )
+        learn_ppo = learner(ppo, 1, steps)
+        yield compare(
+            f"training, for each environment step, n_envs={n}, one pass: {name} against RecurrentPPO",
+            lambda learn=learn, steps=steps: seconds(learn, sizes.epochs * steps),
+            lambda learn=learn_ppo, steps=steps: seconds(learn, steps),
+            sizes.repetitions,
+            goal=3,
+        )
