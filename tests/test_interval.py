@@ -31,7 +31,7 @@ def test_the_interval_holds_the_information_of_gaussian_channels_and_is_narrow()
     assert missed < 12
 
 
-def test_the_limits_spend_two_fifths_of_the_probability_to_miss():
+def test_the_limits_spend_three_fifths_and_one_fifth_of_the_probability_to_miss():
     # With all of it, some rows of tests/benchmarks/interval_coverage.py fall below 95 %: by chance, and by skewness.
     batch = gaussian_batch(100, [[0.3, 0.3], [1.0, 1.0], [4.0, 4.0]], generator=generator())
     interval = information_interval(batch, confidence=0.9)
@@ -42,12 +42,14 @@ def test_the_limits_spend_two_fifths_of_the_probability_to_miss():
         )
         best, nearest = below.argmax(), above.argmin()
         gap = (above[nearest] - below[best]) / max(below_error[best], above_error[nearest])
-        miss = miss_of_each_limit(0.04, gap)
-        assert 0.02 <= miss <= 0.04
+        miss = miss_of_each_limit(0.06, gap)
+        assert 0.03 <= miss <= 0.06
         # Between the limit of a bound alone and that of bounds that are independent of each other.
         alone, independent = normal_quantile(miss), normal_quantile(miss / 2)
         assert (below - independent * below_error).max() <= interval.lower[t] or interval.lower[t] == 0
         assert interval.lower[t] <= max((below - alone * below_error).max(), 0)
+        miss = miss_of_each_limit(0.02, gap)
+        assert 0.01 <= miss <= 0.02
         alone, independent = normal_quantile(miss), normal_quantile(miss / 3)
         assert (above + alone * above_error).min() <= interval.upper[t] <= (above + independent * above_error).min()
 
