@@ -187,10 +187,11 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     fifths of the probability to miss, ``1 - confidence``, the upper one's one fifth. The rest is for what they neglect:
     the limits are asymptotic, they take the means over episodes as Gaussian. But what an episode adds is skewed like a
     chi-square, so that a mean that is too low comes with a standard error that is too small: the upper limits suffer,
-    not the lower ones. Of what is spent, a limit gets its share according to the gap between the estimates (``miss_of_each_limit``), and a share is for all bounds of a side at once, since the tightest
-    is taken: the closer they go together, the less that costs (``joint_quantile``). The interval holds for each step by
-    itself, not for all of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot
-    exceed about ``ln(N^2 / 10)``.
+    not the lower ones. Of what is spent, a limit gets its share according to the gap between the estimates
+    (``miss_of_each_limit``), and a share is for all bounds of a side at once, since the tightest is taken: the closer
+    they go together, the less that costs (``joint_quantile``). The interval holds for each step by itself, not for all
+    of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about
+    ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` that the encoder was not trained on since; the episodes are independent.
     :param confidence: Probability, at least, with which the interval of a step holds the truth.
