@@ -10,6 +10,7 @@ from sb3_tdpg.information import (
     CriticEstimator,
     InformationBatch,
 )
+from sb3_tdpg.information.density_critic import Encoded
 
 CRITICS = sorted(name for name, cls in ESTIMATORS.items() if issubclass(cls, CriticEstimator))
 CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))
@@ -72,3 +73,19 @@ def fresh_estimates(estimator, n_batches=20, n=1000):
     with th.no_grad():
         values = np.stack([estimator(gaussian_batch(n, GAINS)).numpy() for _ in range(n_batches)])
     return values.mean(0), values.std(0, ddof=1) / math.sqrt(n_batches)
+
+
+def generator(seed=0):
+    return th.Generator().manual_seed(seed)
+
+
+def channel(states, means, stds, rng):
+    """Wrap arrays ``(T, N, ...)`` of a channel as a batch."""
+    trvs = means + stds * rng.standard_normal(means.shape)
+    return InformationBatch(*map(th.as_tensor, (states, trvs, means, np.broadcast_to(stds, means.shape).copy())))
+
+
+def encoded(batch, n_draws=1):
+    states, trvs, means, stds = (x[0].double().numpy() for x in batch[:4])
+    noise = np.random.default_rng(0).standard_normal((len(trvs), n_draws - 1, trvs.shape[1]))
+    return Encoded(states, means, stds, np.concatenate([trvs[:, None], means[:, None] + stds[:, None] * noise], 1))

@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK = "#333333"
 # Of the bounds that the limits of an information interval come from: marker and name.
-LOWER_MARKERS = {"critic": ("^", "frozen critic"), "zero": ("_", "never negative")}
+LOWER_MARKERS = {
+    "critic": ("^", "frozen critic"),
+    "gaussian": ("o", "Gaussian critic"),
+    "zero": ("_", "never negative"),
+}
 UPPER_MARKERS = {"logdet": ("v", "log-det"), "loo": ("s", "leave-one-out"), "marginal": ("D", "fitted marginal")}
 MAX_ANNOTATED_STEPS = 15
 WIDTH = 9.0  # inches: about as wide as a README is shown, so that 9 points stay readable

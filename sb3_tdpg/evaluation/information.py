@@ -125,7 +125,8 @@ def interval_frame(interval: InformationInterval) -> pd.DataFrame:
     Make a frame with a row for each time step.
 
     Its columns are ``t``, the limits ``lower`` and ``upper`` in nats and the bounds ``lower_name`` and ``upper_name``
-    that they come from, the estimate of each bound (``critic``, ``logdet``, ``loo``, ``marginal``) and ``n_episodes``.
+    that they come from, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``, ``marginal``) and
+    ``n_episodes``.
     """
     return pd.DataFrame(
         dict(

@@ -19,7 +19,8 @@ from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.density_critic import Regression
-from sb3_tdpg.information.interval import MAX_TRAINING, component_estimates, normal_quantile
+from sb3_tdpg.information.interval import component_estimates, normal_quantile
+from sb3_tdpg.information.interval_bounds import MAX_TRAINING
 from sb3_tdpg.vec_env import make_episodes_env
 
 # Walls that no policy was trained or tested on.

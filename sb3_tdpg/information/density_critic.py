@@ -94,7 +94,7 @@ class DensityCritic:
         self._regression = Regression(train.states, targets)
         residuals = self._regression.residuals[:, : train.means.shape[1]]
         # Coordinates in which both the encoder's variance and the covariance of the residuals are diagonal.
-        self._noise_rotation, self._residual_variance, self._noise_log_volume = _whiten(
+        self._noise_rotation, self._residual_variance, self._noise_log_volume = whiten(
             np.square(train.stds).mean(axis=0), residuals.T @ residuals / len(residuals)
         )
 
@@ -102,7 +102,7 @@ class DensityCritic:
         n, n_draws, dim = train.trvs.shape
         self._centre = train.means.mean(axis=0)
         centred = train.means - self._centre
-        self._rotation, self._spread, self._log_volume = _whiten(
+        self._rotation, self._spread, self._log_volume = whiten(
             np.square(train.stds).mean(axis=0), centred.T @ centred / (n - 1)
         )
         self._components = centred @ self._rotation.T  # (n, Z)
@@ -215,7 +215,7 @@ def _choose_ridge(
     return np.stack(choices)[best].T, np.stack(residuals)[best, :, columns].T
 
 
-def _whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """
     Find coordinates in which the noise has variance 1 and the covariance is diagonal.
 

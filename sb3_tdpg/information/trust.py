@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.information.interval import InformationInterval, information_interval, normal_quantile
+from sb3_tdpg.information.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
 
 NEAR_THE_CAP = 0.9  # of ln N
 FALSE_ALARM = 0.01  # probability of each check to fail without a cause, all time steps together
@@ -74,8 +74,8 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
     r"""
     Check an information interval against what must come out.
 
-    - **shuffled pairs**: with every state paired with the TRVs of another episode there is no information, and the
-      lower bound must not find any;
+    - **shuffled pairs**: with every state paired with the TRVs of another episode there is no information, and no
+      lower bound must find any;
     - **data processing**: a noisier copy of the TRVs (the same noise added to all of a time step, so much that the
       encoder's mean variance is four times as large) knows no more of the state, so its lower limit must not be above
       the upper limit of the TRVs, nor its estimate above theirs (where both count as 0 if they are negative: then the
@@ -100,12 +100,13 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
     miss = FALSE_ALARM / len(steps)
     quantile = normal_quantile(miss)
     checks = (
-        _shuffled_pairs(batch, steps, quantile, seed),
+        _shuffled_pairs(batch, steps, normal_quantile(miss / len(LOWER_BOUNDS)), seed),
         _data_processing(batch, interval, steps, quantile, seed),
         _encoder_density(batch, steps, normal_quantile(miss / 2)),  # either sign counts
     )
     cap = np.log(interval.n_episodes[steps])
-    capped = steps[interval.estimates["critic"][steps] >= NEAR_THE_CAP * cap]
+    lower = np.maximum(*(interval.estimates[name][steps] for name in LOWER_BOUNDS))
+    capped = steps[lower >= NEAR_THE_CAP * cap]
     return TrustBadge(checks, tuple(capped.tolist()))
 
 
@@ -119,9 +120,9 @@ def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float,
     null = information_interval(batch._replace(states=states), seed=seed)
     return _worst(
         "shuffled pairs",
-        null.estimates["critic"][steps],
-        quantile * null.errors["critic"][steps],
-        "nats that the lower bound finds where there are none",
+        np.concatenate([null.estimates[name][steps] for name in LOWER_BOUNDS]),
+        quantile * np.concatenate([null.errors[name][steps] for name in LOWER_BOUNDS]),
+        "nats that a lower bound finds where there are none",
     )
 
 
@@ -141,7 +142,7 @@ def _data_processing(
         name,
         (copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0))[steps],
         quantile * np.hypot(copy.errors["critic"], interval.errors["critic"])[steps],
-        "nats by which a noisier copy of the TRVs knows more, by the lower bound",
+        "nats by which a noisier copy of the TRVs knows more, by the critic's bound",
     )
     crossed = TrustCheck(
         name,
