@@ -32,8 +32,8 @@ def measure(nats: float, dim: int, n_episodes: int, n_draws: int, seed: int) -> 
     interval = information_interval(gaussian_channels(nats, dim, n_episodes, n_draws, rng), seed=seed)
     above, below, width = interval.lower > nats, interval.upper < nats, interval.width
     counts = (f"{1 - (above | below).mean():.1%}".replace("%", " %"), str(above.sum()), str(below.sum()))
-    nats_of_it = (interval.lower.mean(), interval.upper.mean(), width.mean(), np.quantile(width, 0.95), width.max())
-    return (str(n_episodes), str(dim), f"{nats:g}", *counts, *(f"{x:.2f}" for x in nats_of_it))
+    means = (interval.lower.mean(), interval.upper.mean(), width.mean(), np.quantile(width, 0.95))
+    return (str(n_episodes), str(dim), f"{nats:g}", *counts, *(f"{x:.2f}" for x in means), f"{width.max():.3f}")
 
 
 def main() -> None:
