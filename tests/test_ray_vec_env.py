@@ -284,8 +284,9 @@ def csv_log(vec_env, tmp_path, algorithm):
     pytest.param("PandaGrasp-v0", "TDPG", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_training_gives_the_log_that_it_gives_with_subproc_vec_env(env_id, algorithm, tmp_path):
+    # With the module: the server that SubprocVecEnv's processes are forked from may be that of an earlier test.
     logs, policies = zip(*[
-        csv_log(make_vec_env(env_id, n_envs=2, seed=1, vec_env_cls=vec_env), tmp_path, algorithm)
+        csv_log(make_vec_env(f"sb3_tdpg:{env_id}", n_envs=2, seed=1, vec_env_cls=vec_env), tmp_path, algorithm)
         for vec_env in (RayVecEnv, SubprocVecEnv)
     ], strict=True)  # fmt: skip
     assert logs[0] == logs[1]

@@ -154,7 +154,7 @@ def test_workers_that_are_suspended_together_do_not_take_each_other_for_dead(mon
     study, said, clock = open_study(optuna.storages.InMemoryStorage(), "s", space={}), [], [0.0]
     monkeypatch.setattr(study_worker.time, "monotonic", lambda: clock[0])
     study.ask()  # by another one, that gives no sign
-    worker = study_worker.Worker(study, lambda trial: 0.0, 1, 3, 1.0, 6.0, said.append)
+    worker = study_worker.Worker(study, lambda trial: 0.0, 1, 3, 1.0, 6.0, said.append, study_worker.values_of)
     for seconds in (0, 1, 2, 100, 101, 103, 105, 106):
         clock[0] = seconds
         worker._look()
