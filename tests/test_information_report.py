@@ -43,12 +43,24 @@ def test_the_knowledge_is_of_the_component_that_the_trvs_tell():
     assert (frame["nats_lower"] > 0).tolist() == [True, False, False, True]
 
 
+def test_what_many_trvs_know_of_two_components_is_found_in_each_of_them():
+    # Given one component, the density of the TRVs is a band along the other one.
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (1, 500, 2))
+    batch = channel(states, np.tanh(2 * states @ rng.standard_normal((2, 16))), 0.2, rng)
+    frame = state_knowledge(batch)
+    assert (frame["r2"] > 0.9).all()
+    assert (frame["nats_lower"] > 0.8).all()
+    # No more than a sensor that shows nothing but this component, with as much noise as the regression leaves.
+    assert (frame["nats"] < -0.5 * np.log(1 - frame["r2"]) + 0.3).all()
+
+
 def test_a_component_that_is_constant_at_one_step_only_has_no_number_there():
     batch = looking_at_the_first_then_the_second()
     batch.states[0, :, 1] = 2.0
-    estimates, errors = component_estimates(batch)
+    estimates, limits = component_estimates(batch)
     np.testing.assert_array_equal(np.isnan(estimates), [[False, True, True], [False, False, True]])
-    np.testing.assert_array_equal(np.isnan(errors), np.isnan(estimates))
+    np.testing.assert_array_equal(np.isnan(limits), np.isnan(estimates))
     frame = state_knowledge(batch)
     assert frame["r2"].isna().tolist() == [False, True, False, False]
 

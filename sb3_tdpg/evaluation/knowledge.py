@@ -19,7 +19,7 @@ from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.density_critic import Regression
-from sb3_tdpg.information.interval import component_estimates, normal_quantile
+from sb3_tdpg.information.interval import component_estimates
 from sb3_tdpg.information.interval_bounds import MAX_TRAINING
 from sb3_tdpg.vec_env import make_episodes_env
 
@@ -98,7 +98,7 @@ def state_knowledge(
     names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
     if len(names) != n_components:
         raise ValueError(f"names={names} must have a name for each of the {n_components} components of the state")
-    nats, errors = component_estimates(batch, seed=seed)
+    nats, limits = component_estimates(batch, confidence=confidence, seed=seed)
     r2 = np.full_like(nats, np.nan)
     for t in range(horizon):
         known = np.isfinite(nats[t])
@@ -109,7 +109,6 @@ def state_knowledge(
             residuals = Regression(trvs, targets).residuals
             r2[t, known] = 1 - np.square(residuals).sum(axis=0) / np.square(targets).sum(axis=0)
     shown = np.flatnonzero(np.isfinite(nats).any(axis=0))
-    limits = nats - normal_quantile(1 - confidence) * errors
     return pd.DataFrame(
         dict(
             t=np.repeat(np.arange(horizon), len(shown)),

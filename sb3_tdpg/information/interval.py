@@ -242,15 +242,20 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     )
 
 
-def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def component_estimates(
+    batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     r"""
     Bound from below what the TRVs know of each component of the state by itself, I[x^k_t; x~_t].
 
-    The bound is the critic's of :func:`information_interval`, with one component of the state in place of the state.
+    The bounds are the lower ones of :func:`information_interval`, with one component of the state in place of the
+    state; the larger one counts. Where the TRVs tell several components, their density given one of them has a shape of
+    its own, which the critic follows badly; the Gaussians then say more.
 
     :param batch: As for :func:`information_interval`.
-    :param seed: Of the division into halves and of the noise.
-    :return: the estimates and their standard errors, ``(T, X)`` each, nats; NaN where a component is constant and where
+    :param confidence: Of the lower limits, which are one-sided.
+    :param seed: Of the division of the episodes and of the noise.
+    :return: the estimates and their lower limits, ``(T, X)`` each, nats; NaN where a component is constant and where
         too few episodes are alive
     :raises ValueError: if the batch is not fit for an interval.
     """
@@ -264,8 +269,10 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
         rng = np.random.default_rng((seed, t))
         step = draw_trvs(at_t, rng)
         for k in np.flatnonzero(varies(step.states)):
-            bound = critic_bounds(step._replace(states=step.states[:, [k]]), rng)[0]
-            values[:, t, k] = bound.value, bound.error
+            of_one = step._replace(states=step.states[:, [k]])
+            bounds = dict(critic=critic_bounds(of_one, rng)[0], gaussian=gaussian_bound(of_one, rng))
+            values[0, t, k] = max(bound.value for bound in bounds.values())
+            _, values[1, t, k] = limit(bounds, 1 - confidence, sign=-1)
     return values[0], values[1]
 
 
