@@ -130,7 +130,7 @@ class ELUGradient:
             if i > 0:
                 grad = grad * weight.mT if is_column else th.bmm(grad, weight.mT)
                 # d elu(z) / dz in terms of h = elu(z): 1 where h > 0, and exp(z) = h + 1 elsewhere.
-                grad = th.ops.aten.elu_backward(grad, 1.0, 1.0, 1.0, True, x)
+                th.ops.aten.elu_backward.grad_input(grad, 1.0, 1.0, 1.0, True, x, grad_input=grad)
 
 
 class TimeMLP(nn.Module):

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch as th
 from scipy.special import stdtrit
 from torch import nn
+from torch.nn.functional import embedding_bag
 
 DEGREES_OF_FREEDOM = tuple(1.5**i for i in range(11))  # 1 to 58
 NORMAL = 1e6  # degrees of freedom that are as good as infinitely many
@@ -68,6 +69,17 @@ def degrees_of_freedom(ranks: th.Tensor) -> th.Tensor:
     return choices[likelihoods.view(len(ranks), -1).argmax(1)]
 
 
+def add_up(table: th.Tensor, pairs: th.Tensor) -> th.Tensor:
+    """
+    Add what the x and the z of every pair bring.
+
+    :param table: ``(2 * rows * N, C)``: that of every x, then that of every z, row by row
+    :param pairs: where they are in it, ``row * N + i`` and ``rows * N + row * N + j``: ``(rows, n, 2)``, whole numbers
+    :return: ``(rows, n, C)``
+    """
+    return embedding_bag(pairs.flatten(0, 1).int(), table, mode="sum").view(*pairs.shape[:2], -1)
+
+
 class Start(nn.Module):
     r"""
     What the critics are before they are trained: the logarithmic density ratio of a multivariate t, for each row.
@@ -78,19 +90,17 @@ class Start(nn.Module):
         c + \tfrac{\nu + X}{2} \ln(1 + x^\top B x / \nu) + \tfrac{\nu + Z}{2} \ln(1 + z^\top C z / \nu)
         - \tfrac{\nu + X + Z}{2} \ln(1 + (x, z)^\top A (x, z) / \nu).
 
-    What each x and each z bring to it is worked out once: the last quadratic form is then the inner product of two
-    vectors, and so cheap for any pair of them.
+    What each x and each z bring to it is worked out once, and added for a pair of them: the last quadratic form is the
+    squared length of :math:`(x, z) W`, where :math:`W W^\top = A / \nu`, and so of a sum.
 
-    :param of_x: ``(rows * N, Z + 3)``: :math:`(2 x^\top A / \nu, x^\top A x / \nu, 1)`, then c and the logarithm of x
-    :param of_z: ``(rows * N, Z + 3)``: :math:`(z, 1, z^\top A z / \nu)`, then the logarithm of z
+    :param table: see :func:`add_up`, ``(2 * rows * N, X + Z + 1)``: what x or z brings to :math:`(x, z) W`, then to the
+        sum of c and the logarithms of x and z
     :param factor: of the last logarithm, ``(rows, 1, 1)``
     """
 
-    def __init__(self, of_x: th.Tensor, of_z: th.Tensor, factor: th.Tensor) -> None:
+    def __init__(self, table: th.Tensor, factor: th.Tensor) -> None:
         super().__init__()
-        self.of_x, self.of_z, self.factor = of_x.float(), of_z.float(), factor.float()
-        self._all_but_last = th.ones(of_x.shape[-1])
-        self._all_but_last[-1] = 0
+        self.table, self.factor = table.float(), factor.float()
 
     @classmethod
     def fit(cls, y: th.Tensor, train: th.Tensor, n_x: int, nu: th.Tensor, level: float) -> Start:
@@ -103,62 +113,46 @@ class Start(nn.Module):
         :param nu: degrees of freedom, ``(M,)``
         :param level: what is added: the score at which the critic says "no information"
         """
-        n_problems, n_folds, dim, n_z = len(y), len(train), y.shape[-1], y.shape[-1] - n_x
+        n_folds, dim = len(train), y.shape[-1]
         scatter = _scatter(y[:, train].flatten(0, 1), nu.repeat_interleave(n_folds)).unflatten(0, (-1, n_folds))
-        nu = nu[:, None]
-        parts = slice(None), slice(n_x), slice(n_x, None)
-        blocks = [scatter[..., part, part] for part in parts]
-        constant = level + th.lgamma(nu / 2)
-        for block, sign in zip(blocks, (1, -1, -1), strict=True):
-            constant = constant + sign * (th.lgamma((nu + block.shape[-1]) / 2) - th.logdet(block) / 2)
-        inverse, inverse_x, inverse_z = (th.linalg.inv(block) for block in blocks)
-        constant, nu = constant[..., None, None], nu[..., None, None]
-        x, z = (y[:, None, :, part] for part in parts[1:])  # (M, 1, N, .): the same for all folds
-        one = y.new_ones(n_problems, n_folds, y.shape[1], 1)
-        of_x = [
-            2 / nu * x @ inverse[..., :n_x, n_x:],
-            _quadratic(x, inverse[..., :n_x, :n_x]) / nu,
-            one,
-            constant + (nu + n_x) / 2 * th.log1p(_quadratic(x, inverse_x) / nu),
-        ]
-        of_z = [
-            z.expand(-1, n_folds, -1, -1),
-            one,
-            _quadratic(z, inverse[..., n_x:, n_x:]) / nu,
-            (nu + n_z) / 2 * th.log1p(_quadratic(z, inverse_z) / nu),
-        ]
+        nu = nu[:, None, None, None]
+        root = th.linalg.inv(th.linalg.cholesky(scatter)).mT / nu.sqrt()  # W
+        constant = level + th.lgamma(nu / 2) + th.lgamma((nu + dim) / 2) - _half_log_det(scatter)
+        brought = []
+        for part in (slice(n_x), slice(n_x, None)):
+            block, own = scatter[..., part, part], y[:, None, :, part]  # (M, 1, N, .): the same for all folds
+            half = (nu + block.shape[-1]) / 2
+            constant = constant - th.lgamma(half) + _half_log_det(block)
+            logarithm = half * th.log1p(_quadratic(own, th.linalg.inv(block)) / nu)
+            brought.append(th.cat([own @ root[..., part, :], logarithm], -1))
+        brought[0][..., -1:] += constant
         factor = ((nu + dim) / 2).expand(-1, n_folds, -1, -1)
-        return cls(th.cat(of_x, -1).flatten(0, 2), th.cat(of_z, -1).flatten(0, 2), factor.flatten(0, 1))
+        return cls(th.stack(brought).flatten(0, 3), factor.flatten(0, 1))
 
     def flat_like(self, level: float) -> Start:
         """Return a start of the same shape that is ``level`` everywhere."""
-        of_x = th.zeros_like(self.of_x)
-        of_x[..., -1] = level
-        return Start(of_x, th.zeros_like(self.of_z), th.zeros_like(self.factor))
+        table = th.zeros_like(self.table)
+        table[: len(table) // 2, -1] = level
+        return Start(table, th.zeros_like(self.factor))
 
     def forward(self, pairs: th.Tensor) -> th.Tensor:
-        """Evaluate at pairs of the numbers of x and of z, ``row * N + i``: ``(rows, n, 2) -> (rows, n, 1)``."""
-        return self.at(*numbers_of(pairs))
+        """Evaluate at pairs of places in the table: ``(rows, n, 2) -> (rows, n, 1)``."""
+        return self.of_sums(add_up(self.table, pairs))
 
-    def at(self, numbers_x: th.Tensor, numbers_z: th.Tensor) -> th.Tensor:
-        """The same for ``(rows * n,)`` numbers each."""
-        of_x, of_z = self.of_x.index_select(0, numbers_x), self.of_z.index_select(0, numbers_z)
-        marginals = of_x[:, -1] + of_z[:, -1]
-        # Rounding may take the quadratic form below 0.
-        quadratic = of_x.mul_(of_z).mv(self._all_but_last).clamp_(min=0)
-        shape = len(self.factor), -1, 1
-        return marginals.view(shape).addcmul_(self.factor, quadratic.log1p_().view(shape), value=-1)
+    def of_sums(self, sums: th.Tensor) -> th.Tensor:
+        """Evaluate where x and z bring these sums: ``(rows, n, X + Z + 1) -> (rows, n, 1)``."""
+        quadratic = th.linalg.vector_norm(sums[..., :-1], dim=-1, keepdim=True).square_()
+        return sums[..., -1:].addcmul(self.factor, quadratic.log1p_(), value=-1)
+
+
+def _half_log_det(matrices: th.Tensor) -> th.Tensor:
+    return th.logdet(matrices)[..., None, None] / 2
 
 
 def choose_start(starts: Sequence[Start], chosen: th.Tensor) -> Start:
     """Take for each row the start whose number ``chosen`` ``(rows,)`` gives."""
     n_rows = len(chosen)
-    fields = zip(*((start.of_x, start.of_z, start.factor) for start in starts), strict=True)
-    of_rows = (th.stack([values.view(n_rows, -1, values.shape[-1]) for values in field]) for field in fields)
-    of_x, of_z, factor = (values[chosen, th.arange(n_rows)] for values in of_rows)
-    return Start(of_x.flatten(0, 1), of_z.flatten(0, 1), factor)
-
-
-def numbers_of(pairs: th.Tensor) -> tuple[th.Tensor, ...]:
-    """Of the x and of the z, whole: ``(rows, n, 2) -> (rows * n,), (rows * n,)``."""
-    return pairs.reshape(-1, 2).T.long().contiguous().unbind()
+    rows = th.arange(n_rows)
+    tables = th.stack([start.table.view(2, n_rows, -1, start.table.shape[-1]) for start in starts], 2)
+    table = tables[:, rows, chosen]  # (2, rows, N, X + Z + 1)
+    return Start(table.flatten(0, 2), th.stack([start.factor for start in starts])[chosen, rows])

@@ -256,10 +256,12 @@ class CriticEstimator(InformationEstimator):
                 # Dead episodes sort to the end; steps with fewer than 2n living ones are not trained on.
                 priority = th.rand(size, *alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
                 chosen = priority.topk(2 * n, dim=2, largest=False).indices
-            row = th.arange(n_rows, device=trvs.device)[:, None]
-            chosen_trvs = trvs[row, chosen]  # (size, T, 2 n, Z)
-            inputs = self._pair(states[row, chosen[..., :n]], chosen_trvs[..., :n, :], chosen_trvs[..., n:, :])
-            yield from inputs
+            # Whole rows of (T * N, .), which is faster than two indices for each number.
+            index = (chosen + n_episodes * th.arange(n_rows, device=trvs.device)[:, None]).flatten()
+            chosen_states, chosen_trvs = (
+                x.flatten(0, 1).index_select(0, index).view(size, n_rows, 2 * n, -1) for x in (states, trvs)
+            )
+            yield from self._pair(chosen_states[..., :n, :], chosen_trvs[..., :n, :], chosen_trvs[..., n:, :])
 
     def _n_pairs(self, n: int) -> int:
         """How many samples a minibatch of n makes for the critic."""

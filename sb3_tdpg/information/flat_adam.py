@@ -9,7 +9,6 @@ from typing import Any
 
 import torch as th
 from torch import nn
-from torch.optim.adam import adam
 
 VECTOR = 64  # a multiple of what any processor computes at a time
 
@@ -60,20 +59,21 @@ class FlatAdam:
         """Descend along the gradients that the parameters hold."""
         assert self._moments is not None, "attach() first"
         mean, square, count = self._moments
-        adam(
+        count.add_(1)
+        # The kernel of torch.optim.Adam(fused=True): what that does before it takes four times as long.
+        th._fused_adam_(
             [self._vector],
             [self._gradient],
             [mean],
             [square],
             [],
             [count],
-            fused=True,
-            amsgrad=False,
+            lr=self.learning_rate,
             beta1=0.9,
             beta2=0.999,
-            lr=self.learning_rate,
             weight_decay=0.0,
             eps=1e-8,
+            amsgrad=False,
             maximize=False,
         )
 

@@ -7,8 +7,9 @@ variables, D components of either or both, J = 4 features of each: its normal sc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,16 +20,16 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.copula_start import (
     NORMAL,
     Start,
+    add_up,
     choose_start,
     degrees_of_freedom,
-    numbers_of,
     t_scores,
 )
 from sb3_tdpg.information.critic import CriticEstimator, Scores
 from sb3_tdpg.information.flat_adam import AveragedAdam
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.nwj import Nwj
-from sb3_tdpg.networks import BatchedMLP, ELUGradient
+from sb3_tdpg.networks import BatchedLinear, BatchedMLP, ELUGradient
 
 STEPS_PER_CHECK = 50
 MIN_VARIANCE = 1e-2  # of what is brought to variance 1
@@ -181,28 +182,33 @@ def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     return mean, (axes * variances.clamp(min=MIN_VARIANCE).rsqrt()[..., None, :]) @ axes.mT
 
 
-def _inputs(features: th.Tensor, train: th.Tensor, n_x: int) -> tuple[th.Tensor, th.Tensor]:
+def _inputs(features: th.Tensor, train: th.Tensor, n_x: int) -> th.Tensor:
     """
     What x and z bring to the network's inputs, which are the sum of both: white on each fold's training pairs.
 
     :param features: of x and z, ``(M, N, J, D)``
     :param train: pairs that each fold trains on, ``(K, n)``
     :param n_x: X
-    :return: ``(M * K * N, J * D)`` of x and of z
+    :return: of every x, then of every z: ``(2 * M * K * N, J * D)``
     """
     mean, axes = (found.unflatten(0, (-1, len(train))) for found in _whiten(features[:, train].flatten(0, 1)))
     centred = features[:, None] - mean  # (M, K, N, J, D)
-    of_x, of_z = (
+    brought = [
         th.einsum("mknjd,mkjde->mknje", centred[..., part], axes[..., part, :])
         for part in (slice(n_x), slice(n_x, None))
-    )
-    return of_x.flatten(3).flatten(0, 2).float(), of_z.flatten(3).flatten(0, 2).float()
+    ]
+    return th.stack(brought).flatten(4).flatten(0, 3).float()
 
 
 def _elu_(x: th.Tensor) -> th.Tensor:
-    """ELU in place, to within 3e-7: ``exp(x) = 1 / sigmoid(-x) - 1``, and the sigmoid is the faster of the two."""
-    above = x.clamp(min=0)
-    return x.clamp_(max=0).neg_().sigmoid_().reciprocal_().sub_(2).add_(above)
+    """ELU in place, to within 1e-7: ``max(x, exp(min(x, 0)) - 1)``, by a power of 2, which is faster than that of e."""
+    exponential = x.clamp(max=0).mul_(math.log2(math.e)).exp2_()
+    return th.maximum(x, exponential.sub_(1), out=x)
+
+
+def _to_one(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    """Map to one output, ``(M, N, I) -> (M, N, 1)``, in the order that takes a fifth of the time."""
+    return th.baddbmm(bias, weight.mT, x.mT).mT
 
 
 class _QuickELU(nn.ELU):
@@ -214,25 +220,30 @@ class StartedMLP(BatchedMLP):
     """
     Networks that are added to a fixed critic, and are zero at first.
 
-    They are given pairs as the numbers that x and z have among the samples of all rows, ``row * N + i``, and look up
-    what these bring to their inputs. What is drawn, repeated and put together for a minibatch is then numbers alone.
+    They are given pairs as places in a table, and look up what x and z bring to their inputs and to the start. What is
+    drawn, repeated and put together for a minibatch is then numbers alone.
     """
 
     start: Start
-    of_x: th.Tensor  # (rows * N, J * (X + Z))
-    of_z: th.Tensor
+    table: th.Tensor  # see `add_up`: what is brought to the J * (X + Z) inputs, then to the start
 
     def forward(self, pairs: th.Tensor) -> th.Tensor:
         """``(rows, n, 2) -> (rows, n, 1)``."""
         # Not all at once: what the layers make of so many is to stay in the processor's cache.
         parts = (self.prepare(part) for part in pairs.split(PAIRS_AT_ONCE, dim=1))
-        return th.cat([start + super(StartedMLP, self).forward(inputs) for inputs, start in parts], 1)
+        return th.cat([start + self._outputs(inputs) for inputs, start in parts], 1)
+
+    def _outputs(self, inputs: th.Tensor) -> th.Tensor:
+        *hidden, last = cast("list[BatchedLinear]", list(self.layers))
+        for layer in hidden:
+            inputs = self.activation(layer(inputs))
+        return _to_one(inputs, last.weight, last.bias)
 
     def prepare(self, pairs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Inputs of the networks, ``(rows, n, J * (X + Z))``, and what is added to their outputs, ``(rows, n, 1)``."""
-        numbers = numbers_of(pairs)
-        inputs = self.of_x.index_select(0, numbers[0]).add_(self.of_z.index_select(0, numbers[1]))
-        return inputs.view(*pairs.shape[:2], -1), self.start.at(*numbers)
+        sums = add_up(self.table, pairs)
+        n_inputs = sums.shape[-1] - self.start.table.shape[-1]
+        return sums[..., :n_inputs], self.start.of_sums(sums[..., n_inputs:])
 
     def gradient_by_hand(self) -> ELUGradient:
         """Return the means to evaluate and differentiate this critic; see :class:`ELUGradient`."""
@@ -252,7 +263,7 @@ class _StartedGradient(ELUGradient):
         for weight, bias in hidden:
             inputs = _elu_(th.baddbmm(bias, inputs, weight))
             self._inputs.append(inputs)
-        return start.add_(th.baddbmm(last_bias, last_weight.mT, inputs.mT).mT)
+        return start.add_(_to_one(inputs, last_weight, last_bias))
 
 
 # -- folds ----------------------------------------------------------------------------------------------------
@@ -279,15 +290,16 @@ def _cross_fit(
     # What a critic has seen is read on the pairs of the next fold: over all folds each pair is read once by a critic
     # that was fitted to it, and once by one that was not.
     parts = (train, held_out, held_out.roll(-1, 0))
-    # Every row has numbers of its own for the pairs, so that a number says where to look.
-    numbers = th.arange(n_problems * n_folds * n).view(n_problems, n_folds, n)
-    on_train, fresh, seen = (numbers.gather(2, part.expand(n_problems, -1, -1)).flatten(0, 1) for part in parts)
+    # Every row has places of its own for the pairs' x; those of z are `n_places` further on.
     n_rows = n_problems * n_folds
-    estimator = estimator_class(n_rows, 1, 1, **kwargs)  # what is paired is numbers
+    n_places = n_rows * n
+    places = th.arange(n_places, dtype=th.int32).view(n_problems, n_folds, n)
+    on_train, fresh, seen = (places.gather(2, part.expand(n_problems, -1, -1)).flatten(0, 1) for part in parts)
+    estimator = estimator_class(n_rows, 1, 1, **kwargs)  # what is paired is places
 
     def read(critic: nn.Module, pairs: th.Tensor) -> th.Tensor:
         """Estimate from pairs of every row: ``(rows, n) -> (M, K)``."""
-        return _read(estimator, critic, pairs).view(n_problems, n_folds)
+        return _read(estimator, critic, pairs, pairs + n_places).view(n_problems, n_folds)
 
     # The start is what the held-out pairs of all folds say: none, a Gaussian's ratio or a t's.
     infinite = th.full((n_problems,), NORMAL, dtype=th.double)
@@ -301,16 +313,17 @@ def _cross_fit(
     start = choose_start(starts, best_start.repeat_interleave(n_folds))
 
     th.manual_seed(seed)
-    critic = _new_critic(estimator, start, *_inputs(_features(ranks), train, n_x), n_folds)
+    critic = _new_critic(estimator, start, _inputs(_features(ranks), train, n_x), n_folds)
     optimizer = AveragedAdam(estimator.learning_rate)
     optimizer.attach(critic)
     first = read(start, fresh)
     choice = _Choice(estimator.refit_below, estimator.refit_above, first, read(start, seen))
     best = first.mean(-1)
     n_stale, n_done = th.zeros_like(best), 0  # (M,)
+    samples = on_train[..., None], on_train[..., None] + n_places, None, th.arange(n_rows)
     while n_done < max_gradient_steps and (training := n_stale < patience).any():
         n_steps = min(STEPS_PER_CHECK, max_gradient_steps - n_done)
-        estimator._ascend(critic, optimizer, on_train[..., None], on_train[..., None], None, th.arange(n_rows), n_steps)
+        estimator._ascend(critic, optimizer, *samples, n_steps)
         n_done += n_steps
         with optimizer.averaged():
             current = read(critic, fresh)
@@ -326,13 +339,13 @@ def _level(estimator: CriticEstimator) -> float:
     return 1.0 if isinstance(estimator, Nwj) else 0.0
 
 
-def _new_critic(estimator: CriticEstimator, start: Start, of_x: th.Tensor, of_z: th.Tensor, n_folds: int) -> StartedMLP:
+def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_folds: int) -> StartedMLP:
     """Make critics that equal ``start``, whose networks begin alike in every problem: the batch changes no result."""
-    sizes = (of_x.shape[-1], *estimator.sizes[1:])
+    sizes = (inputs.shape[-1], *estimator.sizes[1:])
     networks = BatchedMLP(n_folds, sizes, estimator.activation_fn)
     with th.random.fork_rng(devices=[]):  # what is drawn here is overwritten
         critic = StartedMLP(len(start.factor), sizes, estimator.activation_fn)
-    critic.start, critic.of_x, critic.of_z = start, of_x, of_z
+    critic.start, critic.table = start, th.cat([inputs, start.table], -1)
     if estimator.activation_fn is nn.ELU:
         critic.activation = _QuickELU()
     for parameter, fold in zip(critic.parameters(), networks.parameters(), strict=True):
@@ -343,17 +356,17 @@ def _new_critic(estimator: CriticEstimator, start: Start, of_x: th.Tensor, of_z:
     return critic
 
 
-def _read(estimator: CriticEstimator, critic: nn.Module, numbers: th.Tensor) -> th.Tensor:
-    """Estimate from pairs, each also with the partners of R others: ``(rows, n) -> (rows,)``."""
+def _read(estimator: CriticEstimator, critic: nn.Module, x: th.Tensor, z: th.Tensor) -> th.Tensor:
+    """Estimate from pairs, each x also with the z of R others: places of both, ``(rows, n)`` each ``-> (rows,)``."""
     if isinstance(estimator, InfoNCE):  # it makes pairs of its own
         estimator.critic = critic  # type: ignore[assignment]
-        samples = numbers[..., None].double()
-        return estimator._estimate(InformationBatch(samples, samples, samples, samples), None)
-    n = numbers.shape[1]
+        states, trvs = x[..., None].double(), z[..., None].double()
+        return estimator._estimate(InformationBatch(states, trvs, trvs, trvs), None)
+    n = x.shape[1]
     n_marginal = min(MARGINAL_SAMPLES, n - 1)
     others = (th.arange(n)[:, None] + th.arange(n_marginal + 1)) % n  # (n, 1 + R), its own and others
-    partners = numbers[:, others]
-    pairs = th.stack([numbers[..., None].expand_as(partners), partners], -1)
+    partners = z[:, others]
+    pairs = th.stack([x[..., None].expand_as(partners), partners], -1)
     joint, marginal = pairs[:, :, :1].flatten(1, 2), pairs[:, :, 1:].flatten(1, 2)
     # Double, so that of scores that are large, as a diverged critic's are, no information is made by rounding.
     values = critic(th.cat([joint, marginal], 1)).squeeze(-1).double()
