@@ -7,6 +7,7 @@ Dimension key: N environments side by side, X state, U action.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -156,10 +157,22 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     :raises gymnasium.error.Error: if the id is not registered.
     """
-    spec = gym.spec(_bare_id(env_id))
-    creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
-    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers
+    creator = _creator(env_id)
+    additional_wrappers = gym.spec(_bare_id(env_id)).additional_wrappers
+    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv) and not additional_wrappers
     return cast(type[POMDPEnv], creator) if is_batched else None
+
+
+def _creator(env_id: str) -> Any:
+    """Return what makes an environment: its class, or a function."""
+    spec = gym.spec(_bare_id(env_id))
+    return spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
+
+
+def _draws(env_id: str) -> bool:
+    """Tell whether an environment may be asked for pictures: Gymnasium warns of each one that says it has none."""
+    creator = _creator(env_id)
+    return not hasattr(creator, "metadata") or "rgb_array" in creator.metadata.get("render_modes", ())
 
 
 def default_n_envs(n_episodes: int) -> int:
@@ -207,4 +220,6 @@ def make_episodes_env(
             with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
                 n_episodes = defaults_for(probe.observation_space).n_episodes
         n_envs = default_n_envs(n_episodes)
-    return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
+    # make_vec_env asks an id for pictures, and a function for nothing.
+    make = env_id if _draws(env_id) else functools.partial(gym.make, env_id)
+    return make_vec_env(make, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)

@@ -1,9 +1,11 @@
 """The batched VecEnv is the same environment as the one that gymnasium.make gives."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_problems import tiny_tdpg, train_epochs
+from small_problems import ToyEnv, tiny_tdpg, train_epochs
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -191,6 +193,16 @@ def test_any_other_environment_becomes_a_dummy_vec_env(env_id):
     assert env.num_envs == 40  # the largest divisor of 120 up to 50
     np.testing.assert_array_equal(env.reset(), make_episodes_env(env_id, n_episodes=120, seed=1).reset())
     assert make_episodes_env(env_id, 3, n_episodes=120).num_envs == 3
+
+
+def test_an_environment_without_pictures_is_not_asked_for_any(monkeypatch):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    gym.register("Blind-v0", ToyEnv)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # Gymnasium's, once for each environment
+        env = make_episodes_env("Blind-v0", 2, env_kwargs=dict(horizon=7), seed=1)
+    assert env.get_attr("horizon") == [7, 7]
+    assert make_episodes_env("Pendulum-v1", 2).render_mode == "rgb_array"
 
 
 def test_an_unknown_id_is_refused():
