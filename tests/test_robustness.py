@@ -22,6 +22,7 @@ from perturbed_problems import (
 )
 from small_problems import lava_env, tiny_tdpg, train_epochs
 from stable_baselines3.common.env_checker import check_env as sb3_check
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_tdpg import make_episodes_env
@@ -311,6 +312,14 @@ def test_what_does_not_fit_is_refused(problem, arguments, fragment):
 def test_a_space_that_is_no_box_is_refused():
     with pytest.raises(ValueError, match="is no Box"):
         PerturbedObservation(gym.make("FrozenLake-v1"), "vector_noise")
+
+
+def test_one_environment_and_several_have_each_their_wrapper():
+    with pytest.raises(ValueError, match="DummyVecEnv is several environments: use PerturbedVecEnv"):
+        PerturbedObservation(make_vec_env("Pendulum-v1", 2), "vector_noise")
+    for env in (gym.make("Pendulum-v1"), gym.make_vec("Pendulum-v1", 2)):
+        with pytest.raises(ValueError, match=r"is no VecEnv of Stable-Baselines3.*PerturbedObservation"):
+            PerturbedVecEnv(env, "vector_noise")
 
 
 def test_observations_must_not_be_normalised_before_they_are_perturbed():

@@ -41,6 +41,8 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
     def __init__(
         self, env: gym.Env, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
     ) -> None:
+        if isinstance(env, VecEnv):
+            raise ValueError(f"{type(env).__name__} is several environments: use PerturbedVecEnv")
         RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
         gym.ObservationWrapper.__init__(self, env)
         horizon = env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
@@ -81,6 +83,11 @@ class PerturbedVecEnv(VecEnvWrapper):
     def __init__(
         self, venv: VecEnv, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
     ) -> None:
+        if not isinstance(venv, VecEnv):
+            raise ValueError(
+                f"{type(venv).__name__} is no VecEnv of Stable-Baselines3: use make_vec_env, or PerturbedObservation "
+                "for one environment"
+            )
         if isinstance(venv, VecNormalize) and venv.norm_obs:
             raise ValueError(
                 "a sensor is perturbed before its observations are normalised: "
