@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
 
 class _TDPGCallback(BaseCallback):
     """A callback that knows that its model is a :class:`TDPG`."""
+
+    def init_callback(self, model: BaseAlgorithm) -> None:
+        """Refuse other algorithms before they begin."""
+        if not hasattr(model, "mi_coef"):
+            raise ValueError(f"{type(self).__name__} is for TDPG, and the model is of {type(model).__name__}")
+        super().init_callback(model)
 
     @property
     def tdpg(self) -> TDPG:

@@ -6,9 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from information_problems import channel, gaussian_batch, generator
-from small_problems import tiny_tdpg, train_epochs
+from small_problems import CountdownEnv, tiny_tdpg, train_epochs
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tdpg import BatchedVecEnv, InformationCallback, make_episodes_env
+from sb3_tdpg import BatchedVecEnv, InformationCallback, SelectionCallback, make_episodes_env
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.evaluation import (
     information_report,
@@ -117,6 +120,41 @@ def test_the_report_calls_the_components_as_the_environment_does(env_class, name
 def test_names_that_are_given_win_over_those_of_the_environment():
     report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(LavaEnv(), 50), 50, names=("a", "b"))
     assert set(report.knowledge["component"]) == {"a", "b"}
+
+
+def test_a_report_tells_of_the_steps_that_its_sum_leaves_out():
+    env = DummyVecEnv([lambda: CountdownEnv(0, (4,))] + 59 * [lambda: CountdownEnv(1, (2,))])
+    report = information_report(tiny_tdpg(env, n_episodes=60), env, n_episodes=60, seed=0)
+    assert report.frame["upper"].isna().tolist() == [False, False, True, True]
+    assert "60 episodes, 2 steps with too few of them left out" in str(report)
+
+
+@pytest.mark.parametrize(
+    "model, env, message",
+    [
+        (
+            lambda: PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8),
+            lambda: make_episodes_env(PROBLEM, 4),
+            "is of PPO.*TDPG",
+        ),
+        (
+            tiny_tdpg,
+            lambda: make_vec_env("Pendulum-v1", 4),
+            r"observation_space is Box\(-inf.*environment's is Box\(\[",
+        ),
+    ],
+    ids=["another algorithm", "another environment"],
+)
+def test_a_report_of_what_does_not_fit_is_refused(model, env, message):
+    with pytest.raises(ValueError, match=message):
+        information_report(model(), env(), n_episodes=40)
+
+
+@pytest.mark.parametrize("callback", [InformationCallback(), SelectionCallback(cost_limit=1.0)])
+def test_a_callback_of_tdpg_refuses_other_algorithms(callback):
+    model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match=f"{type(callback).__name__} is for TDPG.*PPO"):
+        model.learn(8, callback=callback)
 
 
 def test_rounds_of_episodes_differ():

@@ -165,6 +165,10 @@ def test_only_living_episodes_count_and_a_step_with_too_few_has_no_interval():
     dead = batch._replace(trvs=th.where(batch.alive[..., None], batch.trvs, math.nan))
     np.testing.assert_array_equal(information_interval(dead).upper, interval.upper)
     assert interval.total[1] == pytest.approx(interval.upper[has_any].sum())
+    assert interval.n_left_out == (~has_any).sum() == 1
+    # Nothing is left out of a sum after the last episode has ended.
+    ended = information_interval(batch._replace(alive=batch.alive & (th.arange(4) < 3)[:, None]))
+    assert (ended.n_left_out, ended.n_episodes[3]) == (0, 0)
 
 
 def test_a_higher_confidence_is_a_wider_interval():

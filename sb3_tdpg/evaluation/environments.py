@@ -64,13 +64,18 @@ def check_models_fit(models: Mapping[str, Any], scenarios: Sequence[Scenario]) -
             except Exception as e:
                 raise ValueError(f"scenario {scenario.name!r} ({scenario.env_id}) cannot be made: {e}") from e
             try:
-                _check_fits(label, model, scenario, env)
+                check_env_fits(model, env, f"model {label!r}", f"scenario {scenario.name!r} ({scenario.env_id})")
             finally:
                 env.close()
 
 
-def _check_fits(label: str, model: Any, scenario: Scenario, env: VecEnv) -> None:
-    where = f"model {label!r} does not fit scenario {scenario.name!r} ({scenario.env_id})"
+def check_env_fits(model: Any, env: VecEnv, model_name: str = "the model", env_name: str = "the environment") -> None:
+    """
+    Compare spaces and horizon of an environment with those that a model was trained with.
+
+    :raises ValueError: if they differ.
+    """
+    where = f"{model_name} does not fit {env_name}"
     for name in ("observation_space", "action_space"):
         expected, given = getattr(model, name, None), getattr(env, name)
         if expected != given:

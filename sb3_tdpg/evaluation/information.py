@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
 from sb3_tdpg.evaluation.knowledge import state_knowledge
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
@@ -33,6 +33,7 @@ from sb3_tdpg.information import (
     trust_checks,
 )
 from sb3_tdpg.information.loo import log_density_matrix
+from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import read_problem
 
 if TYPE_CHECKING:
@@ -82,9 +83,11 @@ class InformationReport:
 
     def __str__(self) -> str:
         lower, upper = self.interval.total
+        n_left_out = self.interval.n_left_out
+        left_out = f", {n_left_out} steps with too few of them left out" if n_left_out else ""
         return (
             f"I[x_t; x~_t], summed over time: {lower:.2f} to {upper:.2f} nat "
-            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes); {self.badge}"
+            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes{left_out}); {self.badge}"
         )
 
 
@@ -106,8 +109,12 @@ def information_report(
     :param seed: Of the episodes, the policy's sampling and the estimates.
     :param names: Of the components of the state; default: the environment's ``state_names``, or ``x0``, ``x1``, ...
     :param at_end: Called at the end of each of the three ``ESTIMATES``.
-    :raises ValueError: if there are too few episodes for an interval at any time step, or the names do not fit.
+    :raises ValueError: if model and environment do not fit, there are too few episodes for an interval at any time
+        step, or the names do not fit.
     """
+    if not isinstance(model.policy, TRVPolicy):
+        raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: give one of TDPG")
+    check_env_fits(model, env)
     names = read_problem(env).state_names if names is None else names
     batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
     at_end = at_end or (lambda: None)

@@ -70,8 +70,13 @@ class InformationInterval:
 
     @property
     def total(self) -> tuple[float, float]:
-        """Sums of the lower and of the upper limits over the time steps that have any."""
+        """Sums of the lower and of the upper limits over the time steps that have any; see :attr:`n_left_out`."""
         return float(np.nansum(self.lower)), float(np.nansum(self.upper))
+
+    @property
+    def n_left_out(self) -> int:
+        """Time steps at which some episodes are alive, but too few for limits: no part of :attr:`total`."""
+        return int(((self.n_episodes > 0) & np.isnan(self.upper)).sum())
 
 
 def normal_quantile(miss: float) -> float:
