@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.cli import main
+from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
@@ -288,6 +290,36 @@ BAD = {
     "severity": (["{pg}"], {"--severities": "6"}, "some of 1 to 5"),
     "seed": (["{pg}"], {"--seed": "-1"}, "seed=-1 must be"),
 }
+
+
+@pytest.mark.parametrize(
+    "models, env_id, message",
+    [
+        ([], "Lava-v0", "models=\\[\\] must be a dictionary"),
+        ({}, "Lava-v0", "models is empty"),
+        ({"A": []}, "Lava-v0", "models\\['A'\\] is empty"),
+        ({"A": "nothing.zip"}, LavaEnv(), "must be the id of an environment: gymnasium.register"),
+    ],
+)
+def test_what_is_no_model_or_no_id_is_refused(models, env_id, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        robustness_report(models, env_id, out=tmp_path)
+
+
+def test_a_training_seed_counts_once(folder, tmp_path, capsys):
+    shutil.copy(folder / "pg-seed0" / "model.zip", tmp_path / "copy.zip")
+    models = [f"A={folder}/pg-seed0/model.zip", f"A={folder}/pg-seed1/model.zip", f"A={tmp_path}/copy.zip"]
+    assert main(["report", *models, "--env", "Lava-v0", "--out", str(tmp_path / "out")]) == 2
+    assert "models 0 and 2 of 'A' are the same policy" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_and_a_perturbation_may_be_texts(tmp_path):
+    text = robustness_report(
+        {"A": tiny_tdpg()}, "Lava-v0", out=str(tmp_path), perturbations="vector_bias", severities=[2], scenarios=(),
+        n_episodes=3, progress_bar=False,
+    )  # fmt: skip
+    assert (tmp_path / "report.md").read_text() == text
 
 
 @pytest.mark.parametrize("models, options, message", BAD.values(), ids=BAD)

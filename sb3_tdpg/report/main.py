@@ -46,9 +46,9 @@ def robustness_report(
     models: Mapping[str, Any],
     env_id: str,
     *,
-    out: Path,
+    out: str | Path,
     env_kwargs: Mapping[str, Any] | None = None,
-    perturbations: Sequence[str] | None = None,
+    perturbations: str | Sequence[str] | None = None,
     severities: Sequence[int] = (1, 2, 3, 4, 5),
     scenarios: Sequence[Scenario] | None = None,
     n_episodes: int | None = None,
@@ -85,6 +85,8 @@ def robustness_report(
     :raises ImportError: without the extra ``plots``.
     """
     _import_extra()
+    out = Path(out)
+    perturbations = [perturbations] if isinstance(perturbations, str) else perturbations
     sources = _sources(models)
     check_registered(env_id)
     kwargs = default_env_kwargs(env_id, env_kwargs)
@@ -108,6 +110,7 @@ def robustness_report(
         scale=scale,
         models={label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()},
     )
+    _check_different(config["models"], sources)
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
@@ -132,6 +135,11 @@ def robustness_report(
 
 def _sources(models: Mapping[str, Any]) -> dict[str, list[Source]]:
     """Make lists, and paths of texts."""
+    if not isinstance(models, Mapping):
+        raise ValueError(
+            f"models={models!r} must be a dictionary of models by method, for instance "
+            "{'PG': [pg_0, pg_1], 'TDPG': [tdpg_0, tdpg_1]}"
+        )
     if not models:
         raise ValueError("models is empty: give at least one, for instance {'TDPG': ['runs/tdpg-seed0/model.zip']}")
     sources = {}
@@ -169,6 +177,18 @@ def _check_fit(models: Mapping[str, Sequence[Any]], rows: Sequence[Row]) -> None
         check_models_fit(named, [rows[0].scenario])
     label, (first, *_) = next(iter(models.items()))
     check_models_fit({label: first}, [row.scenario for row in rows[1:] if row.kind in ("own", "scene")])
+
+
+def _check_different(fingerprints: Mapping[str, Sequence[str]], sources: Mapping[str, Sequence[Source]]) -> None:
+    """Refuse a policy that is there twice: it is one training seed, and would make intervals too narrow."""
+    for label, prints in fingerprints.items():
+        for number, each in enumerate(prints):
+            if (before := prints.index(each)) != number:
+                first, second = (_name(sources[label][i]) for i in (before, number))
+                raise ValueError(
+                    f"models {before} and {number} of {label!r} are the same policy ({first}, {second}): a training "
+                    "seed counts once"
+                )
 
 
 def _firsts(models: Mapping[str, Sequence[Any]]) -> list[tuple[int, str, Any]]:
@@ -238,6 +258,8 @@ def _measure(
     lower, upper = report.interval.total
     trust = "all checks passed" if report.badge.passed else "**not to be trusted**: a check failed"
     text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over an episode's time steps ({trust})."
+    if n_left_out := report.interval.n_left_out:
+        text += f" **Left out**: {n_left_out} time steps to which too few of the {N_INFORMATION} episodes last."
     return Knowledge(label, text, report.badge.markdown(), figures)
 
 

@@ -171,6 +171,8 @@ def check_registered(env_id: str) -> None:
 
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     """
+    if not isinstance(env_id, str):
+        raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
     module, _, bare_id = env_id.rpartition(":")
     try:
         if module:
