@@ -4,12 +4,13 @@ import json
 import re
 import shutil
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 from gymnasium import spaces
 from scipy.stats import binomtest, mannwhitneyu, trim_mean
-from small_problems import tiny_tdpg
+from small_problems import CountdownEnv, tiny_tdpg
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -63,6 +64,8 @@ def test_the_page_and_its_files(report):
     assert {"figures/degradation.png", "figures/examples.png", "figures/comparison.png"} < set(pictures)
     assert all((out / picture).stat().st_size > 1000 for picture in pictures)
     assert not list(out.rglob("*.partial"))
+    assert "| vector_noise | noise on every component | standard deviation, scales | 0.1 | 0.8 |" in page
+    assert "A scale is how much a component" in page
 
 
 def test_the_html_needs_no_other_file(report):
@@ -272,6 +275,7 @@ def test_images_get_a_gallery_and_a_scene(tmp_path):
     )  # fmt: skip
     assert "figures/examples.png" in text
     assert "renderer='fast'" in text
+    assert "| camera_pose | the environment is made otherwise | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
     assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
 
@@ -290,6 +294,25 @@ BAD = {
     "severity": (["{pg}"], {"--severities": "6"}, "some of 1 to 5"),
     "seed": (["{pg}"], {"--seed": "-1"}, "seed=-1 must be"),
 }
+
+
+class FirstEpisodeEnv(CountdownEnv):
+    """All episodes go through the same states."""
+
+    def reset(self, **kwargs):
+        self.episode = -1
+        return super().reset(**kwargs)
+
+
+def test_there_is_a_page_where_the_information_cannot_be_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    gym.register("Countdown-v0", FirstEpisodeEnv, kwargs=dict(name=0, lengths=(2,)))
+    text = robustness_report(
+        {"A": tiny_tdpg("Countdown-v0")}, "Countdown-v0", out=tmp_path, perturbations=["vector_bias"],
+        severities=[2], n_episodes=3, progress_bar=False,
+    )  # fmt: skip
+    assert "not measured: the frame has no component" in text
+    assert (tmp_path / "report.html").exists()
 
 
 @pytest.mark.parametrize(

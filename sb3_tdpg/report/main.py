@@ -101,6 +101,8 @@ def robustness_report(
     _check_fit(loaded, rows)
     n_episodes = n_episodes or N_EPISODES["image" if shows_images(space) else "vector"]
     plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
+    fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
+    _check_different(fingerprints, sources)
     config = dict(
         env_id=env_id,
         env_kwargs=kwargs,
@@ -108,9 +110,8 @@ def robustness_report(
         seed=seed,
         deterministic=deterministic,
         scale=scale,
-        models={label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()},
+        models=fingerprints,
     )
-    _check_different(config["models"], sources)
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
@@ -119,6 +120,11 @@ def robustness_report(
     numbers = make_numbers(records, seed=seed)
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     page = Page(env_id, kwargs, n_episodes, deterministic, names)
+    page.severities = {
+        row.perturbation: [each for each in rows if each.perturbation == row.perturbation]
+        for row in rows
+        if row.kind in ("sensor", "scene")
+    }
     page.figures = _draw(numbers, plan, rows, loaded, space, out)
     page.knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
     how = provenance()
@@ -252,9 +258,12 @@ def _measure(
     if not isinstance(model, TDPG):
         return Knowledge(label, f"not measured: {type(model).__name__} has no task-relevant variables.")
     env = scenario_env(row.scenario, model, n_episodes=N_INFORMATION)
-    with contextlib.closing(env):
-        report = information_report(model, env, N_INFORMATION, plan.seed, at_end=at_end)
-    figures = [_save(figure, out, f"information-{number}-{name}") for name, figure in report.figures().items()]
+    try:
+        with contextlib.closing(env):
+            report = information_report(model, env, N_INFORMATION, plan.seed, at_end=at_end)
+        figures = [_save(figure, out, f"information-{number}-{name}") for name, figure in report.figures().items()]
+    except ValueError as e:  # a state that never varies, say: the rows are worth a page without it
+        return Knowledge(label, f"not measured: {e}.")
     lower, upper = report.interval.total
     trust = "all checks passed" if report.badge.passed else "**not to be trusted**: a check failed"
     text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over an episode's time steps ({trust})."

@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdpg.report.numbers import CLEAR, MIN_CLEAR, Numbers
-from sb3_tdpg.report.rows import ALL, UNPERTURBED
+from sb3_tdpg.report.rows import ALL, UNPERTURBED, Row
+from sb3_tdpg.robustness.registry import find
 
 MIN_SEEDS = 5
 """With fewer models of a method its interval says little."""
@@ -28,6 +29,7 @@ class Page:
     :param deterministic: Whether the policies act without noise.
     :param sources: What the models of each method are called.
     :param figures: File by name: ``degradation``, ``own_rows``, ``comparison``, ``examples``.
+    :param severities: By perturbation, its rows.
     :param knowledge: What is known of each method's information.
     :param made: How the page was made, in a sentence.
     """
@@ -38,6 +40,7 @@ class Page:
     deterministic: bool
     sources: Mapping[str, Sequence[str]]
     figures: Mapping[str, str] = field(default_factory=dict)
+    severities: Mapping[str, Sequence[Row]] = field(default_factory=dict)
     knowledge: Sequence[Knowledge] = ()
     made: str = ""
 
@@ -95,6 +98,8 @@ def write_page(numbers: Numbers, page: Page) -> str:
             "The same moment or episode, as it is and as each perturbation shows it, in rising severity.",
             _image("observations under each perturbation", page.figures["examples"]),
         ]
+    if page.severities:
+        parts += ["What happens, and by how much:", severities_table(page)]
     parts += _information(page)
     if numbers.perturbations:
         parts += ["## Every severity", "Cost and its 95 % interval.", levels_table(numbers)]
@@ -176,7 +181,8 @@ def _verdicts(numbers: Numbers, label: str) -> list[str]:
         ]
     lines = []
     if names:
-        text = f"**{ours} against {theirs}**: it costs {_counts(frame.loc[names, 'cost'], 'under', 'perturbation')}."
+        counts = _counts(frame.loc[names, "cost"], "under", "perturbation")
+        text = f"**{ours} against {theirs}**, the mean over severities: it costs {counts}."
         if ALL in frame.index:
             p = _probability(frame.loc[ALL], "p_cost")
             text += f" Over all perturbations, a model of {ours} costs less than one of {theirs} with probability {p}."
@@ -299,6 +305,28 @@ def levels_table(numbers: Numbers) -> str:
     return _table(["perturbation", "method", *map(str, severities)], rows)
 
 
+def severities_table(page: Page) -> str:
+    """Return a table of what the perturbations are, and what their severities stand for."""
+    severities = sorted({row.severity for rows in page.severities.values() for row in rows})
+    lines = []
+    for name, rows in page.severities.items():
+        if rows[0].kind == "sensor":
+            what, parameter = find(name).summary, find(name).parameter
+            values = [f"{row.value:g}" for row in rows]
+        else:
+            changed = [
+                {key: value for key, value in row.scenario.env_kwargs.items() if page.env_kwargs.get(key) != value}
+                for row in rows
+            ]
+            what, parameter = "the environment is made otherwise", ", ".join(f"`{key}`" for key in changed[0])
+            values = [", ".join(map(str, each.values())) for each in changed]
+        lines.append([_text(name), what, parameter, *values])
+    table = _table(["perturbation", "what happens", "parameter", *map(str, severities)], lines)
+    if any("scales" in line[2] for line in lines):
+        table += "\n\nA scale is how much a component of the observations varies: its standard deviation."
+    return table
+
+
 def _comparisons(numbers: Numbers, page: Page) -> list[str]:
     if numbers.comparisons.empty or numbers.comparisons["p_cost"].isna().all():
         return []
@@ -328,7 +356,8 @@ def _information(page: Page) -> list[str]:
         "## What the policies know",
         "Of the first model of each method, unperturbed: an interval that holds the information in its task-relevant "
         "variables about the true state at each time step, what they know at least of each component of the state, and "
-        "whether the checks of these numbers passed.",
+        "whether the checks of these numbers passed. In the map a component is grey where it does not vary (or too few "
+        "episodes last so long), and its number in brackets where it cannot be told from 0.",
     ]
     for each in page.knowledge:
         parts += [f"### {_text(each.label)}", each.text]
