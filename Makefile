@@ -79,7 +79,7 @@ reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a
 	$(PY) -m sb3_tdpg reproduce grasp-camera --out results/panda_grasp_camera --publish docs/results/panda_grasp_camera
 
 reproduce-peers: $(STAMP) ## PPO, RecurrentPPO, weight decay, VIB and augmented images beside TDPG, on all three environments
-	$(PY) -m sb3_tdpg reproduce peers --n-ball-seeds 2 --out results/peers --publish docs/results/peers
+	$(PY) -m sb3_tdpg reproduce peers --n-grasp-seeds 2 --out results/peers --publish docs/results/peers
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

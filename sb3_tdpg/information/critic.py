@@ -50,7 +50,7 @@ class Pairing:
 
 class CriticEstimator(InformationEstimator):
     """
-    T critics F^theta_t(x_t, x~_t) as one batched network (alg:mine), fitted to each epoch's rollouts.
+    T critics F^theta_t(x_t, x~_t) as one batched network (Algorithm 1, alg:mine), fitted to each epoch's rollouts.
 
     A subclass says which bound the scores make (:meth:`_bound`), and, where the critic is trained on something else
     than the bound itself, on what (:meth:`_objective`).
@@ -158,7 +158,7 @@ class CriticEstimator(InformationEstimator):
         return Scores(values[:, :n], values[:, n:].unflatten(1, (n, -1)))
 
     def fit(self, batch: InformationBatch) -> dict[str, float]:
-        """Train the critics on the epoch's samples (alg:mine); see :class:`InformationEstimator`."""
+        """Train the critics on the epoch's samples (Algorithm 1, alg:mine); see :class:`InformationEstimator`."""
         train, held_out = self._hold_out(batch)
         states, trvs = train.states.detach(), train.trvs.detach()
         if self.standardize:

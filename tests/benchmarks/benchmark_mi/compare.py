@@ -6,7 +6,7 @@ From the repository's root, in the project's environment (``generate.py`` tells 
     python tests/benchmarks/benchmark_mi/compare.py
     python tests/benchmarks/benchmark_mi/compare.py --table-only
 
-It takes two and a half minutes of one core, and prints the tables of docs/results/benchmark_mi.md.
+It takes two minutes of one core, and prints the tables of docs/results/benchmark_mi.md.
 """
 
 from __future__ import annotations

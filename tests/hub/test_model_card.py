@@ -1,0 +1,203 @@
+"""The card of a published model: what it tells, what lies beside it, and what is refused."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from published_cards import REPO_ID, blocks, costs_of, text_of
+from small_problems import assert_same_parameters, parameters, tiny_tdpg, train_epochs
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.envs.scenarios import LAVA, Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.hub import pull_from_hub, write_model_card
+from sb3_tdpg.model_card import results_with_intervals
+from sb3_tdpg.publication import Publication, read_run
+from sb3_tdpg.rerun import rerun
+
+huggingface_hub = pytest.importorskip("huggingface_hub")
+
+
+def test_the_metadata_has_the_mean_of_the_records_and_the_training_environment_first(card):
+    data = huggingface_hub.ModelCard.load(card / "README.md").data
+    assert data.library_name == "stable-baselines3"
+    assert {"Lava-v0", "reinforcement-learning", "deep-reinforcement-learning", "stable-baselines3"} <= set(data.tags)
+    assert data.model_name == "TDPG"
+    assert [result.dataset_config for result in data.eval_results] == ["Training", "Sensor noise 1e-3"]
+    for result in data.eval_results:
+        mean, std = map(float, result.metric_value.split(" +/- "))
+        costs = costs_of(card, result.dataset_config)
+        assert mean == pytest.approx(-costs.mean(), abs=0.005)
+        assert std == pytest.approx(costs.std(), abs=0.005)
+
+
+def test_the_metadata_is_what_the_hub_reads_of_other_stable_baselines3_models(card):
+    data = huggingface_hub.repocard.metadata_load(card / "README.md")
+    first = data["model-index"][0]["results"][0]
+    expected = huggingface_hub.metadata_eval_result(
+        model_pretty_name="TDPG",
+        task_pretty_name="reinforcement-learning",
+        task_id="reinforcement-learning",
+        metrics_pretty_name="mean_reward",
+        metrics_id="mean_reward",
+        metrics_value=first["metrics"][0]["value"],
+        dataset_pretty_name="Lava-v0",
+        dataset_id="Lava-v0",
+        dataset_config="Training",
+    )["model-index"][0]["results"][0]
+    expected["metrics"][0].pop("verified")  # by the Hub's own evaluation service
+    assert first == expected
+
+
+def test_the_table_has_the_95_percent_interval_of_every_scenario(card):
+    rows = re.findall(r"^\| (.*?) \| .* \| 30 \| (\S+) \[(\S+), (\S+)\] \|", text_of(card), re.MULTILINE)
+    assert [row[0] for row in rows] == ["Training", "Sensor noise 1e-3"]
+    for name, *numbers in rows:
+        costs = costs_of(card, name)
+        half = 2.045230 * costs.std() / np.sqrt(30)  # Student's t with 29 degrees of freedom
+        expected = [costs.mean(), costs.mean() - half, costs.mean() + half]
+        np.testing.assert_allclose([float(x) for x in numbers], expected, atol=0.0051)
+    assert "`sensor_noise_std=0.03162`" in text_of(card)
+
+
+def test_everything_that_the_card_refers_to_lies_beside_it(card):
+    links = re.findall(r"\]\((?!https:)([^)]*)\)", text_of(card))
+    assert "training.png" in links
+    assert "episodes.csv" in links
+    assert all((card / link).is_file() for link in links)
+    assert (card / "training.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_card_tells_seed_commit_versions_settings_and_which_policy_it_is(card, runs):
+    text, config = text_of(card), json.loads((runs / "tdpg-seed0" / "config.json").read_text())
+    assert "training seed: 0\n" in text
+    assert f"torch {config['provenance']['versions']['torch']}" in text
+    if config["provenance"]["git"] is not None:
+        assert config["provenance"]["git"]["commit"] in text
+    (settings,) = blocks(card, "yaml")
+    read = json.loads(json.dumps(yaml.safe_load(settings)))
+    assert read == config["settings"] == json.loads(json.dumps(yaml.safe_load((card / "config.yml").read_text())))
+    epoch = json.loads((runs / "tdpg-seed0" / "selected.json").read_text())["epoch"]
+    assert f"The policy is that of epoch {epoch}," in text
+    assert "from the policy of another run, pg-seed0" in text
+
+
+def test_the_command_of_a_user_is_told_and_that_of_a_worker_process_is_not(runs, tmp_path):
+    folder = runs / "pg-seed0"
+    config = json.loads((folder / "config.json").read_text())
+    for i, (command, told) in enumerate(
+        (
+            ("python -m sb3_tdpg demo --out 'my results'", "python -m sb3_tdpg demo --out 'my results'"),
+            ("/home/me/venv/bin/python train.py", "python train.py"),
+            ("/home/me/venv/bin/python3 /home/me/venv/bin/sb3-tdpg train --env a", "sb3-tdpg train --env a"),
+            ("python -c 'from multiprocessing.spawn import spawn_main; spawn_main()' --multiprocessing-fork", None),
+        )
+    ):
+        copy = tmp_path / f"run{i}"
+        copy.mkdir()
+        for name in ("model.zip", "episodes.csv", "progress_00000000.csv"):
+            (copy / name).write_bytes((folder / name).read_bytes())
+        config["provenance"]["command"] = command
+        (copy / "config.json").write_text(json.dumps(config))
+        assert read_run(copy).command == told
+        written = write_model_card(copy, tmp_path / f"card{i}", REPO_ID)
+        assert (f"```bash\n{told}\n```" in text_of(written)) == (told is not None)
+        assert "spawn_main" not in text_of(written)
+
+
+def test_a_model_in_memory_is_published_with_its_records(tmp_path):
+    model = train_epochs(tiny_tdpg(), 2)
+    rows = [Scenario("Wide", "Lava-v0", dict(sensor_noise_std=0.5)), LAVA[0]]
+    records = evaluate_scenarios({"mine": model}, rows, 5, deterministic=True)
+    settings = dict(beta=float("inf"), learning_rate=np.float64(0.5), env_kwargs=dict(sensor_noise_std=0.5))
+    publication = Publication(
+        model=model, env_id="sb3_tdpg:Lava-v0", records=records, scenarios=rows, method="mine", settings=settings
+    )
+    card = write_model_card(publication, tmp_path / "card", REPO_ID, film_episodes=0)
+    loaded = TDPG.load(card / "tdpg-Lava-v0.zip", device="cpu")
+    assert_same_parameters(parameters(loaded.policy), parameters(model.policy))
+    assert yaml.safe_load((card / "config.yml").read_text()) == dict(
+        beta=float("inf"), learning_rate=0.5, env_kwargs=dict(sensor_noise_std=0.5)
+    )
+    text = text_of(card)
+    assert "Deterministic policy" in text
+    assert "| Wide |  | 5 |" in text, "it is the training environment"
+    assert "training.png" not in text
+    assert huggingface_hub.ModelCard(text).data.eval_results[0].dataset_config == "Training"
+    with pytest.raises(ValueError, match="does not describe a run"):
+        rerun(card / "config.json", tmp_path / "again")
+
+
+def test_shares_of_failures_have_wilsons_interval():
+    records = pd.DataFrame(
+        dict(model="PG", scenario="Training", cost=[0.0] * 10, failure=[False] * 10, seed=0, deterministic=False)
+    )
+    row = results_with_intervals(records).iloc[0]
+    assert (row["failure_low"], row["failure_high"]) == (pytest.approx(0), pytest.approx(0.27753, abs=1e-5))
+    records["failure"] = [True] + [False] * 9
+    row = results_with_intervals(records).iloc[0]
+    assert (row["failure_low"], row["failure_high"]) == (
+        pytest.approx(0.01788, abs=1e-5),
+        pytest.approx(0.40415, abs=1e-5),
+    )
+
+
+def test_the_film_of_some_episodes_lies_beside_the_card(runs, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    card = write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=1)
+    assert b"ftyp" in (card / "replay.mp4").read_bytes()[:12]
+    assert "[replay.mp4](replay.mp4)" in text_of(card)
+
+
+@pytest.mark.parametrize("missing", ["config.json", "model.zip", "episodes.csv"])
+def test_what_is_not_finished_is_refused_and_nothing_is_written(missing, runs, tmp_path):
+    copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
+    (copy / missing).unlink()
+    message = "holds no training" if missing == "config.json" else f"no finished run, since {missing} is missing"
+    with pytest.raises(ValueError, match=message):
+        write_model_card(copy, tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_records_that_are_not_of_one_policy_are_refused(runs, tmp_path):
+    run = read_run(runs / "pg-seed0")
+    for records, message in (
+        (pd.concat([run.records, run.records.assign(train_seed=7)]), r"the records are of train_seed \[0, 7\]"),
+        (pd.concat([run.records, run.records.assign(model="TDPG")]), r"the records are of model \['PG', 'TDPG'\]"),
+        (run.records[:31], "at least 2 episodes of each scenario"),
+        (run.records[:0], "at least 2 episodes of each scenario"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_model_card(replace(run, records=records), tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_a_damaged_model_is_refused_and_no_card_is_written(runs, tmp_path):
+    damaged = tmp_path / "model.zip"
+    damaged.write_bytes(b"no zip")
+    with pytest.raises(ValueError, match="wasn't a zip-file"):
+        write_model_card(replace(read_run(runs / "pg-seed0"), model=damaged), tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_a_card_that_could_not_be_finished_does_not_stand_in_the_way(runs, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("sb3_tdpg.hub.card_text", Mock(side_effect=KeyboardInterrupt))
+        write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+    write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
+    assert [path.name for path in tmp_path.iterdir()] == ["card"]
+
+
+def test_a_folder_with_something_in_it_is_left_alone(card, runs, tmp_path):
+    before = {path: path.read_bytes() for path in card.rglob("*") if path.is_file()}
+    for refused in (lambda: write_model_card(runs / "pg-seed0", card, REPO_ID), lambda: pull_from_hub(REPO_ID, card)):
+        with pytest.raises(ValueError, match="exists already: choose another folder, or remove it"):
+            refused()
+    assert {path: path.read_bytes() for path in card.rglob("*") if path.is_file()} == before

@@ -1,0 +1,49 @@
+"""A published run, made again by the command in its card."""
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from published_cards import blocks
+from small_problems import assert_same_parameters, parameters
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.rerun import main as rerun_main
+from sb3_tdpg.rerun import rerun
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def test_the_command_in_the_card_makes_the_run_again(card, runs, tmp_path):
+    copy = shutil.copytree(card, tmp_path / "copy")  # with the policy to start from in it
+    program, *arguments = shlex.split(blocks(copy, "bash")[-1])
+    assert program == "python"
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, *arguments], cwd=copy, check=True, env=environment)
+    assert (copy / "again" / "episodes.csv").read_bytes() == (runs / "tdpg-seed0" / "episodes.csv").read_bytes()
+    first, second = (TDPG.load(f / "model.zip", device="cpu") for f in (runs / "tdpg-seed0", copy / "again"))
+    assert_same_parameters(parameters(first.policy), parameters(second.policy))
+
+
+def test_a_rerun_keeps_to_the_recorded_settings_whatever_became_of_the_block(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_tdpg.runs.load_hyperparams", lambda block: pytest.fail("it reads the block"))
+    rerun(runs / "pg-seed0" / "config.json", tmp_path / "again", progress_bar=False)
+    assert (tmp_path / "again" / "episodes.csv").read_bytes() == (runs / "pg-seed0" / "episodes.csv").read_bytes()
+    assert TDPG.load(tmp_path / "again" / "model.zip", device="cpu").mi_coef == 0  # beta is inf, and not a text
+
+
+def test_a_rerun_without_the_very_policy_it_started_from_is_refused(card, runs, tmp_path, capsys):
+    shutil.copy(card / "config.json", tmp_path)
+    with pytest.raises(ValueError, match="is not trained yet: put the run's own there"):
+        rerun(tmp_path / "config.json", tmp_path / "again")
+    (tmp_path / "pg-seed0").mkdir()
+    shutil.copy(runs / "tdpg-seed0" / "model.zip", tmp_path / "pg-seed0")  # another one
+    assert rerun_main([str(tmp_path / "config.json"), str(tmp_path / "again")]) == 2
+    assert capsys.readouterr().err.startswith("error: the run started from the policy ")
+    with pytest.raises(ValueError, match=r"nothing.json does not describe a run"):
+        rerun(tmp_path / "nothing.json", tmp_path / "again")
+    assert not (tmp_path / "again").exists()

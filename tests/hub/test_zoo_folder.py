@@ -1,0 +1,112 @@
+"""A card of what the zoo's train leaves, and of our own folders: which policy it is, and how it was trained."""
+
+import json
+import re
+import shutil
+import sys
+import zipfile
+
+import pandas as pd
+import pytest
+import yaml
+from published_cards import REPO_ID, text_of
+from small_problems import lava_env
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.evaluation import evaluate_scenarios, provenance
+from sb3_tdpg.hub import write_model_card
+from sb3_tdpg.publication import read_publication
+
+
+@pytest.fixture(scope="module")
+def zoo_folder(tmp_path_factory):
+    """What the zoo's train leaves of a training on normalised observations, with the evaluations of a callback."""
+    pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
+    import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    folder = tmp_path_factory.mktemp("zoo")
+    block = dict(
+        policy="TRVPolicy",
+        n_timesteps=500,
+        n_envs=2,
+        n_episodes=20,
+        beta=float("inf"),
+        normalize=dict(norm_obs=True, norm_reward=False),
+        env_kwargs=dict(action_cost=1.0),
+    )
+    (folder / "conf.yml").write_text(yaml.safe_dump({"Lava-v0": block}))
+    flags = f"train --algo tdpg --env Lava-v0 --seed 3 -f {folder}/logs --conf-file {folder}/conf.yml --eval-freq 100"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(rl_zoo3.ALGOS, "tdpg", TDPG)
+        # Another test may have called register() in this process.
+        patch.setattr(rl_zoo3.train, "ExperimentManager", ExperimentManager)
+        patch.setattr(sys, "argv", flags.split())
+        rl_zoo3.train.train()
+    return folder / "logs" / "tdpg" / "Lava-v0_1"
+
+
+def test_a_folder_of_the_zoo_is_evaluated_and_told_of(zoo_folder, tmp_path):
+    card = write_model_card(zoo_folder, tmp_path / "card", REPO_ID, n_eval_episodes=10, seed=5, scenarios=LAVA[:2])
+    records = pd.read_csv(card / "episodes.csv")
+    assert records.groupby("scenario").size().to_dict() == {"Training": 10, "Sensor noise 1e-3": 10}
+
+    statistics = zoo_folder / "Lava-v0" / "vecnormalize.pkl"
+    assert (card / "vec_normalize.pkl").read_bytes() == statistics.read_bytes()
+    env = VecNormalize.load(str(statistics), lava_env(1))
+    model = TDPG.load(card / "tdpg-Lava-v0.zip", env=env, device="cpu")
+    by_hand = evaluate_scenarios(model, LAVA[:2], 10, seed=5, env_kwargs=dict(action_cost=1.0))
+    assert records["cost"].to_numpy() == pytest.approx(by_hand["cost"].to_numpy())
+    assert "VecNormalize.load" in text_of(card)
+
+    for name in ("args.yml", "config.yml", "command.txt"):
+        assert (card / name).read_bytes() == (zoo_folder / "Lava-v0" / name).read_bytes()
+    with zipfile.ZipFile(card / "train_eval_metrics.zip") as archive:
+        assert set(archive.namelist()) == {"0.monitor.csv", "1.monitor.csv", "evaluations.npz"}
+    text = text_of(card)
+    assert "gym.make('Lava-v0', action_cost=1.0)" in text
+    assert "training seed: 3\n" in text
+    assert re.search(r"versions: Python \d.*PyTorch \d", text)
+    # The zoo's own program leaves the last policy, whatever a selection has chosen.
+    assert "the policy is the one of the end of the training." in text
+    assert "The policy is that of" not in text
+    assert (card / "training.png").exists()
+
+
+def test_the_training_of_the_zoo_is_drawn_by_its_monitors(zoo_folder):
+    progress = read_publication(zoo_folder, n_eval_episodes=2, scenarios=LAVA[:1]).progress
+    rewards = load_results(str(zoo_folder))["r"].to_numpy()
+    assert len(rewards) == 100
+    assert progress["time/iterations"].tolist() == [1, 2, 3, 4, 5]
+    assert progress["rollout/ep_cost_mean"].to_numpy() == pytest.approx(-rewards.reshape(5, 20).mean(axis=1))
+
+
+def test_a_folder_of_the_zoo_without_its_last_policy_gives_the_best_one(zoo_folder, tmp_path):
+    copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
+    (copy / "Lava-v0.zip").unlink()
+    publication = read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1])
+    assert publication.model == copy / "best_model.zip"
+    assert "did best" in publication.notes[0]
+    (copy / "best_model.zip").unlink()
+    with pytest.raises(ValueError, match=r"neither Lava-v0.zip nor best_model.zip: let the training end first"):
+        read_publication(copy)
+
+
+def test_the_card_of_a_folder_of_ours_says_which_policy_it_is(zoo_folder, tmp_path):
+    copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
+    (copy / "selected.json").write_text(json.dumps(dict(epoch=3, cost=17.0, information=0.5)))
+
+    def notes():
+        return " ".join(read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1]).notes)
+
+    assert "the policy is the one of the end" in notes()  # the zoo's own program leaves the last one
+    assert "epoch 3" not in notes()
+    (copy / "run.json").write_text(json.dumps(dict(provenance=provenance())))
+    assert "The policy is that of epoch 3, which the selection chose" in notes()
+    assert "of the end" not in notes()
+    (copy / "checkpoint.zip").touch()  # interrupted
+    assert "the policy is the one of the end" in notes()
+    assert "epoch 3" not in notes()
