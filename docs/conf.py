@@ -1,20 +1,26 @@
 """Sphinx configuration: MyST Markdown, the Read the Docs theme, and docstrings of the code itself."""
 
 import re
+import unicodedata
 from pathlib import Path
 
 from docutils import nodes
 from docutils.parsers.rst.directives.images import Figure
+from latex2mathml.converter import convert as latex_to_mathml
 from sphinx.application import Sphinx
+from sphinx.util.logging import getLogger
+from sphinx.writers.html5 import HTML5Translator
 
 import sb3_tdpg
+
+logger = getLogger(__name__)
 
 project = "sb3_tdpg"
 author = "the sb3_tdpg developers"
 copyright = f"2026, {author}"
 release = version = sb3_tdpg.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
 exclude_patterns = ["_build", "results/*/*"]  # what is in there is included by the pages beside it
 nitpicky = True  # a reference that leads nowhere is a warning, and with -W an error
 nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium|pathlib)\..*")]  # their pages are elsewhere
@@ -31,6 +37,7 @@ copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
 html_theme = "sphinx_rtd_theme"
+html_math_renderer = "mathml"
 html_theme_options = {"navigation_depth": 3}
 html_static_path = ["_static"]
 html_css_files = ["custom.css"]
@@ -50,6 +57,31 @@ def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
                 text.parent.replace(text, nodes.Text(kept))
 
 
+# Browsers take a letter's alphabet from the letter, and not from mathvariant, which the converter writes.
+LETTER = re.compile(r'mathvariant="(double-struck|script|monospace)">([A-Za-z])(?=<)')
+
+
+def in_its_alphabet(match: re.Match[str]) -> str:
+    """Put the letter of an alphabet in the place of a plain letter that is marked as one of it."""
+    alphabet, letter = match[1].upper(), match[2]
+    name = f"{alphabet} {'CAPITAL' if letter.isupper() else 'SMALL'} {letter.upper()}"
+    return f">{unicodedata.lookup(f'MATHEMATICAL {name}')}"
+
+
+def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
+    """Write a formula as MathML, which browsers draw by themselves: no script, and nothing to be fetched."""
+    display = "block" if isinstance(node, nodes.math_block) else "inline"
+    tex = node.astext().strip()
+    if display == "block" and r"\\" in tex and r"\begin" not in tex:
+        tex = rf"\begin{{split}}{tex}\end{{split}}"  # lines that are aligned at their &, as Sphinx has it
+    mathml = latex_to_mathml(tex, display=display)
+    if unknown := re.findall(r"<m[io][^>]*>(\\.+?|&amp;|&#x00026;|&)</m[io]>", mathml):
+        logger.warning("%s in a formula: %s", unknown, node.astext(), location=node)
+    mathml = LETTER.sub(in_its_alphabet, mathml)
+    translator.body.append(f'<div class="math">{mathml}</div>' if display == "block" else mathml)
+    raise nodes.SkipNode
+
+
 class FigureIfMade(Figure):
     """A figure, or, before the script that draws it has been run, the command to run."""
 
@@ -64,4 +96,5 @@ class FigureIfMade(Figure):
 
 def setup(app: Sphinx) -> None:
     app.add_directive("figure-if-made", FigureIfMade)
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
     app.connect("doctree-read", keep_numbers_together)
