@@ -34,7 +34,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     n_episodes, batch_size = settings["n_episodes"], settings["batch_size"]
     for name in ("n_episodes", "n_epochs"):
         check_count(name, settings[name])
-    for name in ("batch_size", "bptt_steps"):
+    for name in ("batch_size", "bptt_steps", "n_threads"):
         if settings[name] is not None:
             check_count(name, settings[name])
     if n_episodes < 2:

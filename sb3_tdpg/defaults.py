@@ -24,6 +24,7 @@ class Defaults(NamedTuple):
     normalize_advantage: bool
     encoder_gradient: str
     mi_estimator: str
+    n_threads: int | None
     total_epochs: int  # policy epochs
 
 
@@ -38,6 +39,7 @@ VECTOR = Defaults(
     normalize_advantage=False,
     encoder_gradient="score",
     mi_estimator="mine",
+    n_threads=1,
     total_epochs=400,
 )
 
@@ -52,6 +54,7 @@ IMAGE = Defaults(
     normalize_advantage=True,
     encoder_gradient="pathwise",
     mi_estimator="logdet",
+    n_threads=None,
     total_epochs=50,
 )
 

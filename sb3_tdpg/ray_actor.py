@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import cloudpickle
 import gymnasium as gym
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import is_wrapped, unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
+
+from sb3_tdpg.threads import set_threads
 
 
 class Start(NamedTuple):
@@ -100,7 +101,7 @@ class EnvActor:
     """
 
     def __init__(self) -> None:
-        th.set_num_threads(1)
+        set_threads(1)
         self._envs: list[gym.Env] = []
         self._keep_starts = False
 

@@ -9,16 +9,14 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.sharedctypes import Synchronized, SynchronizedArray
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
@@ -30,6 +28,7 @@ from sb3_tdpg.evaluation import evaluate_scenarios, write_frame_atomically, writ
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.provenance import check_same_config
 from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.threads import set_threads
 from sb3_tdpg.training import make_training
 from sb3_tdpg.training_batch import Member, MemberDivergedError, TrainingBatch, batch_key
 from sb3_tdpg.vec_env import usable_cores
@@ -411,7 +410,7 @@ def _init_worker(shared: _Shared) -> None:
     global _SHARED
     _SHARED = shared
     end_with_parent()
-    th.set_num_threads(1)
+    set_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
 
 
@@ -425,14 +424,3 @@ def end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=wait_for_its_end, daemon=True).start()
-
-
-@contextmanager
-def torch_threads(n: int) -> Iterator[None]:
-    """Run a block of code with this many torch threads."""
-    before = th.get_num_threads()
-    th.set_num_threads(n)
-    try:
-        yield
-    finally:
-        th.set_num_threads(before)

@@ -25,9 +25,10 @@ import pandas as pd
 from sb3_tdpg.evaluation import save_figure, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.tradeoff import tradeoff_figure
 from sb3_tdpg.files import replaced_atomically, write_atomically
-from sb3_tdpg.runs import check_folder, complete_run, complete_runs, end_with_parent, torch_threads
+from sb3_tdpg.runs import check_folder, complete_run, complete_runs, end_with_parent
 from sb3_tdpg.sweep_runs import Sweep, make_sweep, parse_inverse_beta
 from sb3_tdpg.sweep_summary import sweep_summary
+from sb3_tdpg.threads import threads
 
 # Where several policies know about nothing, which of them knows least is chance: the cheapest of them is taken.
 TIE = 0.01  # nats
@@ -93,7 +94,7 @@ def sweep(
             check_folder(*task, n_eval_episodes)
         out.mkdir(parents=True, exist_ok=True)
         complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-        with torch_threads(1):
+        with threads(1):
             rows = [plan.row(plan.folder(out, *job), *job) for job in wanted]
     else:
         name = study_name or f"sweep-{plan.block}"
@@ -208,7 +209,7 @@ def _work(
         trial.set_user_attr("row", row)
         return row["cost"], row["information"]
 
-    with torch_threads(1):
+    with threads(1):
         work(study, objective, grace_period=grace_period)
 
 

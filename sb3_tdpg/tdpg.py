@@ -34,6 +34,7 @@ from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.policy_update import PolicyUpdate, TrainingDivergedError
 from sb3_tdpg.problem import Problem, read_problem, reward_threshold
 from sb3_tdpg.random_state import RandomState
+from sb3_tdpg.threads import threads
 from sb3_tdpg.vec_env import make_episodes_env
 
 __all__ = ["TDPG", "TrainingDivergedError"]
@@ -102,6 +103,8 @@ class TDPG(OnPolicyAlgorithm):
     :param verbose: 0: nothing; 1: what the environment is wrapped in, and a table each epoch; 2: debug messages.
     :param seed: Seed of all random number generators. With another number of environments it gives other episodes.
     :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    :param n_threads: Threads that ``learn`` computes with, of torch and of NumPy's linear algebra; default: 1, which is
+        enough for networks this small and gives the same numbers on any machine, and as many as torch is set to.
     :param _init_setup_model: Whether to build the networks at once.
     :raises ValueError: if an argument is out of its range or does not fit the environment; the message says how to mend
         it. Nothing has been trained by then.
@@ -140,6 +143,7 @@ class TDPG(OnPolicyAlgorithm):
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
+        n_threads: int | None = None,
         _init_setup_model: bool = True,
     ) -> None:
         for name, count in (("n_episodes", n_episodes), ("n_envs", n_envs)):
@@ -164,6 +168,7 @@ class TDPG(OnPolicyAlgorithm):
             batch_size=batch_size,
             clip_range=clip_range,
             normalize_advantage=normalize_advantage,
+            n_threads=n_threads,
         )
         settings = fill_in(given, None if env is None else env.observation_space)
         settings.update(
@@ -209,6 +214,7 @@ class TDPG(OnPolicyAlgorithm):
         self.batch_size: int | None = settings["batch_size"]
         self.clip_range: float | Schedule = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
+        self.n_threads: int | None = settings["n_threads"]
         self.auto_weight: AutoWeight | None = None
         """The weight of the information with ``beta="auto"``."""
         # Plain numbers, so that a model loaded without an environment can rebuild its networks.
@@ -448,7 +454,10 @@ class TDPG(OnPolicyAlgorithm):
         """
         if total_timesteps is None:
             total_timesteps = defaults_for(self.observation_space).total_epochs * self.n_episodes * self.horizon
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        with threads(self.n_threads):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+            )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callbacks: list[BaseCallback] = []

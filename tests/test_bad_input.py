@@ -51,6 +51,7 @@ ARGUMENTS = {
     "batch_size above n_episodes": (dict(batch_size=21), "batch_size=21", "n_episodes=20", "episodes"),
     "batch_size one": (dict(batch_size=1), "batch_size=1", "between 2 and"),
     "bptt_steps none": (dict(bptt_steps=0), "bptt_steps=0", "integer of at least 1"),
+    "no threads": (dict(n_threads=0), "n_threads=0", "integer of at least 1"),
     "bptt_steps of a time-varying policy": (dict(bptt_steps=2), "bptt_steps=2", "horizon of 5", "time_varying=False"),
     "batch_size in steps": (dict(batch_size=2000), "batch_size=2000", "number of episodes"),
     "clip_range zero": (dict(clip_range=0.0), "clip_range=0.0", "positive", "inf"),

@@ -21,6 +21,7 @@ from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.density_critic import Regression
 from sb3_tdpg.information.interval import component_estimates
 from sb3_tdpg.information.interval_bounds import MAX_TRAINING
+from sb3_tdpg.threads import threads
 from sb3_tdpg.vec_env import make_episodes_env
 
 # Walls that no policy was trained or tested on.
@@ -75,6 +76,7 @@ def trv_knowledge(
     return {name: _r2(known, y) for name, y in (("position", position), ("brightness", brightness), ("wall", color))}
 
 
+@threads(1)
 def state_knowledge(
     batch: InformationBatch, names: Sequence[str] | None = None, *, confidence: float = 0.95, seed: int = 0
 ) -> pd.DataFrame:

@@ -26,6 +26,7 @@ from sb3_tdpg.information.interval_bounds import (
     leave_one_out_bound,
     log_det_bound,
 )
+from sb3_tdpg.threads import threads
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
@@ -155,6 +156,7 @@ def min_episodes(trv_dim: int) -> int:
     return max(MIN_EPISODES, 2 * trv_dim + 2)
 
 
+@threads(1)
 def information_interval(batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0) -> InformationInterval:
     r"""
     Give confidence limits for I[x_t; x~_t] at every time step, from fresh rollouts of a policy.

@@ -30,6 +30,7 @@ from sb3_tdpg.information.flat_adam import AveragedAdam
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.networks import BatchedLinear, BatchedMLP, ELUGradient
+from sb3_tdpg.threads import threads
 
 STEPS_PER_CHECK = 50
 MIN_VARIANCE = 1e-2  # of what is brought to variance 1
@@ -50,6 +51,7 @@ class InformationEstimate(NamedTuple):
     """On the pairs that the critic was fitted to: tends to be too high."""
 
 
+@threads(1)
 def estimate_information(
     x: npt.ArrayLike,
     z: npt.ArrayLike,

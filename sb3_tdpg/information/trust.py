@@ -12,6 +12,7 @@ import numpy as np
 
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.information.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
+from sb3_tdpg.threads import threads
 
 NEAR_THE_CAP = 0.9  # of ln N
 FALSE_ALARM = 0.01  # probability of each check to fail without a cause, all time steps together
@@ -70,6 +71,7 @@ class TrustBadge:
         )
 
 
+@threads(1)
 def trust_checks(batch: InformationBatch, interval: InformationInterval | None = None, *, seed: int = 0) -> TrustBadge:
     r"""
     Check an information interval against what must come out.

@@ -33,8 +33,8 @@ from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
 from sb3_tdpg.reproduction.common import how_made
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.scale import default_scale
-from sb3_tdpg.runs import torch_threads
 from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.threads import threads
 from sb3_tdpg.vec_env import make_episodes_env
 
 N_EPISODES = {"image": 100, "vector": 500}
@@ -245,7 +245,7 @@ def _measure_all(
     firsts = _firsts(models)
     total = len(ESTIMATES) * sum(isinstance(model, TDPG) for _, _, model in firsts)
     known = []
-    with torch_threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
+    with threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
         for number, label, model in firsts:
             progress.set_postfix_str(f"information, {label}")
             known.append(_measure(plan, row, number, label, model, out, progress.update))

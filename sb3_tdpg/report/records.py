@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
@@ -21,7 +20,7 @@ from sb3_tdpg.provenance import write_frame_atomically
 from sb3_tdpg.report.models import Source, load_all
 from sb3_tdpg.report.rows import Row
 from sb3_tdpg.robustness import PerturbedVecEnv
-from sb3_tdpg.runs import torch_threads
+from sb3_tdpg.threads import set_threads, threads
 
 COLUMNS = ("episode", "cost", "length", "failure")
 """Of :func:`~sb3_tdpg.evaluation.records.run_episodes`, what is kept; a failure only if it is known."""
@@ -135,7 +134,7 @@ def _completed(
     plan: Plan, rows: Sequence[Row], models: Mapping[str, Sequence[Any]], jobs: int
 ) -> Iterator[tuple[Row, pd.DataFrame]]:
     if jobs <= 1:
-        with torch_threads(1):
+        with threads(1):
             for row in rows:
                 yield row, run_row(plan, row, models)
         return
@@ -159,7 +158,7 @@ _WORKER: dict[str, Any] = {}  # what a process of the pool loads once
 
 
 def _init_worker(plan: Plan) -> None:
-    th.set_num_threads(1)
+    set_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     _WORKER.update(plan=plan, models=load_all(plan.sources, plan.env_id, plan.env_kwargs))
 

@@ -40,8 +40,9 @@ from sb3_tdpg.reproduction.common import (
     markdown_table,
     publish_files,
 )
-from sb3_tdpg.runs import read_progress, torch_threads
+from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.threads import threads
 
 # Fixed before any policy was evaluated on the test rows. Seeds below 100 were seen while the blocks were made.
 FIRST_SEED = 100
@@ -209,7 +210,7 @@ def reproduce_ball(
     if is_fixed:
         sections += ["## Goals", goals_table(aggregated, GOALS)]
     sections += ["## What the penalty is worth", COMPARISON, comparisons_table(table, COMPARISONS, KINDS)]
-    with torch_threads(1):  # sums come out the same on any number of cores
+    with threads(1):  # sums come out the same on any number of cores
         knowledge = pd.DataFrame(
             dict(
                 model=m.label,

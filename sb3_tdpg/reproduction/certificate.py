@@ -21,8 +21,8 @@ from sb3_tdpg.evaluation.shifts import Shift, TrainingEpisodes, lava_shift, rand
 from sb3_tdpg.files import write_atomically
 from sb3_tdpg.reproduction.common import how_made, markdown_table
 from sb3_tdpg.reproduction.lava import PAPER_INVERSE_BETAS
-from sb3_tdpg.runs import torch_threads
 from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.threads import threads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,7 +80,7 @@ def certify_lava(
     paper: list[dict[str, Any]] = []
     theorem: list[dict[str, Any]] = []
     random: list[dict[str, Any]] = []
-    with torch_threads(1):  # the networks are small: more threads are slower
+    with threads(1):
         for label, model in loaded.items():
             print(f"{label}: {n_episodes:,} training episodes")
             episodes = TrainingEpisodes(

@@ -40,8 +40,9 @@ from sb3_tdpg.reproduction.grasp_analysis import (
     knowledge_table,
     penalty_table,
 )
-from sb3_tdpg.runs import read_progress, torch_threads
+from sb3_tdpg.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.threads import threads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -193,7 +194,7 @@ def reproduce_grasp(
     write_run_config(out / "config.json", dict(runs=trained.configs, provenance=how))
 
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
-    with torch_threads(1):  # sums come out the same on any number of cores
+    with threads(1):  # sums come out the same on any number of cores
         knowledge = knowledge_table(models, rows[:2])
         of_first = {label: models[label, FIRST_SEED] for label in ("PG", "TDPG")}
         estimates = estimates_table(of_first) if experiment.compares_estimates else None

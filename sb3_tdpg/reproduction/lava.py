@@ -32,8 +32,9 @@ from sb3_tdpg.reproduction.common import (
     met,
     publish_files,
 )
-from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress, torch_threads
+from sb3_tdpg.runs import Run, complete_run, complete_runs, read_progress
 from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.threads import threads
 
 READINGS = ("table", "text")
 """Readings of the lava problem: the one that fits Table I, and the one that the paper's text describes."""
@@ -94,7 +95,7 @@ def demo(
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
     folders = {run.method: out / "runs" / run.folder_name for run in runs}
-    with torch_threads(1):  # the networks are small: more threads are slower
+    with threads(1):
         for run in runs:
             print(f"{run.method}: training and evaluating, {folders[run.method]}")
             complete_run(run, folders[run.method], LAVA, n_eval_episodes=n_eval_episodes, progress_bar=True)
