@@ -8,7 +8,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-peers wheel clean
+.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -78,8 +78,8 @@ reproduce-grasp: $(STAMP) ## reproduce Table III: policy gradient, TDPG and its 
 reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a scenario of our own
 	$(PY) -m sb3_tdpg reproduce grasp-camera --out results/panda_grasp_camera --publish docs/results/panda_grasp_camera
 
-reproduce-peers: $(STAMP) ## PPO, RecurrentPPO, weight decay, VIB and augmented images beside TDPG, on all three environments
-	$(PY) -m sb3_tdpg reproduce peers --n-grasp-seeds 2 --out results/peers --publish docs/results/peers
+reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay, VIB and augmented images beside TDPG, on all three environments
+	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from sb3_tdpg.certificates.lava import certificate_figure
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.ball_view import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
@@ -14,7 +15,6 @@ from sb3_tdpg.envs.panda_view import depth_picture
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 from sb3_tdpg.evaluation import save_figure
-from sb3_tdpg.reproduction.certificate import certificate_figure
 from sb3_tdpg.robustness import perturbation_gallery
 
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m

@@ -1,15 +1,25 @@
 """Task-Driven Policy Gradient (TDPG) for Stable-Baselines3."""
 
+import importlib.util
+import sys
 from pathlib import Path
 
-# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. Without this, sb3_tdpg.envs is
-# not found when the checkout comes first on sys.path (the working directory is the repository, or PYTHONPATH).
-_package = Path(__path__[0]).resolve()
-if not (_package / "envs").is_dir() and (_package.parent / "envs" / "__init__.py").is_file():
-    __path__.append(str(_package.parent))
+# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. When the checkout itself comes first
+# on sys.path (it is the working directory, or on PYTHONPATH), no finder knows that they are part of this package.
+_package = Path(__file__).resolve().parent
+for _name in ("envs", "hyperparams"):
+    _init = _package.parent / _name / "__init__.py"
+    if not (_package / _name).is_dir() and _init.is_file() and f"{__name__}.{_name}" not in sys.modules:
+        _spec = importlib.util.spec_from_file_location(
+            f"{__name__}.{_name}", _init, submodule_search_locations=[str(_init.parent)]
+        )
+        assert _spec is not None and _spec.loader is not None
+        sys.modules[_spec.name] = globals()[_name] = importlib.util.module_from_spec(_spec)
+        _spec.loader.exec_module(globals()[_name])
 
-from sb3_tdpg import envs
-from sb3_tdpg.callbacks import InformationCallback, MINECallback, SelectionCallback, TrainingCheckpointCallback
+from sb3_tdpg import envs, hyperparams
+from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
+from sb3_tdpg.measurement.callback import InformationCallback
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
 from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
@@ -26,5 +36,6 @@ __all__ = [
     "TrainingCheckpointCallback",
     "TrainingDivergedError",
     "envs",
+    "hyperparams",
     "make_episodes_env",
 ]

@@ -13,16 +13,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from sb3_tdpg.files import write_atomically
-from sb3_tdpg.information import InformationInterval, information_interval
-from sb3_tdpg.information.interval import component_estimates, min_episodes
-from sb3_tdpg.problem import read_problem
+from sb3_tdpg.common.files import write_atomically
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
 
 
-class _TDPGCallback(BaseCallback):
+class TDPGCallback(BaseCallback):
     """A callback that knows that its model is a :class:`TDPG`."""
 
     def init_callback(self, model: BaseAlgorithm) -> None:
@@ -33,15 +30,16 @@ class _TDPGCallback(BaseCallback):
 
     @property
     def tdpg(self) -> TDPG:
+        """The model."""
         return cast("TDPG", self.model)
 
     def _on_step(self) -> bool:
         return True
 
 
-class MINECallback(_TDPGCallback):
+class MINECallback(TDPGCallback):
     """
-    Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of Algorithm 2, alg:trv-policy).
+    Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of Algorithm 2).
 
     :class:`TDPG` installs it by itself, before the callbacks of the user, so that those find ``model.information``
     up to date; one that is in the user's list takes its place. It does nothing in an epoch without a penalty
@@ -70,61 +68,6 @@ class MINECallback(_TDPGCallback):
             return diagnostics, model.estimator(batch).cpu().numpy()
 
 
-class InformationCallback(_TDPGCallback):
-    """
-    Write an interval that holds the information to the log, beside the estimate that the policy is trained with.
-
-    It is made from the epoch's rollouts, which are fresh for it: they were made with the policy as it is, and each
-    critic is fitted to other episodes than those that it is evaluated on. It needs no penalty, and changes nothing in
-    the training. The keys are ``mi/lower`` and ``mi/upper``, the limits summed over time; for TensorBoard
-    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_d``, ..., what the TRVs know at least of
-    each component of the state, averaged over the time steps at which it varies. A component is called as in the
-    environment's ``state_names``, without its unit, or ``x0``, ``x1``, ...
-
-    :param eval_freq: Epochs from one interval to the next, beginning with the first.
-    :param confidence: With which the interval of a time step holds the truth.
-    :param components: Whether the components of the state are measured, too; it takes as long again for each.
-    :raises ValueError: if ``eval_freq`` is below 1; where the training begins, if an epoch has too few episodes.
-    """
-
-    def __init__(self, eval_freq: int = 10, *, confidence: float = 0.95, components: bool = True) -> None:
-        super().__init__()
-        if eval_freq < 1:
-            raise ValueError(f"eval_freq={eval_freq} must be at least 1 (epochs)")
-        self.eval_freq = eval_freq
-        self.confidence = confidence
-        self.components = components
-        self.interval: InformationInterval | None = None  # the last one
-
-    def _on_training_start(self) -> None:
-        n_episodes, trv_dim = self.tdpg.n_episodes, self.tdpg.policy.trv_dim
-        if n_episodes < min_episodes(trv_dim):  # it would write limits of 0 and 0: sums over no time step
-            raise ValueError(
-                f"n_episodes={n_episodes} are too few for an interval of the information in {trv_dim} TRVs: an epoch "
-                f"must have at least {min_episodes(trv_dim)}"
-            )
-
-    def _on_rollout_end(self) -> None:
-        model = self.tdpg
-        if model.epoch % self.eval_freq != 0:
-            return
-        batch = model.rollout_buffer.episode_batch().information_batch()
-        self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
-        lower, upper = self.interval.total
-        self.logger.record("mi/lower", lower)
-        self.logger.record("mi/upper", upper)
-        for limit in ("lower", "upper"):
-            for t, value in enumerate(getattr(self.interval, limit).tolist()):
-                if np.isfinite(value):
-                    self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))
-        if self.components:
-            estimates, _ = component_estimates(batch, seed=model.epoch)
-            names = read_problem(self.training_env).state_names
-            for name, values in zip(names, estimates.T, strict=True):
-                if np.isfinite(values).any():
-                    self.logger.record(f"mi/knows_{name.split(' (')[0]}", float(np.nanmean(values.clip(min=0))))
-
-
 class Candidate(NamedTuple):
     """The policy of one epoch, measured on the rollouts that it made itself."""
 
@@ -133,7 +76,7 @@ class Candidate(NamedTuple):
     information: float  # sum over t, nats
 
 
-class SelectionCallback(_TDPGCallback):
+class SelectionCallback(TDPGCallback):
     """
     Keep the policy of the best epoch.
 
@@ -240,7 +183,7 @@ class SelectionCallback(_TDPGCallback):
         return self.best
 
 
-class TrainingCheckpointCallback(_TDPGCallback):
+class TrainingCheckpointCallback(TDPGCallback):
     """
     Write a file from which a killed training goes on exactly as if it had not been killed.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_tdpg.baselines import get_baseline
+from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.information import get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
 

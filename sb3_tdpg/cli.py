@@ -42,28 +42,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(out: Path, **options: Any) -> None:
-    from sb3_tdpg.reproduction.lava import demo
+    from sb3_tdpg.paper.lava import demo
 
     print(f"\n{demo(out, **options)}\n\nresults are in {out}")
 
 
 def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
-    from sb3_tdpg.reproduction.ball import reproduce_ball
-    from sb3_tdpg.reproduction.grasp import reproduce_grasp
-    from sb3_tdpg.reproduction.lava import reproduce_lava
-    from sb3_tdpg.reproduction.peers import reproduce_peers
+    from sb3_tdpg.paper.ball import reproduce_ball
+    from sb3_tdpg.paper.baselines import reproduce_baselines
+    from sb3_tdpg.paper.grasp import reproduce_grasp
+    from sb3_tdpg.paper.lava import reproduce_lava
 
     given = {name: value for name, value in options.items() if value is not None}
     if "controls" in given and not experiment.startswith("ball"):
         raise ValueError(f"--no-controls is for ball and ball-varying: {experiment} does not do without any")
     for name in ("n_ball_seeds", "n_grasp_seeds"):
-        if name in given and experiment != "peers":
-            raise ValueError(f"--{name.replace('_', '-')} is for peers: {experiment} has --n-seeds alone")
-    if "n_paper_seeds" in given and experiment == "peers":
-        raise ValueError("--n-paper-seeds is for lava and ball: the peers are not the paper's")
-    if experiment == "peers":
-        out = out or Path("results/peers")
-        text = reproduce_peers(out, **given)
+        if name in given and experiment != "baselines":
+            raise ValueError(f"--{name.replace('_', '-')} is for baselines: {experiment} has --n-seeds alone")
+    if "n_paper_seeds" in given and experiment == "baselines":
+        raise ValueError("--n-paper-seeds is for lava and ball: the baselines are not the paper's")
+    if experiment == "baselines":
+        out = out or Path("results/baselines")
+        text = reproduce_baselines(out, **given)
     elif experiment == "lava":
         out = out or Path("results/lava_reproduction")
         text = reproduce_lava(out, **given)
@@ -79,7 +79,7 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
 
 
 def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
-    from sb3_tdpg.enjoy import enjoy, parse_keywords
+    from sb3_tdpg.evaluation.enjoy import enjoy, parse_keywords
 
     enjoy(model, env, parse_keywords(env_kwargs), **options)
 
@@ -94,8 +94,8 @@ def _zoo(program: str, arguments: Sequence[str]) -> None:
 
 
 def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> None:
-    from sb3_tdpg.enjoy import parse_keywords
-    from sb3_tdpg.sweep import sweep
+    from sb3_tdpg.evaluation.enjoy import parse_keywords
+    from sb3_tdpg.experiments.sweep import sweep
 
     out = options.pop("out") or Path("results", f"sweep-{options['block'] or env}")
     print(
@@ -104,21 +104,21 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
 
 
 def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, **options: Any) -> None:
-    from sb3_tdpg.enjoy import parse_keywords
-    from sb3_tdpg.reproduction.certificate import certify_lava
+    from sb3_tdpg.certificates.lava import certify_lava
+    from sb3_tdpg.evaluation.enjoy import parse_keywords
 
     if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
             f"certify knows the shifts of Lava-v0 only, and not of {env}: declare them in Python, see "
-            "sb3_tdpg.evaluation.shifts.TrainingEpisodes"
+            "sb3_tdpg.certificates.shifts.TrainingEpisodes"
         )
     print(f"\n{certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)}\n\nresults are in {out}")
 
 
 def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:
-    from sb3_tdpg.enjoy import parse_keywords
+    from sb3_tdpg.common.processes import usable_cores
+    from sb3_tdpg.evaluation.enjoy import parse_keywords
     from sb3_tdpg.report import parse_models, robustness_report
-    from sb3_tdpg.vec_env import usable_cores
 
     out = out or Path("results", f"report-{env.rpartition(':')[2]}")
     options["jobs"] = options["jobs"] or usable_cores()
@@ -186,7 +186,7 @@ def _make_parser() -> argparse.ArgumentParser:
     _add_sizes(demo)
 
     reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
-    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-camera", "peers"))
+    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-camera", "baselines"))
     reproduce.add_argument(
         "--out", type=Path, default=None, help="folder for the results (default: one in results/ for each experiment)"
     )
@@ -198,9 +198,11 @@ def _make_parser() -> argparse.ArgumentParser:
         "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
     )
     reproduce.add_argument(
-        "--n-ball-seeds", type=int, help="peers: training seeds on ball catching, 0: none; --n-seeds: on lava"
+        "--n-ball-seeds", type=int, help="baselines: training seeds on ball catching, 0: none; --n-seeds: on lava"
     )
-    reproduce.add_argument("--n-grasp-seeds", type=int, help="peers: training seeds on grasping, 0: none (default: 1)")
+    reproduce.add_argument(
+        "--n-grasp-seeds", type=int, help="baselines: training seeds on grasping, 0: none (default: 1)"
+    )
     reproduce.add_argument(
         "--no-controls", action="store_false", dest="controls", default=None,
         help="ball: only PG and TDPG; without it, a later call adds the controls",

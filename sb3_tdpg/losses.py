@@ -11,7 +11,7 @@ import torch as th
 
 def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor) -> th.Tensor:
     """
-    Surrogate whose gradient is that of the expected cost (equation 12, eq:grad psi, and equation 13, eq:grad phi).
+    Surrogate whose gradient is that of the expected cost (equation 12, and equation 13).
 
     The paper multiplies every log-probability with the whole episode's cost. Any ``advantages[t]`` with the same
     conditional expectation up to a function of what precedes the sample at t gives the same expected gradient: the cost
@@ -73,7 +73,7 @@ def normalized(
 
 def information_loss(information: th.Tensor) -> th.Tensor:
     """
-    The penalty of equation 3, eq:robust pomdp: the sum over time of I[x_t; x~_t], none below zero.
+    The penalty of equation 3: the sum over time of I[x_t; x~_t], none below zero.
 
     Mutual information is never negative, but the bound of a frozen critic is unbounded below. Without the clamp the
     policy would descend there.

@@ -37,10 +37,9 @@ class BatchedLinear(nn.Module):
         """``(M, N, I) -> (M, N, O)``."""
         return th.baddbmm(self.bias, x, self.weight)
 
-    def at(self, x: th.Tensor, index: int | slice) -> th.Tensor:
-        """Apply the map of one index, ``(N, I) -> (N, O)``, or the m maps of a slice, ``(m, N, I) -> (m, N, O)``."""
-        apply = th.addmm if isinstance(index, int) else th.baddbmm
-        return apply(self.bias[index], x, self.weight[index])
+    def at(self, x: th.Tensor, index: int) -> th.Tensor:
+        """Apply the map of one index: ``(N, I) -> (N, O)``."""
+        return th.addmm(self.bias[index], x, self.weight[index])
 
 
 class BatchedMLP(nn.Module):
@@ -77,8 +76,8 @@ class BatchedMLP(nn.Module):
         assert isinstance(self.activation, nn.ELU), "only the derivative of ELU is written out"
         return ELUGradient([(layer.weight, layer.bias) for layer in cast("list[BatchedLinear]", list(self.layers))])
 
-    def at(self, x: th.Tensor, index: int | slice) -> th.Tensor:
-        """Evaluate the network of one index, ``(N, I) -> (N, O)``, or those of a slice, ``(m, N, I) -> (m, N, O)``."""
+    def at(self, x: th.Tensor, index: int) -> th.Tensor:
+        """Evaluate the network of one index: ``(N, I) -> (N, O)``."""
         last = len(self.layers) - 1
         for i, layer in enumerate(self.layers):
             assert isinstance(layer, BatchedLinear)
@@ -167,30 +166,3 @@ class TimeMLP(nn.Module):
     def at(self, x: th.Tensor, t: int) -> th.Tensor:
         """One step, the same for all episodes: ``(N, I) -> (N, O)``."""
         return self.mlp.at(x, t if self.time_varying else 0)
-
-
-class StackedTimeMLP(nn.Module):
-    """
-    The networks of K policies as one: what is ``(T, N, ...)`` for one of them is ``(K * T, N, ...)`` here.
-
-    :param n_policies: K
-    :param like: The network of any of them, for the shape.
-    """
-
-    def __init__(self, n_policies: int, like: TimeMLP) -> None:
-        super().__init__()
-        self.n_policies = n_policies
-        self.horizon = like.horizon
-        self.time_varying = like.time_varying
-        self.mlp = BatchedMLP(n_policies * like.mlp.n_maps, like.sizes, like.activation_fn)
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        """All steps of all episodes: ``(K * T, N, I) -> (K * T, N, O)``."""
-        if self.time_varying:
-            return self.mlp(x)
-        shape = (self.n_policies, self.horizon, x.shape[1])
-        return self.mlp(x.unflatten(0, shape[:2]).flatten(1, 2)).unflatten(1, shape[1:]).flatten(0, 1)
-
-    def at(self, x: th.Tensor, t: int) -> th.Tensor:
-        """One step, the same for all: ``(K, N, I) -> (K, N, O)``."""
-        return self.mlp.at(x, slice(t, None, self.horizon) if self.time_varying else slice(None))

@@ -248,11 +248,7 @@ class TRVPolicy(BasePolicy):
     def _variance(self, log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
         # exp(log_var), bounded: observations unlike any in training would drive it to inf, and a TRV that is all noise
         # drowns the action head. Bounded softly: a clamp has no gradient to come back on.
-        return maximum * self._sigmoid(log_var - math.log(maximum)) + floor
-
-    @staticmethod
-    def _sigmoid(x: th.Tensor) -> th.Tensor:
-        return th.sigmoid(x)
+        return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
     # -- one step, for rollouts and predict -------------------------------------------------------------------
 
@@ -321,7 +317,7 @@ class TRVPolicy(BasePolicy):
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (equation 13, eq:grad phi).
+        Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (equation 13).
 
         The stored TRVs are constants here: ``Normal.log_prob(rsample())`` without a detach has no gradient in the mean.
 
@@ -332,7 +328,7 @@ class TRVPolicy(BasePolicy):
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Log pi(u_t | x~_t) at the stored actions (equation 12, eq:grad psi).
+        Log pi(u_t | x~_t) at the stored actions (equation 12).
 
         :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
         :return: ``(T, N)``
@@ -345,28 +341,20 @@ class TRVPolicy(BasePolicy):
 
     def rebuild_trvs(self, features: th.Tensor, noise: th.Tensor, start: th.Tensor | None = None) -> RebuiltTRVs:
         """
-        Unroll equation 15, eq:lg, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
+        Unroll Equation 15, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
 
         :param features: ``(T, N, F)``
         :param noise: eps_t, ``(T, N, Z)``
         :param start: x~_{-1}, ``(N, Z)``; default: zero
         """
-        # Not features[t]: the gradient of each would be as large as all features.
-        return RebuiltTRVs(*(th.stack(x) for x in self._unroll(features.unbind(), noise.unbind(), start)))
-
-    def _unroll(
-        self, features: Sequence[th.Tensor], noise: Sequence[th.Tensor], start: th.Tensor | None = None
-    ) -> tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor]]:
-        """Return TRVs, means and standard deviations of each step, from the features and the noise of each."""
         trv = th.zeros_like(noise[0]) if start is None else start
-        trvs, means, stds = [], [], []
-        for t, (features_t, noise_t) in enumerate(zip(features, noise, strict=True)):
+        steps = []
+        # unbind, not features[t]: the gradient of each features[t] would be as large as all features.
+        for t, (features_t, noise_t) in enumerate(zip(features.unbind(), noise.unbind(), strict=True)):
             mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features_t], dim=-1), t))
             trv = mean + std * noise_t
-            trvs.append(trv)
-            means.append(mean)
-            stds.append(std)
-        return trvs, means, stds
+            steps.append((trv, mean, std))
+        return RebuiltTRVs(*(th.stack(x) for x in zip(*steps, strict=True)))
 
     def evaluate_episodes(
         self, batch: EpisodeBatch, encoder_gradient: str, bptt_steps: int | None = None, rebuild: bool = False
@@ -393,7 +381,7 @@ class TRVPolicy(BasePolicy):
 
     def rebuild_trvs_in_parts(self, features: th.Tensor, batch: EpisodeBatch, n_steps: int) -> RebuiltTRVs:
         """
-        Unroll equation 15, eq:lg, in parts of the horizon, as if each were an episode: truncated back-propagation.
+        Unroll equation 15, in parts of the horizon, as if each were an episode: truncated back-propagation.
 
         A part begins with the stored TRVs of the step before it, through which no gradient flows.
 

@@ -1,5 +1,5 @@
 """
-The update of the policy from the rollouts of one epoch (line 6 of Algorithm 2, alg:trv-policy).
+The update of the policy from the rollouts of one epoch (line 6 of Algorithm 2).
 
 Dimension key: T horizon, N episodes of an epoch, n episodes of a minibatch.
 """
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch as th
 
-from sb3_tdpg.baselines import get_baseline
+from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.buffers import EpisodeBatch
 from sb3_tdpg.losses import clipped_policy_loss, information_loss, normalized, policy_gradient_loss
 from sb3_tdpg.policies import RebuiltTRVs

@@ -1,5 +1,5 @@
 """
-Task-Driven Policy Gradient (Algorithm 2, alg:trv-policy) as a Stable-Baselines3 algorithm.
+Task-Driven Policy Gradient (Algorithm 2) as a Stable-Baselines3 algorithm.
 
 Dimension key: T horizon, N episodes of an epoch, X state, Z task-relevant variables (TRVs), U action.
 """
@@ -27,14 +27,14 @@ from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.checks import check_action_space, check_arguments, check_beta, check_count, nearest_multiples
+from sb3_tdpg.common.files import replaced_atomically
+from sb3_tdpg.common.random_state import RandomState
+from sb3_tdpg.common.threads import threads
 from sb3_tdpg.defaults import defaults_for, fill_in
-from sb3_tdpg.files import replaced_atomically
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.policy_update import PolicyUpdate, TrainingDivergedError
 from sb3_tdpg.problem import Problem, read_problem, reward_threshold
-from sb3_tdpg.random_state import RandomState
-from sb3_tdpg.threads import threads
 from sb3_tdpg.vec_env import make_episodes_env
 
 __all__ = ["TDPG", "TrainingDivergedError"]
@@ -47,7 +47,7 @@ class TDPG(OnPolicyAlgorithm):
     Task-Driven Policy Gradient (Pacelli and Majumdar, 2020).
 
     Minimises the expected cost of an episode plus the information that the task-relevant variables carry about the
-    state (equation 3, eq:robust pomdp, divided by beta):
+    state (equation 3, divided by beta):
 
     .. math:: E[c(\tau)] + \frac1\beta \sum_t I[x_t; \tilde x_t]
 
@@ -80,7 +80,7 @@ class TDPG(OnPolicyAlgorithm):
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: ``"value"``: cost to come minus its regression on the true state at each time step;
         ``"mean"``: cost of the whole episode minus the mean over the batch, as in the paper.
-    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (equation 13, eq:grad phi), as in the
+    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (equation 13), as in the
         paper; ``"pathwise"``: the noise is held fixed and log pi differentiated through the TRVs. Both are unbiased;
         the second varies less. Default: ``"score"`` and ``"pathwise"``.
     :param bptt_steps: Steps that a gradient flows back through the memory: the pathwise one, and the information's.
@@ -345,7 +345,7 @@ class TDPG(OnPolicyAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         """
-        Roll out N whole episodes with the current policy (line 2 of Algorithm 2, alg:trv-policy).
+        Roll out N whole episodes with the current policy (line 2 of Algorithm 2).
 
         Each of E environments runs N / E episodes one after the other. A quota per environment, not the first N that
         finish: those would be the short ones. All environments begin an epoch at t = 0.
@@ -424,7 +424,7 @@ class TDPG(OnPolicyAlgorithm):
         super().dump_logs(iteration)
 
     def train(self) -> None:
-        """Update encoder and action head (line 6 of Algorithm 2, alg:trv-policy)."""
+        """Update encoder and action head (line 6 of Algorithm 2)."""
         update = PolicyUpdate(self)
         for _ in range(self.n_epochs):
             for episodes in update.minibatches():

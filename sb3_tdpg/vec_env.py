@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
 import time
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -22,6 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_tdpg.common.processes import usable_cores
 from sb3_tdpg.defaults import defaults_for
 from sb3_tdpg.envs.base import BatchStep, POMDPEnv
 
@@ -136,11 +136,6 @@ class BatchedVecEnv(VecEnv):
             images.append(self.env.render())
         self.env._state = batch_state
         return images
-
-
-def usable_cores() -> int:
-    """Count the processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _bare_id(env_id: str) -> str:

@@ -10,7 +10,7 @@ from sb3_tdpg.information import (
     CriticEstimator,
     InformationBatch,
 )
-from sb3_tdpg.information.density_critic import Encoded
+from sb3_tdpg.measurement.density_critic import Encoded
 
 CRITICS = sorted(name for name, cls in ESTIMATORS.items() if issubclass(cls, CriticEstimator))
 CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))

@@ -101,7 +101,7 @@ class LoopTDPG:
         )
 
     def epoch(self, randomness: Randomness) -> None:
-        """Make one policy epoch (alg:trv-policy)."""
+        """Make one policy epoch."""
         episodes = self.rollouts(randomness)
         if self.mi_coef > 0:
             self.fit_critics(episodes, randomness.minibatches)
@@ -167,7 +167,7 @@ class LoopTDPG:
     # -- mutual information ---------------------------------------------------------------------------------------
 
     def fit_critics(self, episodes: list[Episode], minibatches: list[list[Minibatch]]) -> None:
-        """Fit one critic after the other (alg:mine)."""
+        """Fit one critic after the other."""
         for t in range(self.horizon):
             states = [episode.states[t] for episode in episodes]
             trvs = [episode.trvs[t] for episode in episodes]
@@ -180,7 +180,7 @@ class LoopTDPG:
     def donsker_varadhan(
         self, t: int, states: list[th.Tensor], trvs: list[th.Tensor], minibatch: Minibatch
     ) -> th.Tensor:
-        """The estimate of I[x_t; x~_t] in nats (eq:mine theta fixed), the critic called for one sample at a time."""
+        """The estimate of I[x_t; x~_t] in nats, the critic called for one sample at a time."""
         joint = 0.0
         for i in minibatch.joint:
             joint = joint + self.critics[t](th.cat([states[i], trvs[i]]))[0]
@@ -212,7 +212,7 @@ class LoopTDPG:
         advantages: list[list[float]],
     ) -> None:
         """
-        Make one step of the policy (eq:grad psi, eq:grad phi, eq:lg).
+        Make one step of the policy.
 
         :param advantages: weight of each log-probability, for each episode and time step
         """
@@ -235,7 +235,7 @@ class LoopTDPG:
         self.optimizer.step()
 
     def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> list[th.Tensor]:
-        """Compute the TRVs of an episode again, now as functions of the encoder's parameters (eq:lg)."""
+        """Compute the TRVs of an episode again, now as functions of the encoder's parameters."""
         trvs = []
         trv = th.zeros(self.trv_dim)
         for t in range(self.horizon):

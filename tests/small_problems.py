@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.lava import LavaEnv
-from sb3_tdpg.runs import complete_run
+from sb3_tdpg.experiments.runs import complete_run
 
 TINY_CRITIC = dict(hidden_sizes=(8,), batch_size=5, gradient_steps=2, warmup_gradient_steps=4, refit_gradient_steps=4)
 

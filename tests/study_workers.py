@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 import optuna
 
-from sb3_tdpg.studies import enqueue_once, open_storage, open_study, quiet_optuna, work
+from sb3_tdpg.experiments.studies import enqueue_once, open_storage, open_study, quiet_optuna, work
 
 HEARTBEAT_INTERVAL, GRACE_PERIOD = 0.5, 2.0
 JOBS = [{"x": x} for x in (-2, -1, 0, 1, 2, 3)]

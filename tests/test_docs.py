@@ -21,7 +21,7 @@ from sb3_tdpg.robustness import PERTURBATIONS
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 
-# A block after <!-- no-run --> is run elsewhere, with Ray or a stand-in for the Hub (test_ray_vec_env.py,
+# A block after <!-- no-run --> is run elsewhere, with Ray or a stand-in for the Hub (distributed/test_ray_vec_env.py,
 # hub/test_loading.py); what stands in an indented or quoted block is not one.
 BLOCK = re.compile(r"^(?P<skip><!-- no-run -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 

@@ -135,7 +135,7 @@ def advantages(batch):
 
 
 def score_objective(model, batch):
-    """sum_t A (log q + log pi) at the stored samples, averaged over episodes (eq:grad psi, eq:grad phi)."""
+    """sum_t A (log q + log pi) at the stored samples, averaged over episodes."""
     total = 0.0
     for t in range(T):
         prev = batch.trvs[t - 1] if t > 0 else th.zeros(N, Z).double()
@@ -147,7 +147,7 @@ def score_objective(model, batch):
 
 
 def unrolled(model, batch):
-    """TRVs, means and variances along the recurrence with the noise held fixed (eq:lg)."""
+    """TRVs, means and variances along the recurrence with the noise held fixed."""
     trv, out = th.zeros(N, Z).double(), []
     for t in range(T):
         mean, var = encode(model.policy, batch, t, trv)

@@ -8,10 +8,10 @@ import yaml
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_tdpg import TDPG, SelectionCallback, hyperparams
+from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.training import make_training
 
 BLOCKS = sorted(yaml.safe_load(resources.files(hyperparams).joinpath("tdpg.yml").read_text()))
 ZOO_KEYS = {"n_timesteps", "env_kwargs", "vec_env_wrapper", "callback"}

@@ -20,7 +20,7 @@ import torch as th
 from gymnasium.utils import seeding
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.baselines import get_baseline
+from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
 from sb3_tdpg.networks import BatchedMLP, ELUGradient
 from tests.reference_loop import Episode, LoopTDPG, Minibatch, Randomness, mean_baseline, unbatch

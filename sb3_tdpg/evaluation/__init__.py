@@ -18,7 +18,6 @@ from sb3_tdpg.evaluation.records import evaluate_scenarios
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table
 from sb3_tdpg.evaluation.trajectories import Trajectories, rollout_states
-from sb3_tdpg.provenance import provenance, write_frame_atomically, write_run_config
 
 __all__ = [
     "InformationReport",
@@ -41,7 +40,6 @@ __all__ = [
     "lava_trajectories",
     "paired_difference",
     "probability_of_improvement",
-    "provenance",
     "robustness_curves",
     "rollout_states",
     "save_figure",
@@ -49,6 +47,4 @@ __all__ = [
     "summary_table",
     "training_curves",
     "trv_knowledge",
-    "write_frame_atomically",
-    "write_run_config",
 ]

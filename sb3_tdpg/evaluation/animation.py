@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.evaluation.figures import INK, PALETTE
-from sb3_tdpg.files import replaced_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

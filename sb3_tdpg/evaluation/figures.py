@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pandas as pd
 
+from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.envs.lava import GOAL, LAVA, WALL
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.trajectories import rollout_states
-from sb3_tdpg.files import replaced_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -24,15 +24,9 @@ from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
 from sb3_tdpg.evaluation.knowledge import state_knowledge
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
-from sb3_tdpg.information import (
-    InformationBatch,
-    InformationInterval,
-    LogDet,
-    TrustBadge,
-    information_interval,
-    trust_checks,
-)
+from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.information.loo import log_density_matrix
+from sb3_tdpg.measurement import InformationInterval, TrustBadge, information_interval, trust_checks
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import read_problem
 

@@ -13,15 +13,15 @@ import numpy as np
 import pandas as pd
 import torch as th
 
+from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.envs.textures import load_texture
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
 from sb3_tdpg.information import InformationBatch
-from sb3_tdpg.information.density_critic import Regression
-from sb3_tdpg.information.interval import component_estimates
-from sb3_tdpg.information.interval_bounds import MAX_TRAINING
-from sb3_tdpg.threads import threads
+from sb3_tdpg.measurement.density_critic import Regression
+from sb3_tdpg.measurement.interval import component_estimates
+from sb3_tdpg.measurement.interval_bounds import MAX_TRAINING
 from sb3_tdpg.vec_env import make_episodes_env
 
 # Walls that no policy was trained or tested on.

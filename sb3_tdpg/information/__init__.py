@@ -7,14 +7,11 @@ A new estimator is a file of its own here and a row in :data:`ESTIMATORS`.
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.infonce import InfoNCE
-from sb3_tdpg.information.interval import InformationInterval, information_interval
 from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
-from sb3_tdpg.information.pairs import InformationEstimate, estimate_information
 from sb3_tdpg.information.smile import Smile
-from sb3_tdpg.information.trust import TrustBadge, TrustCheck, trust_checks
 from sb3_tdpg.information.vib import VariationalBottleneck
 
 ESTIMATORS: dict[str, type[InformationEstimator]] = {
@@ -49,20 +46,13 @@ __all__ = [
     "CriticEstimator",
     "InfoNCE",
     "InformationBatch",
-    "InformationEstimate",
     "InformationEstimator",
-    "InformationInterval",
     "LeaveOneOut",
     "LogDet",
     "Mine",
     "Nwj",
     "Smile",
-    "TrustBadge",
-    "TrustCheck",
     "VariationalBottleneck",
-    "estimate_information",
     "get_estimator_class",
-    "information_interval",
     "own_sample_bound",
-    "trust_checks",
 ]

@@ -27,30 +27,18 @@ class Scores(NamedTuple):
     marginal: th.Tensor  # (T, B, K)
 
 
-class Pairing:
-    """Draws which episodes a state and the TRVs that are paired with it come from; the same for all time steps."""
-
-    def choose(self, size: int, n_episodes: int, n: int, device: th.device) -> th.Tensor:
-        """Choose n different episodes, ``size`` times: ``(size, 1, n)``."""
-        return th.rand(size, 1, n_episodes, device=device).topk(n, dim=2).indices
-
-    def derange(self, n: int, device: th.device) -> th.Tensor:
-        """Give each of n episodes another one, each once: ``(1, n)``."""
-        # A random cyclic order makes a derangement: no state is paired with its own TRVs.
-        order = th.randperm(n, device=device)
-        other = th.empty_like(order)
-        other[order] = order.roll(1)
-        return other[None]
-
-    def refits(self, broken: th.Tensor) -> Iterator[th.Tensor]:
-        """Divide the steps whose critics start anew into those that are fitted together."""
-        if len(broken) > 0:
-            yield broken
+def derange(n: int, device: th.device) -> th.Tensor:
+    """Give each of n episodes another one, each once: ``(n,)``."""
+    # A random cyclic order makes a derangement: no state is paired with its own TRVs.
+    order = th.randperm(n, device=device)
+    other = th.empty_like(order)
+    other[order] = order.roll(1)
+    return other
 
 
 class CriticEstimator(InformationEstimator):
     """
-    T critics F^theta_t(x_t, x~_t) as one batched network (Algorithm 1, alg:mine), fitted to each epoch's rollouts.
+    T critics F^theta_t(x_t, x~_t) as one batched network (Algorithm 1), fitted to each epoch's rollouts.
 
     A subclass says which bound the scores make (:meth:`_bound`), and, where the critic is trained on something else
     than the bound itself, on what (:meth:`_objective`).
@@ -120,7 +108,6 @@ class CriticEstimator(InformationEstimator):
         self.held_out = held_out
         self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
         self.optimizer = FlatAdam(learning_rate)
-        self.pairing = Pairing()
         self.is_warm = False
         self.register_buffer("state_mean", th.zeros(horizon, 1, state_dim))
         self.register_buffer("state_std", th.ones(horizon, 1, state_dim))
@@ -158,7 +145,7 @@ class CriticEstimator(InformationEstimator):
         return Scores(values[:, :n], values[:, n:].unflatten(1, (n, -1)))
 
     def fit(self, batch: InformationBatch) -> dict[str, float]:
-        """Train the critics on the epoch's samples (Algorithm 1, alg:mine); see :class:`InformationEstimator`."""
+        """Train the critics on the epoch's samples (Algorithm 1); see :class:`InformationEstimator`."""
         train, held_out = self._hold_out(batch)
         states, trvs = train.states.detach(), train.trvs.detach()
         if self.standardize:
@@ -178,8 +165,8 @@ class CriticEstimator(InformationEstimator):
 
         # On all episodes, as the policy's loss is.
         broken = steps[self._is_broken(batch)[steps]]
-        for together in self.pairing.refits(broken):
-            self._refit(states, trvs, train.alive, together)
+        if len(broken) > 0:
+            self._refit(states, trvs, train.alive, broken)
         return self._report(len(broken), train, held_out, steps)
 
     def _hold_out(self, batch: InformationBatch) -> tuple[InformationBatch, InformationBatch | None]:
@@ -251,7 +238,7 @@ class CriticEstimator(InformationEstimator):
         for start in range(0, n_gradient_steps, chunk):
             size = min(chunk, n_gradient_steps - start)
             if alive is None:
-                chosen = self.pairing.choose(size, n_episodes, 2 * n, trvs.device)
+                chosen = th.rand(size, 1, n_episodes, device=trvs.device).topk(2 * n, dim=2).indices
             else:
                 # Dead episodes sort to the end; steps with fewer than 2n living ones are not trained on.
                 priority = th.rand(size, *alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
@@ -324,8 +311,7 @@ class CriticEstimator(InformationEstimator):
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         states, trvs = self._scale(batch.states, t), batch.trvs
         n = trvs.shape[1]
-        other = self.pairing.derange(n, trvs.device)
-        other_trvs = trvs[th.arange(len(trvs), device=trvs.device)[:, None], other]
+        other_trvs = trvs[:, derange(n, trvs.device)]
         inputs = self._pair(states, trvs, other_trvs)
         values = self.critic(inputs) if t is None else self.critic.at(inputs[0], t)[None]
         return self._bound(self._split(values, n))

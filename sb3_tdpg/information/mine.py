@@ -18,12 +18,12 @@ def log_mean_exp(x: th.Tensor) -> th.Tensor:
 
 class Mine(CriticEstimator):
     r"""
-    The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (equation 8, eq:kl mine).
+    The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (equation 8).
 
     A lower bound for a fixed critic on *fresh* samples, but for the bias of the logarithm of a mean: it is upward, and
     small with many samples. On the samples that the critic was fitted to it is neither, and tends to be too high.
 
-    :param ema_decay: With it the denominator of the critic's gradient (equation 10, eq:grad mine) is an exponential
+    :param ema_decay: With it the denominator of the critic's gradient (equation 10) is an exponential
         moving average over the gradient steps, to lessen the bias of minibatches. It is the weight **on the past**:
         0.99 averages over about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no
         averaging. ``None``: each minibatch's own mean.
@@ -49,7 +49,7 @@ class Mine(CriticEstimator):
         return scores.joint.mean(dim=1) - log_mean_exp(scores.marginal)
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """In closed form (equation 10, eq:grad mine): -1 / B at the joint samples, a softmax at the marginal ones."""
+        """In closed form (equation 10): -1 / B at the joint samples, a softmax at the marginal ones."""
         gradient = th.zeros_like(values)
         marginal = values[rows, n:, 0]
         gradient[rows, :n, 0] = -1.0 / n

@@ -11,12 +11,14 @@ import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
+from sb3_tdpg.common.files import write_atomically
+from sb3_tdpg.common.provenance import check_same_config, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import information_report, provenance, save_figure, write_frame_atomically, write_run_config
+from sb3_tdpg.evaluation import information_report, save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
-from sb3_tdpg.files import write_atomically
-from sb3_tdpg.provenance import check_same_config
+from sb3_tdpg.paper.common import how_made
 from sb3_tdpg.report.figures import (
     comparison_figure,
     degradation_curves,
@@ -30,11 +32,9 @@ from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, write_page
 from sb3_tdpg.report.records import Plan, complete_rows
 from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
-from sb3_tdpg.reproduction.common import how_made
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.tdpg import TDPG
-from sb3_tdpg.threads import threads
 from sb3_tdpg.vec_env import make_episodes_env
 
 N_EPISODES = {"image": 100, "vector": 500}

@@ -15,12 +15,12 @@ import pandas as pd
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
+from sb3_tdpg.common.provenance import write_frame_atomically
+from sb3_tdpg.common.threads import set_threads, threads
 from sb3_tdpg.evaluation.records import run_episodes
-from sb3_tdpg.provenance import write_frame_atomically
 from sb3_tdpg.report.models import Source, load_all
 from sb3_tdpg.report.rows import Row
 from sb3_tdpg.robustness import PerturbedVecEnv
-from sb3_tdpg.threads import set_threads, threads
 
 COLUMNS = ("episode", "cost", "length", "failure")
 """Of :func:`~sb3_tdpg.evaluation.records.run_episodes`, what is kept; a failure only if it is known."""

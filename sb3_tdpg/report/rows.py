@@ -11,8 +11,8 @@ from typing import Any
 
 from gymnasium import spaces
 
+from sb3_tdpg.common.provenance import jsonable
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
-from sb3_tdpg.provenance import jsonable
 from sb3_tdpg.robustness import applicable, scene_perturbations
 from sb3_tdpg.robustness.registry import N_SEVERITIES, find
 

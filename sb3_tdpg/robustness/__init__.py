@@ -1,7 +1,7 @@
 """
 Robustness: perturbations of what a policy observes, in five severities, for any environment.
 
-They are for the evaluation of policies; :mod:`sb3_tdpg.perturbation` has what images go through in training.
+They are for the evaluation of policies; :mod:`sb3_tdpg.robustness.training` has what images go through in training.
 """
 
 from sb3_tdpg.robustness.gallery import perturbation_gallery

@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
-from sb3_tdpg.provenance import write_run_config
+from sb3_tdpg.common.provenance import write_run_config
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import batched_class, default_n_envs, make_episodes_env
 from sb3_tdpg.zoo.blocks import check_block, find_file

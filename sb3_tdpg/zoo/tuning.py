@@ -23,11 +23,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.callbacks import SelectionCallback
-from sb3_tdpg.evaluation import write_frame_atomically, write_run_config
+from sb3_tdpg.common.files import write_atomically
+from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.files import write_atomically
-from sb3_tdpg.provenance import check_same_config
-from sb3_tdpg.studies import open_storage, open_study, quiet_optuna, work
+from sb3_tdpg.experiments.studies import open_storage, open_study, quiet_optuna, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample

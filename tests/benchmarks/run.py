@@ -28,12 +28,11 @@ from tests.benchmarks.speed.critics import bench_critics  # noqa: E402
 from tests.benchmarks.speed.environments import bench_camera, bench_environment  # noqa: E402
 from tests.benchmarks.speed.grasping import GraspTrials, bench_grasp, bench_processes  # noqa: E402
 from tests.benchmarks.speed.measure import FULL, QUICK, format_table  # noqa: E402
-from tests.benchmarks.speed.training import bench_batch, bench_epoch, bench_training  # noqa: E402
+from tests.benchmarks.speed.training import bench_epoch, bench_training  # noqa: E402
 
 PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
 BENCHES = (
     bench_epoch,
-    bench_batch,
     bench_critics,
     bench_training,
     bench_environment,

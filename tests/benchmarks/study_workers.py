@@ -24,9 +24,9 @@ sys.path.insert(0, str(REPOSITORY))
 
 import optuna  # noqa: E402
 
+from sb3_tdpg.experiments.studies import open_storage, open_study, quiet_optuna, work  # noqa: E402
+from sb3_tdpg.experiments.training import make_training  # noqa: E402
 from sb3_tdpg.hyperparams import load_hyperparams  # noqa: E402
-from sb3_tdpg.studies import open_storage, open_study, quiet_optuna, work  # noqa: E402
-from sb3_tdpg.training import make_training  # noqa: E402
 
 GOAL = 1.8  # times as fast with two workers
 

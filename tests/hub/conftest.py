@@ -6,8 +6,8 @@ import pytest
 from published_cards import REPO_ID, TINY
 
 from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hub import write_model_card
-from sb3_tdpg.runs import Run, complete_run
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -13,7 +13,7 @@ from small_problems import assert_same_parameters, lava_env, parameters
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.hub import load_from_hub
-from sb3_tdpg.model_card import model_name
+from sb3_tdpg.hub.model_card import model_name
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 huggingface_hub = pytest.importorskip("huggingface_hub")

@@ -16,10 +16,10 @@ from small_problems import assert_same_parameters, parameters, tiny_tdpg, train_
 from sb3_tdpg import TDPG
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.experiments.rerun import rerun
 from sb3_tdpg.hub import pull_from_hub, write_model_card
-from sb3_tdpg.model_card import results_with_intervals
-from sb3_tdpg.publication import Publication, read_run
-from sb3_tdpg.rerun import rerun
+from sb3_tdpg.hub.model_card import results_with_intervals
+from sb3_tdpg.hub.publication import Publication, read_run
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 

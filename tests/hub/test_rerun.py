@@ -12,8 +12,8 @@ from published_cards import blocks
 from small_problems import assert_same_parameters, parameters
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.rerun import main as rerun_main
-from sb3_tdpg.rerun import rerun
+from sb3_tdpg.experiments.rerun import main as rerun_main
+from sb3_tdpg.experiments.rerun import rerun
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -30,7 +30,7 @@ def test_the_command_in_the_card_makes_the_run_again(card, runs, tmp_path):
 
 
 def test_a_rerun_keeps_to_the_recorded_settings_whatever_became_of_the_block(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_tdpg.runs.load_hyperparams", lambda block: pytest.fail("it reads the block"))
+    monkeypatch.setattr("sb3_tdpg.experiments.runs.load_hyperparams", lambda block: pytest.fail("it reads the block"))
     rerun(runs / "pg-seed0" / "config.json", tmp_path / "again", progress_bar=False)
     assert (tmp_path / "again" / "episodes.csv").read_bytes() == (runs / "pg-seed0" / "episodes.csv").read_bytes()
     assert TDPG.load(tmp_path / "again" / "model.zip", device="cpu").mi_coef == 0  # beta is inf, and not a text

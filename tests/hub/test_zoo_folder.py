@@ -15,10 +15,11 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.common.provenance import provenance
 from sb3_tdpg.envs.scenarios import LAVA
-from sb3_tdpg.evaluation import evaluate_scenarios, provenance
+from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.hub import write_model_card
-from sb3_tdpg.publication import read_publication
+from sb3_tdpg.hub.publication import read_publication
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""An epoch of TDPG, trainings as one batch, and a step of training."""
+"""An epoch of TDPG and a step of training."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_tdpg import TDPG, make_episodes_env
-from sb3_tdpg.training_batch import Member, TrainingBatch
 from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
 from tests.reference_loop import LoopTDPG, draw_randomness
 
@@ -41,28 +40,6 @@ def bench_epoch(sizes: Sizes) -> Iterable[Row]:
         sizes.loop_repetitions,
         goal=100,
     )
-
-
-def bench_batch(sizes: Sizes) -> Iterable[Row]:
-    """Compare eight trainings as one batch with one alone, for each training; the critics' warm-up counts."""
-    n_timesteps = 5 * sizes.n_episodes * 4 * sizes.epochs
-
-    def models(n: int, estimator: str) -> list[TDPG]:
-        return [
-            TDPG("TRVPolicy", "Lava-v0", mi_estimator=estimator, n_episodes=sizes.n_episodes, seed=seed, device="cpu")
-            for seed in range(n)
-        ]
-
-    for estimator in ("logdet", "mine"):
-        yield compare(
-            f"training on Lava, N={sizes.n_episodes}, {4 * sizes.epochs} epochs, {estimator}: eight seeds as one batch "
-            "against one by one, for each seed",
-            lambda name=estimator: seconds(
-                TrainingBatch([Member(model, n_timesteps) for model in models(8, name)]).learn, units=8
-            ),
-            lambda name=estimator: seconds(lambda: models(1, name)[0].learn(n_timesteps)),
-            sizes.loop_repetitions,
-        )
 
 
 def bench_training(sizes: Sizes) -> Iterable[Row]:

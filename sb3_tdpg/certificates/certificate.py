@@ -1,0 +1,242 @@
+r"""
+An upper bound on the expected cost under every distribution that is close to the training distribution.
+
+The Donsker-Varadhan formula gives, for every :math:`\beta > 0`,
+
+.. math::
+    \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
+    \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c},
+
+and the right side is known from costs under p alone. It corrects the paper's Theorem II.1; the derivation is in ``docs/guide/certificate.md``.
+
+Dimension key: N episodes, M points of a distribution.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+try:
+    from scipy.optimize import minimize_scalar
+    from scipy.stats import beta as beta_distribution
+except ImportError as e:
+    raise ImportError("certificates need scipy: pip install sb3_tdpg[plots]") from e
+
+# All of the highest costs, then steps of this factor in the rank: of a million costs 400 remain.
+_HIGHEST = 50
+_RANK_FACTOR = 1.04
+
+
+class CostDistribution(NamedTuple):
+    """A distribution on M values that lies, with some confidence, stochastically above that of a cost."""
+
+    values: np.ndarray
+    """``(M,)``, ascending."""
+    probabilities: np.ndarray
+    """``(M,)``: of the values."""
+    confidence: float | None
+    """With which it lies above; None: no allowance for the sampling error was made."""
+
+    def with_largest(self, probability: float) -> CostDistribution:
+        """
+        Raise the cost to the largest value in an event of this probability, of which nothing else is known.
+
+        At worst the event is where the cost is lowest.
+
+        :param probability: Of the event.
+        """
+        below = np.clip(np.cumsum(self.probabilities) - probability, 0.0, 1.0)
+        below[-1] = 1.0
+        return self._replace(probabilities=np.diff(below, prepend=0.0))
+
+    def capped(self, level: float) -> tuple[CostDistribution, float]:
+        """
+        Cut off the upper tail: move it to the least value of the sample that a cost exceeds with at most ``level``.
+
+        :param level: A probability. Where the sample is too small for it, its largest value is the cap.
+        :return: the distribution of the capped cost, and the probability of a cost above the cap
+        """
+        n = len(self.values) - (self.confidence is not None)  # the last value is then no cost of the sample
+        below = np.cumsum(self.probabilities)[:n]
+        last = min(int(np.searchsorted(below, 1 - level)), n - 1)
+        kept = np.append(self.probabilities[:last], 1 - (below[last - 1] if last else 0.0))
+        return self._replace(values=self.values[: last + 1], probabilities=kept), max(0.0, 1 - float(below[last]))
+
+
+class Certificate(NamedTuple):
+    """A bound on an expected cost, and what it is made of: ``bound = risk + kl / beta``."""
+
+    bound: float
+    """On the expected cost."""
+    beta: float
+    """The best one, or the one given. inf: the bound is the largest cost; 0: it is the mean."""
+    risk: float
+    """The entropic risk at beta, with the allowance for the sampling error."""
+    kl: float
+    """The divergence in nats that the bound is for."""
+    confidence: float | None
+    """With which the bound holds; None: no allowance for the sampling error was made."""
+
+
+def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:
+    r"""
+    Entropic risk :math:`\rho_\beta[c] = \frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
+
+    It is equation 4.
+
+    :param costs: ``(N,)``
+    :param beta: At least 0; 0 gives the limit, the mean.
+    :param probabilities: Of the costs, ``(N,)``; default: 1 / N each.
+    :raises ValueError: if a cost is not finite, or beta is negative or not finite.
+    """
+    costs = _checked_costs(costs)
+    if not (np.isfinite(beta) and beta >= 0):
+        raise ValueError(f"beta={beta} must be finite and at least 0")
+    weights = np.full(len(costs), 1 / len(costs)) if probabilities is None else np.asarray(probabilities)
+    return _risk(costs, weights, beta)
+
+
+def _risk(values: np.ndarray, weights: np.ndarray, beta: float) -> float:
+    mean = float(weights @ values)
+    if beta == 0:
+        return mean
+    # Around the mean, since the difference from it is of the order of beta; the largest exponent is taken out before
+    # the exponential. This is scipy's logsumexp without its checks, which take ten times as long as the sum.
+    exponents = beta * (values - mean)
+    largest = float(exponents.max())
+    if largest < 1:  # so small a difference from 1 would be lost
+        return mean + math.log1p(float(weights @ np.expm1(exponents))) / beta
+    return mean + (largest + math.log(float(weights @ np.exp(exponents - largest)))) / beta
+
+
+def cost_distribution(
+    costs: np.ndarray, cost_bound: float | None = None, confidence: float | None = 0.95
+) -> CostDistribution:
+    r"""
+    Turn a sample of costs into a distribution above that of the cost, by a confidence band.
+
+    The i-th lowest of N costs has :math:`F(c_{(i)})` above a Beta(i, N + 1 - i) variable. Its lower quantiles at
+    ``1 - confidence``, divided by the number of ranks i that are used, hold at once (Bonferroni), and the step function
+    through them is a lower bound on F. What F lacks at the highest cost, about ``log(400 / (1 - confidence)) / N``, is
+    put at ``cost_bound``. So *every* mean of an increasing function is bounded at once: the entropic risk for all beta,
+    and optimising over beta costs nothing (Anderson's bound, 1969, with a band that is narrow in the tail, where
+    Dvoretzky, Kiefer and Wolfowitz's is wide: :math:`N^{-1}` against :math:`N^{-1/2}`).
+
+    :param costs: Independent and identically distributed, ``(N,)``.
+    :param cost_bound: What the cost of no episode can exceed.
+    :param confidence: Probability with which the band holds; ``None``: the distribution of the sample itself, on the
+        same ranks, without any allowance for the sampling error.
+    :raises ValueError: if a cost is not finite or exceeds the bound, or a confidence is asked for without a bound.
+    """
+    costs = np.sort(_checked_costs(costs))
+    n = len(costs)
+    ranks = _ranks(n)
+    if confidence is None:
+        below, values = ranks / n, costs[ranks - 1]
+    else:
+        check_allowance(confidence, cost_bound)
+        assert cost_bound is not None
+        if costs[-1] > cost_bound:
+            raise ValueError(
+                f"a cost of {costs[-1]:g} exceeds cost_bound={cost_bound:g}: give a larger bound, or certify the "
+                "clipped cost, np.minimum(costs, cost_bound)"
+            )
+        below = beta_distribution.ppf((1 - confidence) / len(ranks), ranks, n + 1 - ranks)
+        below, values = np.append(below, 1.0), np.append(costs[ranks - 1], cost_bound)
+    return CostDistribution(values, np.diff(below, prepend=0.0), confidence)
+
+
+def check_allowance(confidence: float | None, cost_bound: float | None) -> None:
+    """Raise a ``ValueError`` if a confidence is none, or is asked for without a bound on the cost."""
+    if confidence is None:
+        return
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence={confidence} must lie between 0 and 1, or be None for no allowance")
+    if cost_bound is None or not np.isfinite(cost_bound):
+        raise ValueError(
+            f"cost_bound={cost_bound} must be finite for a confidence of {confidence}: without it one rare episode "
+            "could cost anything; give the largest cost that an episode can have, or confidence=None for an "
+            "estimate without allowance for the sampling error"
+        )
+
+
+def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = None) -> Certificate:
+    r"""
+    Bound the mean under any distribution within ``kl`` nats: the least of ``risk + kl / beta`` over beta.
+
+    With :math:`s = 1 / \beta` the function is :math:`s \log \mathbb E\, e^{c / s} + s\, \mathbb D`: the perspective of
+    a convex function plus a linear one, hence convex in s, hence quasi-convex in beta and in log beta, and a local
+    search finds the least value. Any beta gives a valid bound. The least is also the largest mean that a distribution
+    within ``kl`` nats has, so nothing better can be said from the distribution and ``kl`` alone.
+
+    :param distribution: From :func:`cost_distribution`.
+    :param kl: D[shifted || training] in nats, or more; inf gives the largest cost.
+    :param beta: Fix it instead of searching.
+    """
+    if not kl >= 0:
+        raise ValueError(f"kl={kl} must be at least 0")
+    values, weights, confidence = distribution
+    largest = float(values[-1])
+    if beta is not None:
+        if not (np.isfinite(beta) and beta > 0):
+            raise ValueError(f"beta={beta} must be finite and positive, or None to search for the best one")
+        risk = _risk(values, weights, beta)
+        return Certificate(risk + kl / beta, beta, risk, kl, confidence)
+    width = largest - float(values[0])
+    if kl == 0 or width == 0:
+        mean = float(weights @ values)
+        return Certificate(mean, 0.0, mean, kl, confidence)
+    # The distribution that has all its weight on the largest value is this far away.
+    if kl >= -math.log(max(float(weights[values == largest].sum()), 1e-300)):
+        return Certificate(largest, math.inf, largest, kl, confidence)
+
+    def objective(log_s: float) -> float:
+        s = width * math.exp(log_s)
+        return _risk(values, weights, 1 / s) + kl * s
+
+    best = minimize_scalar(objective, bounds=(-15.0, 15.0), method="bounded", options=dict(xatol=1e-3))
+    found = 1 / (width * math.exp(float(best.x)))
+    bound = min(float(best.fun), largest)
+    return Certificate(bound, found, bound - kl / found, kl, confidence)
+
+
+def certificate(
+    costs: np.ndarray,
+    kl: float,
+    *,
+    cost_bound: float | None = None,
+    confidence: float | None = 0.95,
+    beta: float | None = None,
+) -> Certificate:
+    """
+    Bound the expected cost under a shift from costs in training (equation 6, corrected).
+
+    :param costs: Of independent episodes in training, ``(N,)``.
+    :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.
+    :param cost_bound: What the cost of no episode can exceed. Costs that may be larger can be clipped:
+        ``np.minimum(costs, cost_bound)``; the certificate is then one of the clipped cost.
+    :param confidence: Of the allowance for the sampling error; ``None``: no allowance, an estimate and no bound.
+    :param beta: Fix it instead of taking the best.
+    :raises ValueError: see :func:`cost_distribution` and :func:`worst_mean`.
+    """
+    return worst_mean(cost_distribution(costs, cost_bound, confidence), kl, beta)
+
+
+def _ranks(n: int) -> np.ndarray:
+    """Ranks from 1 to n: all of the highest, then fewer and fewer, and at even steps below the middle."""
+    from_top: list[np.ndarray] = [np.arange(min(_HIGHEST, n))]
+    if n > _HIGHEST:
+        n_steps = math.ceil(math.log(n / (2 * _HIGHEST) + 1) / math.log(_RANK_FACTOR))
+        from_top += [_HIGHEST * _RANK_FACTOR ** np.arange(n_steps), np.linspace(n / 2, n - 1, 100)]
+    ranks = n - np.unique(np.concatenate(from_top).astype(np.int64).clip(0, n - 1))
+    return ranks[::-1]
+
+
+def _checked_costs(costs: np.ndarray) -> np.ndarray:
+    costs = np.asarray(costs, dtype=np.float64)
+    if costs.ndim != 1 or len(costs) == 0 or not np.isfinite(costs).all():
+        raise ValueError(f"costs must be a vector of finite numbers, one for each episode, and not {costs!r}")
+    return costs

@@ -1,0 +1,443 @@
+r"""
+Declared shifts of sensor and start, and how far they move the distribution over episodes, in nats.
+
+What the actions depend on passes through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. A shift of the sensor
+therefore moves states and actions by no more than it moves the TRVs, and the encoder's density is known. The derivation
+is in ``docs/guide/certificate.md``.
+
+Dimension key: T horizon, N episodes, X state, Z TRVs.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from scipy.special import betaln, digamma
+from stable_baselines3.common.utils import obs_as_tensor
+from torch.distributions import Normal, kl_divergence
+
+from sb3_tdpg.certificates.certificate import (
+    Certificate,
+    CostDistribution,
+    check_allowance,
+    cost_distribution,
+    worst_mean,
+)
+from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.randomness import isolated_randomness
+from sb3_tdpg.information import InformationBatch, LogDet
+from sb3_tdpg.vec_env import BatchedVecEnv
+
+EPISODES_AT_A_TIME = 100_000
+"""Episodes run side by side; a constant, because results depend on it."""
+
+INFORMATION_EPISODES = 4_000
+"""Episodes for the bound on the information."""
+
+# Streams of random numbers.
+_START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)
+
+EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+"""Shares of the episodes whose divergence is not counted in full; the best one is taken, after the fact."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """
+    A declared change of the sensor and of the distribution of the start; the dynamics and the cost stay.
+
+    :param name: For tables.
+    :param env_kwargs: Keywords of the shifted environment beside those of the training.
+    :param start_kl: D[shifted start || start in training] in nats.
+    :param sensor_kl: The largest D[shifted sensor || sensor in training] of one observation, over all states; inf if it
+        is not known.
+    """
+
+    name: str
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    start_kl: float = 0.0
+    sensor_kl: float = math.inf
+
+
+class Budget(NamedTuple):
+    """How far a shift moves the TRVs; see :meth:`TrainingEpisodes.budgets`."""
+
+    kl: float
+    """Nats."""
+    exceedance: float
+    """Probability, in training, of episodes whose divergence is not counted in full."""
+
+
+class ShiftCertificate(NamedTuple):
+    """What is certified for one shift."""
+
+    bound: float
+    """The least of the following three."""
+    through_trvs: float
+    """By the divergence of the TRVs."""
+    through_sensor: float
+    """By that of the sensor, which does not know the policy."""
+    trivial: float
+    """What no episode can cost more than."""
+    budget: Budget
+    """The divergence of the TRVs that ``through_trvs`` is for."""
+    sensor_kl: float
+    """Divergence of the sensor over the whole episode, with the start's, in nats."""
+
+
+class RecordedEpisodes(NamedTuple):
+    """N episodes and the random numbers that drove their sensor."""
+
+    costs: np.ndarray  # (N,)
+    states: np.ndarray  # (T, N, X)
+    prev_trvs: th.Tensor  # (T, N, Z), x~_{t-1}
+    last_trv_noise: th.Tensor  # (N, Z), eps_{T-1}
+    densities: list[Normal]  # of the TRVs at each step, (N, Z), and of the last actions, (N, U)
+    seed: tuple[int, ...]  # of the sensor
+
+    def first(self, n: int | None) -> RecordedEpisodes:
+        """Return the first n of them."""
+        return RecordedEpisodes(
+            self.costs[:n],
+            self.states[:, :n],
+            self.prev_trvs[:, :n],
+            self.last_trv_noise[:n],
+            [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities],
+            self.seed,
+        )
+
+
+def gaussian_kl(bias: np.ndarray, std: float, training_std: float) -> float:
+    """D[N(bias, std^2 I) || N(0, training_std^2 I)] in nats; inf if one of the two has no noise."""
+    if std == training_std and not bias.any():
+        return 0.0
+    if std == 0 or training_std == 0:
+        return math.inf
+    ratio = (std / training_std) ** 2
+    return float(0.5 * (len(bias) * (ratio - 1 - math.log(ratio)) + (bias**2).sum() / training_std**2))
+
+
+def beta_kl(a: float, b: float) -> float:
+    """D[Beta(a, b) || uniform] in nats."""
+    return float(-betaln(a, b) + (a - 1) * digamma(a) + (b - 1) * digamma(b) - (a + b - 2) * digamma(a + b))
+
+
+def lava_shift(
+    name: str,
+    *,
+    sensor_noise_std: float | None = None,
+    sensor_bias: Sequence[float] | None = None,
+    start_beta: Sequence[float] | None = None,
+    training_noise_std: float = 0.01,
+) -> Shift:
+    """
+    Declare a shift of the lava problem; see :class:`~sb3_tdpg.envs.lava.LavaEnv` for the keywords.
+
+    In training the sensor must have no bias, and the start must be uniform: the divergences are from there.
+
+    :param training_noise_std: The sensor noise in training.
+    """
+    noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
+    bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
+    given = dict(sensor_noise_std=sensor_noise_std, sensor_bias=sensor_bias, start_beta=start_beta)
+    return Shift(
+        name,
+        {key: value for key, value in given.items() if value is not None},
+        0.0 if start_beta is None else beta_kl(*start_beta),
+        gaussian_kl(bias, noise, training_noise_std),
+    )
+
+
+def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.01) -> list[Shift]:
+    """
+    Draw shifts of the lava problem: noise, bias and start, each changed with probability 1/2, at least one of them.
+
+    The noise's variance is log-uniform in [1e-6, 1], the bias has any direction and a length that is log-uniform in
+    [0.001, 1], the start is Beta(a, b) with a and b log-uniform in [1/2, 2].
+
+    :param n: How many.
+    :param seed: Of the draws.
+    :param training_noise_std: The sensor noise in training.
+    """
+    random = np.random.default_rng(seed)
+    shifts: list[Shift] = []
+    while len(shifts) < n:
+        has_noise, has_bias, has_start = random.random(3) < 0.5
+        noise, length = 10.0 ** random.uniform((-3.0, -3.0), (0.0, 0.0))
+        angle = random.uniform(0, 2 * math.pi)
+        start = 2.0 ** random.uniform(-1, 1, 2)
+        if has_noise or has_bias or has_start:
+            shift = lava_shift(
+                f"shift {len(shifts)}",
+                sensor_noise_std=float(noise) if has_noise else None,
+                sensor_bias=(float(length * math.cos(angle)), float(length * math.sin(angle))) if has_bias else None,
+                start_beta=(float(start[0]), float(start[1])) if has_start else None,
+                training_noise_std=training_noise_std,
+            )
+            shifts.append(shift)
+    return shifts
+
+
+class TrainingEpisodes:
+    """
+    What a certificate is made from: recorded episodes in training, and the encoder.
+
+    Nothing is ever run in a shifted environment; only its sensor is asked what it would have shown of recorded states.
+
+    :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
+    :param scenario: The training environment, one of this plugin's.
+    :param cost_bound: What the cost of no episode can exceed. The cost is clipped there: with less than the true bound
+        (:attr:`LavaEnv.cost_bound <sb3_tdpg.envs.lava.LavaEnv.cost_bound>`) the clipped cost is certified.
+    :param n_episodes: For the distribution of the cost.
+    :param n_budget_episodes: The first of them, for the divergence of the TRVs.
+    :param confidence: With which all certificates of this object hold, each; ``None``: without allowance for the
+        sampling error. Half of the error probability goes to the cost's distribution, half to the divergence.
+    :param seed: Of the episodes.
+    :raises ValueError: if the environment is none of this plugin's, the model's own environment normalises, or a number
+        does not fit; no episode has been run by then.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        scenario: Scenario,
+        *,
+        cost_bound: float,
+        n_episodes: int = 1_000_000,
+        n_budget_episodes: int = 50_000,
+        confidence: float | None = 0.95,
+        seed: int = 0,
+    ) -> None:
+        if not 1 <= n_budget_episodes <= min(n_episodes, EPISODES_AT_A_TIME):
+            raise ValueError(
+                f"n_budget_episodes={n_budget_episodes} must be at least 1 and at most n_episodes={n_episodes} and "
+                f"{EPISODES_AT_A_TIME}"
+            )
+        check_allowance(confidence, cost_bound)
+        self.model, self.scenario, self.seed = model, scenario, seed
+        self._env = _pomdp(model, scenario)
+        costs: list[np.ndarray] = []
+        for i in range(math.ceil(n_episodes / EPISODES_AT_A_TIME)):
+            n = min(EPISODES_AT_A_TIME, n_episodes - i * EPISODES_AT_A_TIME)
+            episodes = record_episodes(model, self._env, n, (seed, i))
+            costs.append(episodes.costs)
+            if i == 0:
+                self.recorded = episodes.first(n_budget_episodes)
+                self.information = _information(episodes.first(INFORMATION_EPISODES))
+        self.costs = np.concatenate(costs)
+        self._allow(confidence, cost_bound)
+
+    def allowing(self, confidence: float | None, cost_bound: float | None = None) -> TrainingEpisodes:
+        """
+        Return the same episodes with another allowance for the sampling error, or another bound on the cost.
+
+        :param confidence: See the class.
+        :param cost_bound: See the class; default: as it is.
+        """
+        other = copy.copy(self)
+        other._allow(confidence, self.cost_bound if cost_bound is None else cost_bound)
+        return other
+
+    @property
+    def true_cost_bound(self) -> float:
+        """What the environment says that no episode can exceed (its attribute ``cost_bound``), or inf."""
+        return float(getattr(self._env, "cost_bound", math.inf))
+
+    def _allow(self, confidence: float | None, cost_bound: float) -> None:
+        self.confidence, self.cost_bound = confidence, cost_bound
+        share = None if confidence is None else (1 + confidence) / 2
+        self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, share)
+
+    def divergences(self, shift: Shift, n_episodes: int | None = None) -> np.ndarray:
+        """
+        Divergences at each step of each recorded episode, given the noise that couples the two sensors.
+
+        :param shift: Of the sensor.
+        :param n_episodes: Use the first of them; default: all.
+        :return: at each step that of the TRVs, D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] in nats, and in
+            a last row that of the last step's actions: ``(T + 1, N)``
+        """
+        recorded = self.recorded.first(n_episodes)
+        shifted = encode(self.model, _pomdp(self.model, self._shifted(shift)), recorded)
+        return _divergences(shifted, recorded.densities)
+
+    def budgets(self, shift: Shift, n_episodes: int | None = None) -> list[Budget]:
+        """
+        Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
+
+        Step by step: the mean of a step's divergence under the *shifted* distribution is at most its worst mean within
+        the divergence of the steps before. A step's divergence is counted up to a cap. The shift is taken to be undone
+        in a step where it is larger, and the episode to cost all that it can.
+
+        :param shift: Of sensor and start.
+        :param n_episodes: Use the first of the recorded episodes; default: all.
+        :return: for each cap of ``EXCEEDANCE_LEVELS``; all hold at once
+        """
+        divergences = self.divergences(shift, n_episodes)
+        share = None if self.confidence is None else 1 - (1 - self.confidence) / (2 * len(divergences))
+        steps = [cost_distribution(divergence, float(divergence.max()), share) for divergence in divergences]
+        return [_budget(steps, shift.start_kl, level) for level in EXCEEDANCE_LEVELS]
+
+    def certify(self, shift: Shift, n_episodes: int | None = None) -> ShiftCertificate:
+        """
+        Bound the expected cost under a shift, clipped at ``cost_bound``.
+
+        The certificates through the TRVs and the one through the sensor hold at once, so that the lowest counts.
+
+        :param shift: Of sensor and start.
+        :param n_episodes: Use the first of the recorded episodes for the divergence of the TRVs; default: all.
+        """
+        trivial = self.cost_bound
+        candidates = [
+            (worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl).bound, budget)
+            for budget in self.budgets(shift, n_episodes)
+        ]
+        through_trvs, budget = min(candidates, key=lambda candidate: candidate[0])
+        sensor_kl = shift.start_kl + len(self.recorded.states) * shift.sensor_kl
+        through_sensor = worst_mean(self.distribution, sensor_kl).bound
+        bound = min(through_trvs, through_sensor, trivial)
+        return ShiftCertificate(bound, through_trvs, through_sensor, trivial, budget, sensor_kl)
+
+    def fixed_beta(self, beta: float, information: float) -> Certificate:
+        """
+        Return the corrected theorem as the paper words it: the budget is ``beta * information``.
+
+        :param beta: The theorem's.
+        :param information: Nats; for the theorem an upper bound on the sum over t of I[x_t; x~_t].
+        """
+        return worst_mean(self.distribution, beta * information, beta)
+
+    def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
+        """
+        Run the shifted environment, to hold a certificate against it.
+
+        :return: the costs of the episodes, ``(N,)``, and the mean divergence of the TRVs (with the start's) along them:
+            what the budget bounds
+        """
+        shifted = record_episodes(self.model, _pomdp(self.model, self._shifted(shift)), n_episodes, (seed, _TEST))
+        by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
+        return shifted.costs, shift.start_kl + float(by_step[:-2].sum() + by_step[-2:].min())
+
+    def _shifted(self, shift: Shift) -> Scenario:
+        return Scenario(shift.name, self.scenario.env_id, {**self.scenario.env_kwargs, **shift.env_kwargs})
+
+
+def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
+    """
+    Run N episodes whose sensor draws random numbers that :func:`encode` can draw again.
+
+    :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
+    :param env: The environment itself.
+    :param n: N
+    :param seed: Of the start, the dynamics, the sensor and the policy.
+    """
+    policy, device, box = model.policy, model.device, env.action_space
+    assert isinstance(box, spaces.Box)  # of every environment of this plugin
+    policy.set_training_mode(False)
+    env.np_random = np.random.default_rng([*seed, _START])
+    state, costs = env._initial_state(n), np.zeros(n)
+    trv = th.zeros(n, policy.trv_dim, device=device)
+    states, prev_trvs, densities = [], [], []
+    policy_seed = int(np.random.SeedSequence([*seed, _POLICY]).generate_state(1)[0])
+    with isolated_randomness(policy_seed, model), th.no_grad():
+        for t in range(env.horizon):
+            env.np_random = np.random.default_rng([*seed, _SENSOR, t])
+            step = policy.step(obs_as_tensor(env._sensor(state), device), trv, np.full(n, t))
+            states.append(state)
+            prev_trvs.append(trv)
+            densities.append(Normal(step.means, step.stds))
+            trv = step.trvs
+            action = np.clip(step.actions.cpu().numpy().reshape((n, *box.shape)), box.low, box.high)
+            costs += env._cost(state, action)
+            env.np_random = np.random.default_rng([*seed, _DYNAMICS, t])
+            state = env._dynamics(state, action)
+        last = _action_density(policy, trv)
+    costs += env._terminal_cost(state)
+    return RecordedEpisodes(costs, np.stack(states), th.stack(prev_trvs), step.noise, [*densities, last], seed)
+
+
+def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal]:
+    """
+    Encode what the sensor of another environment would have shown in recorded episodes.
+
+    The sensor draws the same random numbers as in the episodes, which couples the observations; the noise of the last
+    TRVs is the same, too.
+
+    :return: the densities of the TRVs at each step, and of the last actions
+    """
+    policy, n = model.policy, recorded.states.shape[1]
+    policy.set_training_mode(False)
+    densities: list[Normal] = []
+    with th.no_grad():
+        for t, (state, prev_trv) in enumerate(zip(recorded.states, recorded.prev_trvs, strict=True)):
+            env.np_random = np.random.default_rng([*recorded.seed, _SENSOR, t])
+            observation = obs_as_tensor(env._sensor(state), model.device)
+            densities.append(Normal(*policy.encoder_density(observation, prev_trv, np.full(n, t))))
+        trvs = densities[-1].mean + densities[-1].stddev * recorded.last_trv_noise
+        return [*densities, _action_density(policy, trvs)]
+
+
+def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
+    """Return the density of the last actions."""
+    density = policy.action_density(trvs, np.full(len(trvs), policy.horizon - 1)).distribution
+    return Normal(density.mean, density.stddev)
+
+
+def _information(recorded: RecordedEpisodes) -> float:
+    """Bound the sum over t of I[x_t; x~_t] from above, by the log-det bound."""
+    n_episodes, trv_dim = recorded.last_trv_noise.shape
+    if n_episodes < trv_dim + 2:
+        raise ValueError(
+            f"n_episodes={n_episodes} must be at least {trv_dim + 2}, to estimate the information of {trv_dim} TRVs"
+        )
+    means, stds = (th.stack([getattr(d, name) for d in recorded.densities[:-1]]).cpu() for name in ("mean", "stddev"))
+    last = means[-1] + stds[-1] * recorded.last_trv_noise.cpu()
+    trvs = th.cat([recorded.prev_trvs[1:].cpu(), last[None]])
+    states = th.as_tensor(recorded.states, dtype=th.float32)
+    log_det = LogDet(len(trvs), states.shape[2], trvs.shape[2])
+    return float(log_det(InformationBatch(states, trvs, means, stds)).sum())
+
+
+def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
+    # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
+    pairs = ((_double(p), _double(q)) for p, q in zip(shifted, training, strict=True))
+    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in pairs])
+
+
+def _double(density: Normal) -> Normal:
+    return Normal(density.mean.double(), density.stddev.double())
+
+
+def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
+    """Add up the divergences of the steps; what follows the last TRVs is only an action, so the lower counts there."""
+
+    def add(budget: Budget, step: CostDistribution) -> Budget:
+        capped, exceedance = step.capped(level)
+        return Budget(budget.kl + worst_mean(capped, budget.kl).bound, budget.exceedance + exceedance)
+
+    budget = Budget(start_kl, 0.0)
+    for step in steps[:-2]:
+        budget = add(budget, step)
+    return min((add(budget, step) for step in steps[-2:]), key=lambda candidate: candidate.kl)
+
+
+def _pomdp(model: Any, scenario: Scenario) -> POMDPEnv:
+    """Return the environment of a scenario itself, whose sensor can be asked about any state."""
+    if model.get_vec_normalize_env() is not None:
+        raise ValueError("the model's environment normalises observations (VecNormalize), which is not supported here")
+    env = scenario_env(scenario, model, n_episodes=1, n_envs=1).unwrapped
+    if not isinstance(env, BatchedVecEnv):
+        raise ValueError(
+            f"{scenario.env_id} is no environment of this plugin: a certificate needs the methods of a POMDPEnv, "
+            "to ask the shifted sensor about recorded states"
+        )
+    return env.env

@@ -1,0 +1,1 @@
+"""What every room uses: files that are never half-written, provenance, threads, processes."""

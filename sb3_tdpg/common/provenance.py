@@ -1,0 +1,216 @@
+"""Where a result came from: versions, commit, machine and command, and files that are never half-written."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
+from importlib import metadata
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_tdpg.common.files import replaced_atomically, write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_DIFFERENCES = 3
+MAX_LENGTH = 60  # of a value in a message
+PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "pandas", "pybullet")
+
+
+def provenance() -> dict[str, Any]:
+    """
+    Describe the run that is going on, in plain JSON types.
+
+    :return: ``versions``, ``git`` (commit and whether it was changed; None outside a checkout), ``platform``,
+        ``cpu_count``, ``torch_threads``, ``cuda_device`` (None without), ``utc_time``, ``command``
+    """
+    import torch as th
+
+    from sb3_tdpg import __version__
+
+    versions: dict[str, str | None] = {"python": platform.python_version(), "sb3_tdpg": __version__}
+    versions.update({package: _version(package) for package in PACKAGES})
+    return dict(
+        versions=versions,
+        git=_git(),
+        platform=platform.platform(),
+        cpu_count=os.cpu_count(),
+        torch_threads=th.get_num_threads(),
+        cuda_device=th.cuda.get_device_name() if th.cuda.is_available() else None,
+        utc_time=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        command=_command(),
+    )
+
+
+def write_run_config(path: str | os.PathLike[str], config: Mapping[str, Any]) -> None:
+    """
+    Write a run's configuration as JSON, atomically, with its :func:`provenance` unless it has one already.
+
+    :param path: The file; folders are made.
+    :param config: Settings and seeds. ``inf`` (as in ``beta``) is written as ``"inf"``, since JSON has no such number;
+        ``float("inf")`` reads it back. What JSON does not know is written as text.
+    """
+    content = jsonable({**config, "provenance": config.get("provenance") or provenance()})
+    write_atomically(_with_folder(path), json.dumps(content, indent=2) + "\n")
+
+
+def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
+    """
+    Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
+
+    What one of the two leaves out counts as a difference, too: it may be a file of an earlier version, which does not
+    say what it was made with.
+
+    :param path: The file; if there is none, all is well.
+    :param config: What it must hold, and nothing else.
+    :param what: What lies in its folder, for the message.
+    """
+    if not path.exists():
+        return
+    try:
+        found = json.loads(path.read_text())
+        found.pop("provenance")
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
+        raise ValueError(f"{path} is there already and is not that of a {what}: choose another folder") from e
+    if changed := differences(found, jsonable(config)):
+        raise ValueError(
+            f"{path.parent} holds a {what} with other settings, {changed}: choose another folder or remove it"
+        )
+
+
+def differences(found: Any, wanted: Any) -> str:
+    """
+    Name the first few differences of two values of JSON's types, in a line; nothing if there are none.
+
+    :param found: What is there.
+    :param wanted: What it is compared with.
+    :return: as in ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
+    """
+    lines = list(_differences(found, wanted))
+    shown, more = lines[:MAX_DIFFERENCES], len(lines) - MAX_DIFFERENCES
+    return "; ".join([*shown, f"and {more} more"] if more > 0 else shown)
+
+
+def _differences(found: Any, wanted: Any, where: str = "") -> Iterator[str]:
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in sorted({*found, *wanted}):
+            inside = f"{where}.{key}" if where else key
+            yield from _differences(found.get(key, _MISSING), wanted.get(key, _MISSING), inside)
+    elif _has_dicts(found) and _has_dicts(wanted):  # rows; a list of numbers is told as a whole
+        for i, (old, new) in enumerate(zip_longest(found, wanted, fillvalue=_MISSING)):
+            yield from _differences(old, new, f"{where}[{i}]")
+    elif found != wanted:
+        old, new = ("" if value is _MISSING else json.dumps(value) for value in (found, wanted))
+        begin = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), 0)
+        texts = (f"{_excerpt(old, begin)} there" if old else "not there", f"{_excerpt(new, begin)} here")
+        yield f"{where}: {texts[0]}, {texts[1] if new else 'not here'}"
+
+
+_MISSING = object()  # None is a value
+
+
+def _has_dicts(value: Any) -> bool:
+    return isinstance(value, list) and any(isinstance(item, dict) for item in value)
+
+
+def _excerpt(text: str, begin: int) -> str:
+    """Shorten a long text, so that what begins to differ there can be seen."""
+    if len(text) <= MAX_LENGTH:
+        return text
+    start = max(0, min(begin - MAX_LENGTH // 2, len(text) - MAX_LENGTH))
+    end = start + MAX_LENGTH
+    return f"{'...' * (start > 0)}{text[start:end]}{'...' * (end < len(text))}"
+
+
+def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) -> None:
+    """
+    Write a frame as CSV without its index, so that at no time a half-written file is there.
+
+    :param frame: Records or a table.
+    :param path: ``.csv``, or ``.csv.gz`` or ``.csv.xz`` (smaller) to compress it; folders are made. The same frame
+        gives the same bytes.
+    """
+    path = _with_folder(path)
+    if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
+        raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
+    # Without mtime the compressed file would differ from one second to the next.
+    methods: dict[str, Any] = {".csv": None, ".gz": {"method": "gzip", "mtime": 0}, ".xz": "xz"}
+    with replaced_atomically(path) as partial:
+        frame.to_csv(partial, index=False, compression=methods[path.suffix])
+
+
+def _with_folder(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _command() -> str:
+    """Return the command line without the folders of this machine: relative to where it was run."""
+    here = Path.cwd()
+    program, *arguments = as_typed(sys.orig_argv)
+    relative = [str(Path(a).relative_to(here)) if Path(a).is_relative_to(here) else a for a in arguments]
+    return shlex.join([program, *relative])
+
+
+def as_typed(command: Sequence[str]) -> list[str]:
+    """
+    Return a command without the folder of its program.
+
+    A program that pip has installed is run by the interpreter beside it, which its user has not typed.
+
+    :param command: Interpreter and arguments.
+    """
+    interpreter, arguments = Path(command[0]), list(command[1:])
+    if arguments and interpreter.is_absolute() and Path(arguments[0]).parent == interpreter.parent:
+        return [Path(arguments[0]).name, *arguments[1:]]
+    return [interpreter.name, *arguments]
+
+
+def _git() -> dict[str, Any] | None:
+    """Commit of the checkout that this package lies in, and whether a tracked file was changed since."""
+    package = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(package), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        # An installed package may lie in a checkout of something else (a virtual environment in a project).
+        git("ls-files", "--error-unmatch", str(package / "__init__.py"))
+        return dict(commit=git("rev-parse", "HEAD"), dirty=bool(git("status", "--porcelain", "--untracked-files=no")))
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def jsonable(value: Any) -> Any:
+    """Turn a value into what JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [jsonable(item) for item in value]
+    if isinstance(value, np.generic):
+        return jsonable(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

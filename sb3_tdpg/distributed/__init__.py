@@ -1,0 +1,5 @@
+"""Environments on many cores or machines."""
+
+from sb3_tdpg.distributed.ray_vec_env import RayVecEnv
+
+__all__ = ["RayVecEnv"]

@@ -1,0 +1,98 @@
+"""
+A recorded run once more: ``python -m sb3_tdpg.experiments.rerun config.json again`` trains and evaluates what ``config.json``
+describes, in the folder ``again``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.experiments.runs import Run, complete_run
+
+
+@dataclass(frozen=True)
+class _RecordedRun(Run):
+    """A run whose settings were recorded whole: a block that was changed since then does not change them."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return dict(self.overrides)
+
+
+def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progress_bar: bool = True) -> Path:
+    """
+    Train and evaluate anew what a run's ``config.json`` describes: the same numbers, given the same versions.
+
+    :param config: The file. The policy that the run started from, if from any, must lie beside it:
+        ``<name of that run>/model.zip``.
+    :param out: Folder of the new run, see ``sb3_tdpg.experiments.runs.complete_run``.
+    :param progress_bar: Show progress bars.
+    :return: ``out``
+    :raises ValueError: if the file does not describe a run, or the policy to start from is another one.
+    """
+    config = Path(config)
+    try:
+        content = json.loads(config.read_text())
+        scenarios, n_eval_episodes, start = scenarios_of(content), content["n_eval_episodes"], content["start"]
+        run = _RecordedRun(
+            **{name: content[name] for name in ("method", "env_id", "block", "seed", "max_attempts")},
+            overrides=with_numbers(content["settings"]),
+            start=None if start is None else config.parent / start,
+        )
+    except (OSError, KeyError, TypeError, json.JSONDecodeError) as e:
+        raise ValueError(f"{config} does not describe a run ({e!r}): give the config.json of a run's folder") from e
+    if run.config["start_policy"] != content["start_policy"]:
+        raise ValueError(
+            f"the run started from the policy {content['start_policy']}, and {config.parent / start / 'model.zip'} is "
+            f"{run.config['start_policy']}: put the run's own there"
+        )
+    return complete_run(run, Path(out), scenarios, n_eval_episodes=n_eval_episodes, progress_bar=progress_bar)
+
+
+def scenarios_of(config: Mapping[str, Any]) -> list[Scenario]:
+    """
+    Return what a recorded run was evaluated on.
+
+    :raises KeyError: if it was not recorded.
+    """
+    return [Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"])) for row in config["scenarios"]]
+
+
+def with_numbers(value: Any) -> Any:
+    """Read back what JSON has no numbers for: ``"inf"``, ``"-inf"``, ``"nan"``."""
+    if isinstance(value, dict):
+        return {key: with_numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [with_numbers(item) for item in value]
+    return float(value) if value in ("inf", "-inf", "nan") else value
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run :func:`rerun` from the command line.
+
+    :return: exit code: 0 done, 2 bad input
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_tdpg.experiments.rerun", description="train and evaluate a recorded run anew"
+    )
+    parser.add_argument("config", type=Path, help="the config.json of a run")
+    parser.add_argument("out", type=Path, help="folder for the new run")
+    try:
+        rerun(**vars(parser.parse_args(arguments)))
+    except ValueError as e:
+        print(f"error: {e}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

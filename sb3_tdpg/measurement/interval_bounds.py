@@ -1,0 +1,261 @@
+"""
+The bounds that the limits of an information interval come from, each with its standard error, at one time step.
+
+Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_tdpg.information.base import InformationBatch
+from sb3_tdpg.measurement.density_critic import LOG_2_PI, DensityCritic, Encoded, log_gaussians
+from sb3_tdpg.measurement.gaussian_critic import GaussianCritic
+
+MAX_DRAWS = 12  # of the TRVs, for each episode
+GROUPS = (8, 5)  # of episodes, two of which a Gaussian critic is evaluated on; the latter with more than MAX_REDIVIDED
+MAX_VALUES = 1_000_000  # densities of all draws under all episodes; bounds the memory
+MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
+DIVISIONS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of quarters of the episodes into halves
+MAX_REDIVIDED = 300  # episodes that are divided more than once; bounds the time, and more gain little by it
+MIN_HITS = 10  # pairs of a state with another episode's TRVs at the clip, to estimate the critic's denominator from
+
+
+class Estimate(NamedTuple):
+    """What a bound came to at one time step."""
+
+    value: float  # nats
+    parts: np.ndarray  # (n,): what each episode adds to the mean that the value is, but for a constant
+    least_variance: float = 0.0  # of the value
+
+    @property
+    def error(self) -> float:
+        """Standard error, nats."""
+        return math.sqrt(max(self.parts.var(ddof=1) / len(self.parts), self.least_variance))
+
+    def correlation(self, other: Estimate) -> float:
+        """Correlation of the errors of two bounds on the same episodes, 0 where one has none."""
+        own, others = self.parts - self.parts.mean(), other.parts - other.parts.mean()
+        return float(own @ others / max(len(own) * own.std() * others.std(), 1e-300))
+
+    def less_noise(self, controls: np.ndarray) -> Estimate:
+        """
+        Take off what the encoder's noise adds by chance: control variates.
+
+        :param controls: ``(n, C)``, whose expectations are 0 in every episode, see ``noise_controls``.
+        """
+        mean = controls.mean(axis=0)
+        coefficients = np.linalg.lstsq(controls - mean, self.parts - self.parts.mean(), rcond=None)[0]
+        return self._replace(value=float(self.value - mean @ coefficients), parts=self.parts - controls @ coefficients)
+
+
+def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
+    """
+    Draw the encoder's noise anew, beside the one that was rolled out.
+
+    :param batch: One time step, ``(1, n, ...)``, all episodes alive.
+    :param rng: For the noise.
+    """
+    states, trvs, means, stds = (x[0].detach().cpu().numpy().astype(np.float64) for x in batch[:4])
+    n, dim = means.shape
+    # Each noise comes with its mirror image, which cancels what is linear in it.
+    n_pairs = int(np.clip(MAX_VALUES // (2 * n**2), 1, MAX_DRAWS // 2))
+    noise = rng.standard_normal((n, n_pairs, dim))
+    noise[:, 0] = (trvs - means) / stds
+    draws = means[:, None] + stds[:, None] * np.concatenate([noise, -noise], axis=1)
+    return Encoded(states, means, stds, draws)
+
+
+def noise_controls(step: Encoded) -> np.ndarray:
+    r"""
+    Tell how large the noise of each episode's draws is by chance, relative to what the encoder's densities expect.
+
+    Log-densities are about quadratic in the noise: that of the encoder in its own units, that of the marginal in those
+    of the TRVs' covariance S. The two are :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and
+    :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with :math:`\nu = \tilde x - \mu`, averaged over
+    the draws. Their expectations are 0 whatever the distribution of the means, for any S that the noise has no part in.
+
+    :return: ``(n, 2)``
+    """
+    scale = np.sqrt(np.square(step.stds).mean(axis=0))
+    stds, centred = step.stds / scale, (step.means - step.means.mean(axis=0)) / scale
+    noise = (step.trvs - step.means[:, None]) / scale  # (n, K, Z)
+    precision = np.linalg.inv(centred.T @ centred / len(centred) + np.diag(np.square(stds).mean(axis=0)))
+    own = (np.square(noise / stds[:, None]) - 1).sum(axis=2)
+    of_all = (noise @ precision * noise).sum(axis=2) - (np.square(stds) @ np.diag(precision))[:, None]
+    return np.stack([own.mean(axis=1), of_all.mean(axis=1)], axis=1)
+
+
+class FreshPairs:
+    """
+    Scores F of frozen critics on fresh episodes and all their pairs.
+
+    Scores are clipped from above, which leaves a critic like any other, and keeps single pairs from deciding on the
+    mean of e^F.
+
+    :param n: Number of episodes.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.log_clip = 1 + math.log(n)
+        self._joint, self._times = np.zeros((2, n))
+        self._ratios, self._pair_times = np.zeros((2, n, n))
+
+    def add(self, fresh: np.ndarray, scores: np.ndarray) -> None:
+        """
+        Add the scores of a critic.
+
+        :param fresh: Episodes that it was not fitted to, m of n, by their indices.
+        :param scores: Of the K draws of the TRVs of each of them with the state of each, ``(m K, m)``.
+        """
+        m = len(fresh)
+        each, pairs = np.arange(m), np.ix_(fresh, fresh)
+        scores = np.minimum(scores, self.log_clip).reshape(m, -1, m)
+        self._joint[fresh] += scores[each, :, each].mean(axis=1)
+        self._times[fresh] += 1
+        self._ratios[pairs] += np.exp(scores, out=scores).mean(axis=1)
+        self._pair_times[pairs] += 1
+
+    def bound(self) -> Estimate:
+        """Bound the information from below; every episode must have been fresh once, and as often as any other."""
+        times = self._pair_times.copy()
+        np.fill_diagonal(times, 0)  # no episode is paired with itself
+        ratios = np.divide(self._ratios, times, out=np.zeros_like(times), where=times > 0)
+        return donsker_varadhan(self._joint / self._times, ratios, int((times > 0).sum()), self.log_clip)
+
+
+def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Estimate]:
+    """
+    Fit critics to halves of the episodes, and evaluate them on the other halves; the mean over several divisions.
+
+    A division leaves out the pairs of episodes that it parts. Any two quarters of the episodes are together in one of
+    three divisions, which leave out none.
+
+    :param step: n episodes, an even number of draws each: the mirror images are the second half.
+    :param rng: For the quarters.
+    :return: the lower bound of the critic and the upper bound of its marginal density
+    """
+    n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
+    quarters = np.array_split(rng.permutation(n), 4)
+    divisions = DIVISIONS if n <= MAX_REDIVIDED else DIVISIONS[:1]
+    pairs, gaps = FreshPairs(n), np.zeros(n)
+    for i, division in enumerate(divisions):
+        halves = [np.concatenate([quarters[q] for q in half]) for half in division]
+        # The draws are shared out among the divisions, each with its mirror image.
+        mine = np.arange(i % n_mirrored, n_mirrored, len(divisions))
+        draws = step._replace(trvs=step.trvs[:, np.concatenate([mine, mine + n_mirrored])])
+        for train, fresh in (halves[::-1], halves):
+            critic, evaluated = DensityCritic(step.select(train[:MAX_TRAINING])), draws.select(fresh)
+            points = evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])
+            log_marginal = critic.log_marginal(points)
+            pairs.add(fresh, critic.scores(evaluated.states, points, log_marginal))
+            gaps[fresh] += _marginal_gaps(evaluated, log_marginal) / len(divisions)
+    controls = noise_controls(step)
+    return pairs.bound().less_noise(controls), Estimate(float(gaps.mean()), gaps).less_noise(controls)
+
+
+def gaussian_bound(step: Encoded, rng: np.random.Generator) -> Estimate:
+    """
+    Fit Gaussian critics to all but two of several groups of the episodes, and evaluate each on the two left out.
+
+    :param step: n episodes, an even number of draws each: the mirror images are the second half.
+    :param rng: For the groups.
+    """
+    n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
+    some = np.arange(max(1, 2 * n_mirrored // 3))  # the critics are many
+    draws = step._replace(trvs=step.trvs[:, np.concatenate([some, some + n_mirrored])])
+    moments = step._replace(trvs=step.trvs[:, :0])
+    groups = np.array_split(rng.permutation(n), GROUPS[n > MAX_REDIVIDED])
+    pairs = FreshPairs(n)
+    for left_out in combinations(range(len(groups)), 2):
+        fresh = np.concatenate([groups[g] for g in left_out])
+        train = np.concatenate([group for g, group in enumerate(groups) if g not in left_out])
+        evaluated = draws.select(fresh)
+        critic = GaussianCritic(moments.select(train))
+        pairs.add(fresh, critic.scores(evaluated.states, evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])))
+    return pairs.bound().less_noise(noise_controls(draws))
+
+
+def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_clip: float) -> Estimate:
+    r"""
+    Put the Donsker-Varadhan bound together.
+
+    Of several critics, e^F is averaged before the logarithm is taken: the logarithm of a mean is not below the mean of
+    logarithms, so that this is a lower bound, too, and one that has the pairs of all to estimate the mean from.
+
+    The mean counts as at least that of a few clipped pairs: where the TRVs of no episode fit the state of another, it
+    would be estimated as 0, and the bound as infinite.
+
+    :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
+    :param ratios: e^F of the TRVs of each episode with the state of each, ``(n, n)``; 0 where they are not paired.
+    :param n_pairs: Number of those that are, about as many for each episode.
+    :param log_clip: Highest F.
+    """
+    n = len(joint)
+    mean = ratios.sum() / n_pairs
+    floor = MIN_HITS * math.exp(log_clip) / n_pairs
+    if mean < floor:
+        mean, relative_variance = floor, 1 / MIN_HITS  # of the number of clipped pairs, which are rare events
+        parts, least_variance = joint, joint.var(ddof=1) / n + relative_variance
+    else:
+        # An episode counts through its state and through its TRVs (Hoeffding's projection).
+        influence = (ratios.sum(axis=0) + ratios.sum(axis=1)) * n / n_pairs / mean
+        relative_variance = influence.var(ddof=1) / n
+        # Not less than that of as many independent pairs: by luck the projection can be next to constant.
+        parts = joint - influence
+        least_variance = float(np.square(ratios).sum() / n_pairs / mean**2 - 1) / n_pairs
+    # The logarithm of a mean is biased downward by half its relative variance.
+    return Estimate(float(joint.mean() - math.log(mean) - relative_variance / 2), parts, least_variance)
+
+
+def _marginal_gaps(step: Encoded, log_marginal: np.ndarray) -> np.ndarray:
+    """
+    Average log q(x~ | e) - log a(x~) over the draws of an episode, ``(n,)``.
+
+    :param log_marginal: Of a density a that was fitted to other episodes, ``(n K,)``.
+    """
+    n, _, dim = step.trvs.shape
+    noise = (step.trvs - step.means[:, None]) / step.stds[:, None]
+    log_own = -0.5 * (np.square(noise).sum(axis=2) + dim * LOG_2_PI) - np.log(step.stds).sum(axis=1)[:, None]
+    return (log_own - log_marginal.reshape(n, -1)).mean(axis=1)
+
+
+def log_det_bound(step: Encoded) -> Estimate:
+    """Bound by the Gaussian of the same covariance; the jackknife takes off the bias of order 1/n."""
+    n, dim = step.means.shape
+    variances, log_stds = np.square(step.stds), np.log(step.stds).sum(axis=1)
+    scale = np.sqrt(variances.mean(axis=0))
+    centred, noise = (step.means - step.means.mean(axis=0)) / scale, variances / scale**2
+    scatter = centred.T @ centred
+
+    def bound(covariance: np.ndarray, log_std: np.ndarray) -> np.ndarray:
+        sign, log_determinant = np.linalg.slogdet(covariance)
+        return np.where(sign > 0, 0.5 * log_determinant, np.nan) + np.log(scale).sum() - log_std
+
+    whole = bound(scatter / (n - 1) + np.diag(noise.mean(axis=0)), log_stds.mean())
+    # About the mean of the others, the scatter of the others is less by n / (n - 1) times this episode's square.
+    covariances = (scatter - n / (n - 1) * centred[:, :, None] * centred[:, None, :]) / (n - 2)  # (n, Z, Z)
+    diagonal = np.arange(dim)
+    covariances[:, diagonal, diagonal] += (noise.sum(axis=0) - noise) / (n - 1)
+    without = bound(covariances, (log_stds.sum() - log_stds) / (n - 1))  # (n,)
+    value = n * whole - (n - 1) * without.mean()
+    return Estimate(float(value), -(n - 1) * without)
+
+
+def leave_one_out_bound(step: Encoded) -> Estimate:
+    """Bound by the mixture of the other episodes' densities; an episode counts through its TRVs and as a component."""
+    n, n_draws, dim = step.trvs.shape
+    log_density = log_gaussians(step.trvs.reshape(-1, dim), step.means, np.square(step.stds))  # (n K, n)
+    draws, own = np.arange(n * n_draws), np.repeat(np.arange(n), n_draws)
+    log_own = log_density[draws, own]
+    log_density[draws, own] = -np.inf
+    top = log_density.max(axis=1)
+    density = np.exp(log_density - top[:, None], out=log_density)
+    total = density.sum(axis=1)
+    gaps = (log_own - np.log(total) - top + math.log(n - 1)).reshape(n, n_draws).mean(axis=1)
+    shares = (1 / total) @ density / n_draws  # mean 1
+    return Estimate(float(gaps.mean()), gaps - shares).less_noise(noise_controls(step))

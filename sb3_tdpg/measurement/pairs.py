@@ -1,0 +1,420 @@
+"""
+The information between two variables from i.i.d. pairs of them, with no policy around: fitted and read by folds.
+
+Dimension key: M problems, K folds, N pairs, R marginal samples for each pair, X and Z the components of the two
+variables, D components of either or both, J = 4 features of each: its normal score and three cosines of its rank.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from torch import nn
+
+from sb3_tdpg.common.threads import threads
+from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+from sb3_tdpg.information.critic import CriticEstimator, Scores
+from sb3_tdpg.information.flat_adam import AveragedAdam
+from sb3_tdpg.information.infonce import InfoNCE
+from sb3_tdpg.information.nwj import Nwj
+from sb3_tdpg.measurement.copula_start import (
+    NORMAL,
+    Start,
+    add_up,
+    choose_start,
+    degrees_of_freedom,
+    t_scores,
+)
+from sb3_tdpg.networks import BatchedLinear, BatchedMLP, ELUGradient
+
+STEPS_PER_CHECK = 50
+MIN_VARIANCE = 1e-2  # of what is brought to variance 1
+MARGINAL_SAMPLES = 16  # partners of others that x is also read with
+MIN_PAIRS_PER_FOLD = 10
+N_WAVES = 3
+PAIRS_AT_ONCE = 800
+
+
+class InformationEstimate(NamedTuple):
+    """What :func:`estimate_information` found, in nats: floats for one problem, ``(M,)`` arrays for M of them."""
+
+    estimate: Any
+    """Midway between the other two."""
+    held_out: Any
+    """On pairs that the critic was not fitted to: tends to be too low."""
+    trained_on: Any
+    """On the pairs that the critic was fitted to: tends to be too high."""
+
+
+@threads(1)
+def estimate_information(
+    x: npt.ArrayLike,
+    z: npt.ArrayLike,
+    estimator: str | type[InformationEstimator] = "mine",
+    *,
+    n_folds: int = 5,
+    max_gradient_steps: int = 1000,
+    patience: int = 2,
+    learning_rate: float = 2e-2,
+    batch_size: int | None = None,
+    seed: int = 0,
+    **kwargs: Any,
+) -> InformationEstimate:
+    r"""
+    Estimate I[x; z] in nats from i.i.d. pairs of two continuous variables, held out fold by fold.
+
+    Only the ranks of each component are used, which leaves the information as it is. The critic is
+    :math:`F = F_0 + \text{network}`. It starts from the logarithmic density ratio :math:`F_0` of a t-copula (Demarta
+    and McNeil, 2005): a multivariate Student's t, which also has tails that come together, of the t quantiles of the
+    ranks. Its scatter matrix is that of the training folds, and its degrees of freedom are the most likely ones for all
+    pairs. Where that does better on the held-out pairs of all folds, they are infinitely many, which makes a Gaussian,
+    or :math:`F_0 = 0`. The network's inputs are the normal scores and three cosines of each rank, those of x and z
+    together brought to covariance 1: where x and z depend on each other closely, the little in which they differ is
+    what counts. The network is read with the moving average of its weights.
+
+    Each of K folds is held out once. After how many gradient steps a critic is read is decided for a fold by the
+    estimates on the *other* folds, so that a fold's own luck is not chosen.
+
+    :param x: ``(N, X)``, or ``(M, N, X)`` for M problems at once; ``(N,)`` counts as ``(N, 1)``.
+    :param z: ``(N, Z)`` or ``(M, N, Z)``, row by row the partners of ``x``.
+    :param estimator: One with a critic: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, or a class of one's own.
+    :param n_folds: K
+    :param max_gradient_steps: The most steps of gradient ascent for each critic.
+    :param patience: Training ends after this many checks, one every 50 steps, with no better held-out estimate: after
+        100 steps where the start cannot be bettered.
+    :param learning_rate: Adam's learning rate.
+    :param batch_size: Minibatch B; None: 200, or 32 for InfoNCE, which cannot tell more than ``ln B``.
+    :param seed: Of folds, weights and minibatches. PyTorch's global random state is left as it was.
+    :param kwargs: Further arguments of the estimator's constructor, such as ``hidden_sizes``.
+    :return: the estimate between its lower and its upper guess. For a critic with p parameters in a large sample, the
+        pairs that it was fitted to read about p / 2N too high and fresh ones about p / 2N too low (the same count as in
+        Akaike's criterion), so that the mean of both is the estimate. ``held_out`` alone is the cautious one, a lower
+        bound in expectation where the estimator is one.
+    :raises ValueError: if the shapes do not fit, a number is not finite, there are fewer than ten pairs for each fold
+        or too few for the number of components, or the estimator needs the encoder's density.
+    """
+    from sb3_tdpg.information import get_estimator_class  # the registry is made of the modules in this folder
+
+    estimator_class = get_estimator_class(estimator)
+    if not issubclass(estimator_class, CriticEstimator):
+        raise ValueError(
+            f"estimator={estimator!r} needs the encoder's density, and pairs alone have none: use an estimator with a "
+            'critic, such as "mine"'
+        )
+    x, z, single = _check(x, z, n_folds)
+    for name, value in (("max_gradient_steps", max_gradient_steps), ("patience", patience)):
+        if value < 1:
+            raise ValueError(f"{name}={value} must be at least 1")
+    if batch_size is None:
+        batch_size = 32 if issubclass(estimator_class, InfoNCE) else 200
+    kwargs = dict(kwargs, learning_rate=learning_rate, batch_size=batch_size)
+    with th.random.fork_rng(devices=[]), th.no_grad():
+        held_out, trained_on = _cross_fit(x, z, estimator_class, n_folds, max_gradient_steps, patience, seed, kwargs)
+    values = [((held_out + trained_on) / 2).numpy(), held_out.numpy(), trained_on.numpy()]
+    return InformationEstimate(*(float(value[0]) if single else value for value in values))
+
+
+def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor, th.Tensor, bool]:
+    """Return both as ``(M, N, ...)``, and whether there was only one problem."""
+    arrays = []
+    for name, value in (("x", x), ("z", z)):
+        array = np.asarray(value.detach().cpu() if isinstance(value, th.Tensor) else value, dtype=np.float64)
+        array = array[:, None] if array.ndim == 1 else array
+        if array.ndim not in (2, 3) or array.shape[-1] == 0:
+            raise ValueError(f"{name} has shape {array.shape}: expected (N, components) or (M, N, components)")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} has {(~np.isfinite(array)).sum()} values that are not finite: drop these pairs")
+        arrays.append(array)
+    if arrays[0].shape[:-1] != arrays[1].shape[:-1]:
+        raise ValueError(
+            f"x has shape {arrays[0].shape} and z {arrays[1].shape}: all but the last number must agree, since row i "
+            "of x belongs to row i of z"
+        )
+    if n_folds < 2:
+        raise ValueError(f"n_folds={n_folds} must be at least 2: one fold is held out while the others are trained on")
+    n = arrays[0].shape[-2]
+    n_components = sum(array.shape[-1] for array in arrays)
+    # Their covariance is estimated on all folds but one.
+    fewest = max(MIN_PAIRS_PER_FOLD * n_folds, 4 * n_components)
+    if n < fewest:
+        raise ValueError(
+            f"{n} pairs are too few: with n_folds={n_folds} and {n_components} components in all, at least {fewest} "
+            "are needed"
+        )
+    single = arrays[0].ndim == 2
+    first, second = (th.as_tensor(array[None] if single else array) for array in arrays)
+    return first, second, single
+
+
+# -- inputs of the critics ------------------------------------------------------------------------------------
+
+
+def _ranks(x: th.Tensor) -> th.Tensor:
+    """Relative rank of every value among the N of its component, in (0, 1), equal values alike: ``(..., N, D)``."""
+    values = x.mT.contiguous()
+    ordered = values.sort(dim=-1).values
+    below = th.searchsorted(ordered, values)
+    not_above = th.searchsorted(ordered, values, right=True)
+    return (below + not_above).mT.double() / (2 * x.shape[-2])
+
+
+def _features(ranks: th.Tensor) -> th.Tensor:
+    """Normal scores, and cosines with which a small network sees more detail: ``(M, N, D) -> (M, N, J, D)``."""
+    waves = [2**0.5 * th.cos(th.pi * j * ranks) for j in range(1, N_WAVES + 1)]
+    return th.stack([th.special.ndtri(ranks), *waves], -2)
+
+
+def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Find the means and the maps after which the features of each kind are uncorrelated, with variance 1, in all rows.
+
+    Where x and z depend on each other closely, the little in which they differ is what a network has to see.
+
+    :param features: of x and z, ``(rows, n, J, D)``
+    :return: ``(rows, 1, J, D)`` and ``(rows, J, D, D)``
+    """
+    mean = features.mean(1, keepdim=True)
+    centred = features - mean
+    variances, axes = th.linalg.eigh(th.einsum("rnjd,rnje->rjde", centred, centred) / features.shape[1])
+    return mean, (axes * variances.clamp(min=MIN_VARIANCE).rsqrt()[..., None, :]) @ axes.mT
+
+
+def _inputs(features: th.Tensor, train: th.Tensor, n_x: int) -> th.Tensor:
+    """
+    What x and z bring to the network's inputs, which are the sum of both: white on each fold's training pairs.
+
+    :param features: of x and z, ``(M, N, J, D)``
+    :param train: pairs that each fold trains on, ``(K, n)``
+    :param n_x: X
+    :return: of every x, then of every z: ``(2 * M * K * N, J * D)``
+    """
+    mean, axes = (found.unflatten(0, (-1, len(train))) for found in _whiten(features[:, train].flatten(0, 1)))
+    centred = features[:, None] - mean  # (M, K, N, J, D)
+    brought = [
+        th.einsum("mknjd,mkjde->mknje", centred[..., part], axes[..., part, :])
+        for part in (slice(n_x), slice(n_x, None))
+    ]
+    return th.stack(brought).flatten(4).flatten(0, 3).float()
+
+
+def _elu_(x: th.Tensor) -> th.Tensor:
+    """ELU in place, to within 1e-7: ``max(x, exp(min(x, 0)) - 1)``, by a power of 2, which is faster than that of e."""
+    exponential = x.clamp(max=0).mul_(math.log2(math.e)).exp2_()
+    return th.maximum(x, exponential.sub_(1), out=x)
+
+
+def _to_one(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    """Map to one output, ``(M, N, I) -> (M, N, 1)``, in the order that takes a fifth of the time."""
+    return th.baddbmm(bias, weight.mT, x.mT).mT
+
+
+class _QuickELU(nn.ELU):
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return _elu_(x)
+
+
+class StartedMLP(BatchedMLP):
+    """
+    Networks that are added to a fixed critic, and are zero at first.
+
+    They are given pairs as places in a table, and look up what x and z bring to their inputs and to the start. What is
+    drawn, repeated and put together for a minibatch is then numbers alone.
+    """
+
+    start: Start
+    table: th.Tensor  # see `add_up`: what is brought to the J * (X + Z) inputs, then to the start
+
+    def forward(self, pairs: th.Tensor) -> th.Tensor:
+        """``(rows, n, 2) -> (rows, n, 1)``."""
+        # Not all at once: what the layers make of so many is to stay in the processor's cache.
+        parts = (self.prepare(part) for part in pairs.split(PAIRS_AT_ONCE, dim=1))
+        return th.cat([start + self._outputs(inputs) for inputs, start in parts], 1)
+
+    def _outputs(self, inputs: th.Tensor) -> th.Tensor:
+        *hidden, last = cast("list[BatchedLinear]", list(self.layers))
+        for layer in hidden:
+            inputs = self.activation(layer(inputs))
+        return _to_one(inputs, last.weight, last.bias)
+
+    def prepare(self, pairs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Inputs of the networks, ``(rows, n, J * (X + Z))``, and what is added to their outputs, ``(rows, n, 1)``."""
+        sums = add_up(self.table, pairs)
+        n_inputs = sums.shape[-1] - self.start.table.shape[-1]
+        return sums[..., :n_inputs], self.start.of_sums(sums[..., n_inputs:])
+
+    def gradient_by_hand(self) -> ELUGradient:
+        """Return the means to evaluate and differentiate this critic; see :class:`ELUGradient`."""
+        return _StartedGradient(self, super().gradient_by_hand())
+
+
+class _StartedGradient(ELUGradient):
+    def __init__(self, critic: StartedMLP, network: ELUGradient) -> None:
+        self.__dict__.update(network.__dict__)
+        self._critic = critic
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """As that of the base class, with kernels that take half the time but round in another way."""
+        inputs, start = self._critic.prepare(x)
+        *hidden, (last_weight, last_bias) = self._layers
+        self._inputs = [inputs]
+        for weight, bias in hidden:
+            inputs = _elu_(th.baddbmm(bias, inputs, weight))
+            self._inputs.append(inputs)
+        return start.add_(_to_one(inputs, last_weight, last_bias))
+
+
+# -- folds ----------------------------------------------------------------------------------------------------
+
+
+def _cross_fit(
+    x: th.Tensor,
+    z: th.Tensor,
+    estimator_class: type[CriticEstimator],
+    n_folds: int,
+    max_gradient_steps: int,
+    patience: int,
+    seed: int,
+    kwargs: dict[str, Any],
+) -> tuple[th.Tensor, th.Tensor]:
+    """Train the critics of all problems and folds as one network; ``(M,)`` held out and trained on."""
+    th.manual_seed(seed)
+    n_problems, n, n_x = x.shape
+    ranks = th.cat([_ranks(x), _ranks(z)], -1)
+    order = th.randperm(n)
+    size = n // n_folds
+    held_out = order[: size * n_folds].view(n_folds, size)
+    train = th.stack([order[~th.isin(order, fold)] for fold in held_out])  # (K, N - N // K)
+    # What a critic has seen is read on the pairs of the next fold: over all folds each pair is read once by a critic
+    # that was fitted to it, and once by one that was not.
+    parts = (train, held_out, held_out.roll(-1, 0))
+    # Every row has places of its own for the pairs' x; those of z are `n_places` further on.
+    n_rows = n_problems * n_folds
+    n_places = n_rows * n
+    places = th.arange(n_places, dtype=th.int32).view(n_problems, n_folds, n)
+    on_train, fresh, seen = (places.gather(2, part.expand(n_problems, -1, -1)).flatten(0, 1) for part in parts)
+    estimator = estimator_class(n_rows, 1, 1, **kwargs)  # what is paired is places
+
+    def read(critic: nn.Module, pairs: th.Tensor) -> th.Tensor:
+        """Estimate from pairs of every row: ``(rows, n) -> (M, K)``."""
+        return _read(estimator, critic, pairs, pairs + n_places).view(n_problems, n_folds)
+
+    # The start is what the held-out pairs of all folds say: none, a Gaussian's ratio or a t's.
+    infinite = th.full((n_problems,), NORMAL, dtype=th.double)
+    starts = [
+        Start.fit(t_scores(ranks, nu[:, None])[:, 0], train, n_x, nu, _level(estimator))
+        for nu in (infinite, degrees_of_freedom(ranks))
+    ]
+    values = th.stack([read(start, fresh).mean(-1) for start in starts])  # (2, M)
+    starts.append(starts[0].flat_like(_level(estimator)))
+    best_start = th.where((values > 0).any(0), values.nan_to_num(-th.inf).argmax(0), 2)
+    start = choose_start(starts, best_start.repeat_interleave(n_folds))
+
+    th.manual_seed(seed)
+    critic = _new_critic(estimator, start, _inputs(_features(ranks), train, n_x), n_folds)
+    optimizer = AveragedAdam(estimator.learning_rate)
+    optimizer.attach(critic)
+    first = read(start, fresh)
+    choice = _Choice(estimator.refit_below, estimator.refit_above, first, read(start, seen))
+    best = first.mean(-1)
+    n_stale, n_done = th.zeros_like(best), 0  # (M,)
+    samples = on_train[..., None], on_train[..., None] + n_places, None, th.arange(n_rows)
+    while n_done < max_gradient_steps and (training := n_stale < patience).any():
+        n_steps = min(STEPS_PER_CHECK, max_gradient_steps - n_done)
+        estimator._ascend(critic, optimizer, *samples, n_steps)
+        n_done += n_steps
+        with optimizer.averaged():
+            current = read(critic, fresh)
+            choice.consider(current, lambda: read(critic, seen), training)
+        improved = current.mean(-1) > best
+        n_stale = th.where(training & improved, 0.0, n_stale + 1)
+        best = best.fmax(current.mean(-1))
+    return choice.held_out.mean(-1), choice.trained_on.mean(-1)
+
+
+def _level(estimator: CriticEstimator) -> float:
+    """The score at which the critic says "no information": the NWJ bound's best critic is 1 + the log ratio."""
+    return 1.0 if isinstance(estimator, Nwj) else 0.0
+
+
+def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_folds: int) -> StartedMLP:
+    """Make critics that equal ``start``, whose networks begin alike in every problem: the batch changes no result."""
+    sizes = (inputs.shape[-1], *estimator.sizes[1:])
+    networks = BatchedMLP(n_folds, sizes, estimator.activation_fn)
+    with th.random.fork_rng(devices=[]):  # what is drawn here is overwritten
+        critic = StartedMLP(len(start.factor), sizes, estimator.activation_fn)
+    critic.start, critic.table = start, th.cat([inputs, start.table], -1)
+    if estimator.activation_fn is nn.ELU:
+        critic.activation = _QuickELU()
+    for parameter, fold in zip(critic.parameters(), networks.parameters(), strict=True):
+        parameter.copy_(fold.repeat(len(parameter) // n_folds, 1, 1))
+    last = critic.layers[-1]
+    for parameter in last.parameters():
+        parameter.zero_()
+    return critic
+
+
+def _read(estimator: CriticEstimator, critic: nn.Module, x: th.Tensor, z: th.Tensor) -> th.Tensor:
+    """Estimate from pairs, each x also with the z of R others: places of both, ``(rows, n)`` each ``-> (rows,)``."""
+    if isinstance(estimator, InfoNCE):  # it makes pairs of its own
+        estimator.critic = critic  # type: ignore[assignment]
+        states, trvs = x[..., None].double(), z[..., None].double()
+        return estimator._estimate(InformationBatch(states, trvs, trvs, trvs), None)
+    n = x.shape[1]
+    n_marginal = min(MARGINAL_SAMPLES, n - 1)
+    others = (th.arange(n)[:, None] + th.arange(n_marginal + 1)) % n  # (n, 1 + R), its own and others
+    partners = z[:, others]
+    pairs = th.stack([x[..., None].expand_as(partners), partners], -1)
+    joint, marginal = pairs[:, :, :1].flatten(1, 2), pairs[:, :, 1:].flatten(1, 2)
+    # Double, so that of scores that are large, as a diverged critic's are, no information is made by rounding.
+    values = critic(th.cat([joint, marginal], 1)).squeeze(-1).double()
+    return estimator._bound(Scores(values[:, :n], values[:, n:].unflatten(1, (n, n_marginal))))
+
+
+class _Choice:
+    """
+    Chooses the length of training for each fold by what the other folds say of it.
+
+    An estimate out of bounds, of any fold, is that of a critic that has diverged, which is not chosen. What a critic
+    reads on pairs that it has seen is asked for only where it may be chosen.
+
+    :param lowest: of an estimate
+    :param highest: likewise
+    :param held_out: of the start, ``(M, K)``
+    :param trained_on: of the start, ``(M, K)``
+    """
+
+    def __init__(self, lowest: float, highest: float, held_out: th.Tensor, trained_on: th.Tensor) -> None:
+        self._lowest, self._highest = lowest, highest
+        self.held_out, self.trained_on = held_out, trained_on
+        self._best = self._others(held_out).where(self._counts(held_out) & self._counts(trained_on), -th.inf)
+
+    def consider(self, held_out: th.Tensor, trained_on: Callable[[], th.Tensor], training: th.Tensor) -> None:
+        """
+        Choose a critic for the folds for which it is better than those before.
+
+        :param held_out: ``(M, K)``
+        :param trained_on: gives ``(M, K)``
+        :param training: problems that are still in training, ``(M,)``
+        """
+        others = self._others(held_out)
+        better = (others > self._best) & self._counts(held_out) & training[:, None]
+        if better.any():
+            seen = trained_on()
+            better &= self._counts(seen)
+            self._best = others.where(better, self._best)
+            self.held_out = held_out.where(better, self.held_out)
+            self.trained_on = seen.where(better, self.trained_on)
+
+    def _counts(self, estimates: th.Tensor) -> th.Tensor:
+        """Whether the estimates of all folds of a problem are in bounds: ``(M, K) -> (M, 1)``."""
+        return ((estimates >= self._lowest) & (estimates <= self._highest)).all(-1, keepdim=True)  # NaN compares false
+
+    @staticmethod
+    def _others(held_out: th.Tensor) -> th.Tensor:
+        """Sum of the other folds: ``(M, K) -> (M, K)``."""
+        return held_out @ (1 - th.eye(held_out.shape[-1], dtype=held_out.dtype))

@@ -1,0 +1,172 @@
+"""
+May an information interval be trusted? Checks whose outcome is known beforehand.
+
+Dimension key: T time steps, N episodes, Z TRVs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_tdpg.common.threads import threads
+from sb3_tdpg.information.base import InformationBatch
+from sb3_tdpg.measurement.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
+
+NEAR_THE_CAP = 0.9  # of ln N
+FALSE_ALARM = 0.01  # probability of each check to fail without a cause, all time steps together
+ADDED_VARIANCE = 3.0  # of the data-processing check's noise, in multiples of the encoder's mean variance
+
+
+@dataclass(frozen=True)
+class TrustCheck:
+    """One check: a number that must not exceed a threshold."""
+
+    name: str
+    value: float
+    threshold: float
+    meaning: str
+    """What the number is, and its unit."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is within its threshold; NaN is not."""
+        return self.value <= self.threshold
+
+
+@dataclass(frozen=True)
+class TrustBadge:
+    """What speaks for and against an interval. ``str(badge)`` is one line, :meth:`markdown` a table."""
+
+    checks: tuple[TrustCheck, ...]
+    capped_steps: tuple[int, ...]
+    """Time steps whose lower estimate is within 10 % of ln N, or above it: the truth can be far above."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed; a cap is a warning only."""
+        return all(check.passed for check in self.checks)
+
+    def __str__(self) -> str:
+        outcomes = [f"{check.name} {'ok' if check.passed else 'FAILED'}" for check in self.checks]
+        return f"{'trusted' if self.passed else 'NOT TRUSTED'}: {', '.join(outcomes)}{self._warning()}"
+
+    def markdown(self) -> str:
+        """Return a table with a row for each check, and the warning below it."""
+        rows = [
+            f"| {check.name} | {'ok' if check.passed else '**failed**'} | {check.value:.3f} | {check.threshold:.3f} | "
+            f"{check.meaning} |"
+            for check in self.checks
+        ]
+        table = "\n".join(["| check | | value | at most | meaning |", "|---|---|---|---|---|", *rows])
+        return f"{table}\n\nWarning{self._warning().removeprefix('; warning')}" if self.capped_steps else table
+
+    def _warning(self) -> str:
+        if not self.capped_steps:
+            return ""
+        steps = ", ".join(map(str, self.capped_steps))
+        return (
+            f"; warning: at the ln N cap at t = {steps}: the lower limit can be far below the truth, use more episodes"
+        )
+
+
+@threads(1)
+def trust_checks(batch: InformationBatch, interval: InformationInterval | None = None, *, seed: int = 0) -> TrustBadge:
+    r"""
+    Check an information interval against what must come out.
+
+    - **shuffled pairs**: with every state paired with the TRVs of another episode there is no information, and no
+      lower bound must find any;
+    - **data processing**: a noisier copy of the TRVs (the same noise added to all of a time step, so much that the
+      encoder's mean variance is four times as large) knows no more of the state, so its lower limit must not be above
+      the upper limit of the TRVs, nor its estimate above theirs (where both count as 0 if they are negative: then the
+      critic finds nothing, and its limit is 0);
+    - **encoder density**: :math:`(\tilde x - \mu) / \sigma` must have mean square 1, or the density that every bound
+      rests on is not that of the TRVs (actions and TRVs taken without noise, say).
+
+    Of the time steps, the worst is reported. If all is well, a check fails with a probability of about 1 %, the number
+    of time steps allowed for.
+
+    :param batch: The rollouts ``(T, N, ...)`` of the interval.
+    :param interval: From :func:`~sb3_tdpg.measurement.information_interval`; made anew if not given.
+    :param seed: Of the shuffling and of the intervals.
+    :raises ValueError: if no time step has enough episodes.
+    """
+    interval = information_interval(batch, seed=seed) if interval is None else interval
+    steps = np.flatnonzero(np.isfinite(interval.upper) & np.isfinite(interval.estimates["critic"]))
+    if len(steps) == 0:
+        raise ValueError(
+            f"no time step has an interval to be checked: {interval.n_episodes.max(initial=0)} episodes at the most"
+        )
+    miss = FALSE_ALARM / len(steps)
+    quantile = normal_quantile(miss)
+    checks = (
+        _shuffled_pairs(batch, steps, normal_quantile(miss / len(LOWER_BOUNDS)), seed),
+        _data_processing(batch, interval, steps, quantile, seed),
+        _encoder_density(batch, steps, normal_quantile(miss / 2)),  # either sign counts
+    )
+    cap = np.log(interval.n_episodes[steps])
+    lower = np.maximum(*(interval.estimates[name][steps] for name in LOWER_BOUNDS))
+    capped = steps[lower >= NEAR_THE_CAP * cap]
+    return TrustBadge(checks, tuple(capped.tolist()))
+
+
+def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float, seed: int) -> TrustCheck:
+    rng = np.random.default_rng(seed)
+    states = batch.states.clone()
+    for t in steps:
+        living = np.flatnonzero(np.ones(states.shape[1]) if batch.alive is None else batch.alive[t].cpu().numpy())
+        order = rng.permutation(living)
+        states[t, order] = batch.states[t, np.roll(order, 1)]  # one cycle: no episode keeps its own
+    null = information_interval(batch._replace(states=states), seed=seed)
+    return _worst(
+        "shuffled pairs",
+        np.concatenate([null.estimates[name][steps] for name in LOWER_BOUNDS]),
+        quantile * np.concatenate([null.errors[name][steps] for name in LOWER_BOUNDS]),
+        "nats that a lower bound finds where there are none",
+    )
+
+
+def _data_processing(
+    batch: InformationBatch, interval: InformationInterval, steps: np.ndarray, quantile: float, seed: int
+) -> TrustCheck:
+    # Noise that knew how noisy the encoder is would tell something of its input: one variance for all of a time step.
+    variances = batch.stds.square()
+    if batch.alive is not None:
+        variances = variances.masked_fill(~batch.alive[..., None], 0.0)
+    n_living = batch.trvs.shape[1] if batch.alive is None else batch.alive.sum(1)[:, None, None].clamp(min=1)
+    stds = (batch.stds.square() + ADDED_VARIANCE * variances.sum(1, keepdim=True) / n_living).sqrt()
+    noisier = batch._replace(trvs=batch.means + (batch.trvs - batch.means) * stds / batch.stds, stds=stds)
+    copy = information_interval(noisier, confidence=interval.confidence, seed=seed)
+    name = "data processing"
+    in_order = _worst(
+        name,
+        (copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0))[steps],
+        quantile * np.hypot(copy.errors["critic"], interval.errors["critic"])[steps],
+        "nats by which a noisier copy of the TRVs knows more, by the critic's bound",
+    )
+    crossed = TrustCheck(
+        name,
+        float((copy.lower - interval.upper)[steps].max()),
+        0.0,
+        "nats by which the lower limit of a noisier copy of the TRVs is above the upper limit",
+    )
+    return in_order if crossed.passed else crossed
+
+
+def _encoder_density(batch: InformationBatch, steps: np.ndarray, quantile: float) -> TrustCheck:
+    trv_dim = batch.trvs.shape[2]
+    excess, n_noises = [], []
+    for t in steps.tolist():
+        at_t = batch.at(t)
+        noise = (at_t.trvs - at_t.means) / at_t.stds
+        n_noises.append(noise.shape[1] * trv_dim)
+        excess.append(abs(noise.double().square().mean().item() - 1))
+    threshold = quantile * np.sqrt(2 / np.asarray(n_noises))  # the square of a normal number has variance 2
+    return _worst("encoder density", np.asarray(excess), threshold, "distance of the mean square of the noise from 1")
+
+
+def _worst(name: str, values: np.ndarray, thresholds: np.ndarray, meaning: str) -> TrustCheck:
+    worst = int(np.argmax(values - thresholds))
+    return TrustCheck(name, float(values[worst]), float(thresholds[worst]), meaning)

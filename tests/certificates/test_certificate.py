@@ -1,0 +1,203 @@
+"""The certificate: its arithmetic, its confidence, its counter-example, and whether it holds."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp, rel_entr
+
+from sb3_tdpg.certificates.certificate import certificate, cost_distribution, entropic_risk, worst_mean
+
+
+def kl(p, q):
+    return float(rel_entr(p, q).sum())
+
+
+def random_problem(random, n=6):
+    """Two distributions on n points, and costs."""
+    p, shifted = random.dirichlet(np.full(n, 0.7), 2)
+    return p + 1e-12, shifted, random.normal(0, 10.0 ** random.uniform(-2, 2), n)
+
+
+@pytest.mark.parametrize("beta", [1e-12, 1e-3, 1.0, 1e3, 1e9])
+def test_entropic_risk_lies_between_mean_and_largest_cost_however_large_the_exponent(beta):
+    costs = np.random.default_rng(0).exponential(1e4, 1000)
+    risk = entropic_risk(costs, beta)
+    assert costs.mean() * (1 - 1e-12) <= risk <= costs.max()
+    if beta == 1e9:
+        assert risk == pytest.approx(costs.max(), rel=1e-9)
+    if beta == 1e-12:
+        assert risk == pytest.approx(costs.mean() + beta * costs.var() / 2, rel=1e-9)
+
+
+def test_entropic_risk_is_the_log_of_the_mean_exponential():
+    costs, weights = np.array([-3.0, 0.0, 7.0]), np.array([0.2, 0.5, 0.3])
+    assert entropic_risk(costs, 0.4, weights) == pytest.approx(logsumexp(0.4 * costs, b=weights) / 0.4)
+    assert entropic_risk(costs, 0.0, weights) == pytest.approx(weights @ costs)
+
+
+def test_the_bound_holds_in_random_problems_for_every_beta():
+    random = np.random.default_rng(1)
+    for _ in range(500):
+        p, shifted, costs = random_problem(random)
+        beta = 10.0 ** random.uniform(-4, 3)
+        assert shifted @ costs <= entropic_risk(costs, beta, p) + kl(shifted, p) / beta + 1e-8
+
+
+def test_the_best_beta_gives_the_worst_mean_within_the_divergence():
+    random = np.random.default_rng(2)
+    for _ in range(100):
+        p, _, costs = random_problem(random)
+        order = np.argsort(costs)
+        p, costs = p[order] / p.sum(), costs[order]
+        beta = random.uniform(0.1, 3) / costs.std()
+        tilted = p * np.exp(beta * (costs - costs.max()))
+        tilted /= tilted.sum()
+        distribution = cost_distribution(costs, confidence=None)._replace(values=costs, probabilities=p)
+        found = worst_mean(distribution, kl(tilted, p))
+        assert found.bound == pytest.approx(tilted @ costs, rel=1e-5, abs=1e-5 * np.ptp(costs))
+        assert found.beta == pytest.approx(beta, rel=0.05)
+        assert found.risk + found.kl / found.beta == pytest.approx(found.bound)
+
+
+def test_a_divergence_of_nothing_gives_the_mean_and_a_large_one_the_largest_cost():
+    costs = np.array([1.0, 2.0, 6.0])
+    assert certificate(costs, 0.0, confidence=None).bound == pytest.approx(3.0)
+    assert certificate(costs, math.log(3) + 1e-9, confidence=None).bound == 6.0
+    assert certificate(costs, math.inf, cost_bound=10.0).bound == 10.0
+    assert certificate(costs, math.log(3) - 0.01, confidence=None).bound < 6.0
+    assert certificate(np.full(4, 2.5), 1.0, confidence=None).bound == 2.5
+
+
+def printed_bound(costs, p, beta, information):
+    return entropic_risk(costs, beta, p) + information
+
+
+def lamp(error, cost=10.0):
+    """
+    A lamp is on or off, the TRV tells which, wrongly with probability ``error``; acting on the wrong one costs.
+
+    :return: joint probabilities of (lamp, TRV) and costs, of the four outcomes; information in nats
+    """
+    joint = 0.5 * np.array([1 - error, error, error, 1 - error])
+    return joint, np.array([0.0, cost, cost, 0.0]), kl(joint, np.full(4, 0.25))
+
+
+def test_the_printed_condition_is_met_where_the_printed_bound_fails():
+    p, costs, information = lamp(0.01)
+    shifted, _, _ = lamp(0.99)
+    beta = 0.1
+    assert beta * kl(shifted, p) <= information  # as the paper prints it
+    assert shifted @ costs > 10 * printed_bound(costs, p, beta, information)
+    assert kl(shifted, p) > beta * information  # the corrected condition is not met
+
+
+def test_the_corrected_condition_is_enough_for_every_shift_of_the_example():
+    p, costs, information = lamp(0.01)
+    n_met = 0
+    for beta in (0.01, 0.1, 0.5, 1.0, 3.0):
+        for error in np.linspace(0.001, 0.999, 999):
+            shifted, _, _ = lamp(error)
+            if kl(shifted, p) <= beta * information:
+                n_met += 1
+                assert shifted @ costs <= printed_bound(costs, p, beta, information) + 1e-12
+    assert n_met > 500
+
+
+def test_the_printed_condition_is_enough_for_beta_of_at_least_one():
+    random = np.random.default_rng(3)
+    for _ in range(500):
+        p, shifted, costs = random_problem(random)
+        beta = 10.0 ** random.uniform(0, 2)
+        information = beta * kl(shifted, p)  # just met
+        assert shifted @ costs <= printed_bound(costs, p, beta, information) + 1e-8
+
+
+# Name -> (sampler, cost bound, cumulant generating function at beta).
+KNOWN = {
+    "uniform": (lambda random, n: random.uniform(0, 1, n), 1.0, lambda b: math.log(math.expm1(b) / b)),
+    "rare disaster": (
+        lambda random, n: 50.0 * (random.random(n) < 0.002),
+        50.0,
+        lambda b: math.log1p(0.002 * math.expm1(50 * b)),
+    ),
+    "coin": (lambda random, n: 1.0 * (random.random(n) < 0.5), 1.0, lambda b: math.log((1 + math.exp(b)) / 2)),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("n", [30, 1000])
+def test_the_confidence_bound_covers_all_betas_at_once(name, n):
+    sample, cost_bound, cumulant = KNOWN[name]
+    betas = np.geomspace(1e-3, 10, 9) / cost_bound
+    truth = np.array([cumulant(beta) / beta for beta in betas])
+    random = np.random.default_rng(4)
+    n_covered = 0
+    for _ in range(200):
+        distribution = cost_distribution(sample(random, n), cost_bound, confidence=0.9)
+        risks = [worst_mean(distribution, 0.0).bound]
+        risks += [entropic_risk(distribution.values, beta, distribution.probabilities) for beta in betas]
+        n_covered += (np.array(risks) >= np.append(truth[0], truth) - 1e-9).all()
+    assert n_covered >= 175  # 180 expected if the band were exact; it is wider
+
+
+def test_the_band_lies_below_the_distribution_function_at_all_ranks_at_once():
+    random = np.random.default_rng(8)
+    n_below = 0
+    for _ in range(200):
+        distribution = cost_distribution(random.uniform(0, 1, 1000), cost_bound=1.0, confidence=0.9)
+        n_below += (np.cumsum(distribution.probabilities)[:-1] <= distribution.values[:-1]).all()
+    assert n_below >= 175
+
+
+def test_without_allowance_the_estimate_is_below_the_truth_half_of_the_time():
+    random = np.random.default_rng(5)
+    estimates = [certificate(random.uniform(0, 1, 50), 0.0, confidence=None).bound for _ in range(200)]
+    assert 60 < np.sum(np.array(estimates) < 0.5) < 140
+
+
+def test_the_band_is_narrow_in_the_tail():
+    costs = np.random.default_rng(6).uniform(0, 1, 100_000)
+    distribution = cost_distribution(costs, cost_bound=1000.0, confidence=0.95)
+    assert distribution.probabilities.sum() == pytest.approx(1.0)
+    assert (distribution.probabilities >= 0).all()
+    assert 1 / len(costs) < distribution.probabilities[-1] < 15 / len(costs)
+    assert worst_mean(distribution, 0.0).bound < 0.5 + 1000 * 15 / len(costs) + 0.02
+
+
+def test_a_cap_cuts_off_no_more_than_the_level():
+    costs = np.random.default_rng(7).exponential(1.0, 5000)
+    for confidence, bound in ((None, None), (0.95, 1e6)):
+        distribution = cost_distribution(costs, bound, confidence)
+        for level in (0.0, 1e-3, 0.1):
+            capped, beyond = distribution.capped(level)
+            assert capped.probabilities.sum() == pytest.approx(1.0)
+            assert capped.values[-1] <= costs.max()
+            assert (costs > capped.values[-1]).mean() <= beyond + 1e-12  # the band leaves more than the sample
+            assert beyond <= max(level, 1 - distribution.probabilities[:-1].sum()) + 1e-12
+    assert distribution.capped(0.1)[0].values[-1] < distribution.capped(1e-3)[0].values[-1]
+
+
+def test_an_event_raises_the_lowest_costs_to_the_largest():
+    distribution = cost_distribution(np.array([0.0, 1.0, 2.0, 3.0]), confidence=None)
+    raised = distribution.with_largest(0.3)
+    np.testing.assert_allclose(raised.probabilities, [0.0, 0.2, 0.25, 0.55])
+    np.testing.assert_allclose(distribution.with_largest(0.0).probabilities, distribution.probabilities)
+    np.testing.assert_allclose(distribution.with_largest(1.0).probabilities, [0, 0, 0, 1])
+
+
+BAD = {
+    "no cost bound": (dict(), "cost_bound=None must be finite"),
+    "cost above the bound": (dict(cost_bound=2.0), "a cost of 3 exceeds cost_bound=2"),
+    "confidence": (dict(cost_bound=5.0, confidence=1.0), "confidence=1.0 must lie between 0 and 1"),
+    "beta": (dict(cost_bound=5.0, beta=0.0), "beta=0.0 must be finite and positive"),
+    "kl": (dict(cost_bound=5.0, kl=-0.1), "kl=-0.1 must be at least 0"),
+    "nan": (dict(cost_bound=5.0, costs=np.array([1.0, np.nan])), "costs must be a vector of finite numbers"),
+    "no costs": (dict(cost_bound=5.0, costs=np.array([])), "costs must be a vector of finite numbers"),
+}
+
+
+@pytest.mark.parametrize("given, message", BAD.values(), ids=BAD)
+def test_bad_input_is_told(given, message):
+    with pytest.raises(ValueError, match=message):
+        certificate(**{"costs": np.array([1.0, 3.0]), "kl": 0.1, **given})

@@ -1,0 +1,518 @@
+"""Environments in Ray's actors give SubprocVecEnv's numbers, and a dead actor is replaced or reported."""
+
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from small_problems import AtEveryStep, assert_same_parameters, parameters, tiny_tdpg, train_epochs
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import CSVOutputFormat, Logger
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_tdpg import TDPG, TrainingCheckpointCallback
+
+ray = pytest.importorskip("ray")
+
+from sb3_tdpg.distributed.ray_vec_env import DeadActorError, RayVecEnv  # noqa: E402
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+N = 3  # not a multiple of the number of actors: environment 0 is in actor 0, the others are in actor 1
+
+
+@pytest.fixture(scope="module", autouse=True)
+def local_ray():
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        environment.delenv("RAY_ADDRESS", raising=False)
+        # As SubprocVecEnv's processes do, the actors must find what the tests import.
+        environment.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+        # SubprocVecEnv's processes are forked from one that has imported PyTorch once.
+        multiprocessing.set_forkserver_preload(["sb3_tdpg"])
+        ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+        yield
+        ray.shutdown()
+
+
+class WanderEnv(gym.Env):
+    """A noisy walk in any kind of space; it ends at a random time, or is cut off, and shows what it was told."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    horizon = 4
+
+    def __init__(self, kind="box", name=0, render_mode=None):
+        self.name, self.render_mode, self.gain = name, render_mode, 1.0
+        box = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        self.observation_space = {
+            "box": box,
+            "dict": spaces.Dict(walk=box, time=spaces.Box(0, 99, (), np.int64)),
+            "tuple": spaces.Tuple((box, spaces.Box(0, 99, (1,), np.int64))),
+            "discrete": spaces.Discrete(99),
+        }[kind]
+        self.kind = kind
+
+    def _observe(self):
+        walk = self.x.copy()
+        kinds = {
+            "box": walk,
+            "dict": {"walk": walk, "time": self.t},
+            "tuple": (walk, np.array([self.t])),
+            "discrete": self.t,
+        }
+        return kinds[self.kind]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        self.x = self.np_random.standard_normal(3) + (options or {}).get("shift", 0.0)
+        return self._observe(), {"begins_at": self.x.copy()}
+
+    def step(self, action):
+        action *= self.gain  # in place, which is an environment's right
+        self.t += 1
+        self.x[:2] += action
+        self.x += 0.1 * self.np_random.standard_normal(3)
+        truncated = self.t == self.horizon
+        terminated = bool(self.np_random.random() < 0.1) or (truncated and self.name == 0)
+        info = {"x": self.x, "ends": (terminated, truncated)}
+        return self._observe(), float(self.x.sum()), terminated, truncated, info
+
+    def render(self):
+        return np.full((4, 4, 3), self.name, np.uint8)
+
+    def double(self, value, *, plus=0):
+        return 2 * value + plus + self.name
+
+    def pid(self):
+        return os.getpid()
+
+    def fail(self):
+        raise KeyError("lost key")
+
+
+class OwnNoiseEnv(WanderEnv):
+    """Draws from a generator of its own, which no seed reaches, where it begins or for its rewards."""
+
+    def __init__(self, kind, name, noise_in):
+        super().__init__(kind, name)
+        self.noise_in = noise_in
+
+    def reset(self, *, seed=None, options=None):
+        _, info = super().reset(seed=seed, options=options)
+        if self.noise_in == "reset":
+            self.x += np.random.default_rng().standard_normal(3)
+        return self._observe(), info
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        if self.noise_in == "reward":
+            reward += np.random.default_rng().standard_normal()
+        return observation, reward, *rest
+
+
+class CrashingEnv(WanderEnv):
+    """Takes its process along, each time it is told to."""
+
+    def step(self, action):
+        if action[0] > 0.99:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+
+class SleepingEnv(WanderEnv):
+    """Falls asleep in its first life, if told to."""
+
+    def __init__(self, marker):
+        super().__init__()
+        self.marker = marker
+
+    def step(self, action):
+        if action[0] > 0.99 and not self.marker.exists():
+            self.marker.touch()
+            time.sleep(600)
+        return super().step(action)
+
+
+def wanderers(kind="box", n=N, env_class=WanderEnv, **kwargs):
+    return [lambda name=name: env_class(kind, name, **kwargs) for name in range(n)]
+
+
+@pytest.fixture
+def make():
+    """Make a RayVecEnv of two actors that is closed whatever happens."""
+    made = []
+
+    def make_one(env_fns, n_actors=2, **kwargs):
+        made.append(RayVecEnv(env_fns, n_actors, **kwargs))
+        return made[-1]
+
+    yield make_one
+    for env in made:
+        env.close()
+
+
+def actions(t, n=N):
+    return np.random.default_rng(t).uniform(-0.9, 0.9, (n, 2)).astype(np.float32)
+
+
+def assert_same(first, second):
+    """Compare what two environments returned: values, types, and whether arrays may be written to."""
+    if isinstance(first, dict):
+        assert list(first) == list(second)
+        for key in first:
+            if key != "t":  # Monitor's clock
+                assert_same(first[key], second[key])
+    elif isinstance(first, (tuple, list)):
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    elif isinstance(first, np.ndarray):
+        assert first.dtype == second.dtype
+        assert first.flags.writeable == second.flags.writeable
+        np.testing.assert_array_equal(first, second)
+    else:
+        assert type(first) is type(second)
+        assert first == second
+
+
+def kill(env, index):
+    """Kill -9 the process of the actor that an environment is in."""
+    # Not env_method: after it nothing is replaced.
+    (pid,) = env._pool.ask([index], "env_method", "pid", (), {})
+    assert pid != os.getpid()
+    os.kill(pid, signal.SIGKILL)
+
+
+def trace(env, n_steps=15, *, seed=3, before_step=None):
+    """Everything that an environment returns."""
+    env.seed(seed)
+    seen = [(env.reset(), list(env.reset_infos))]
+    for t in range(n_steps):
+        if before_step is not None:
+            before_step(t)
+        observations, rewards, dones, infos = env.step(actions(t))
+        seen.append((observations, rewards, dones, list(infos), list(env.reset_infos)))
+    return seen
+
+
+# -- the same as SubprocVecEnv ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "kind", ["box", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("dict", "tuple", "discrete"))]
+)
+def test_it_gives_what_subproc_vec_env_gives(kind, make):
+    ours, theirs = make(wanderers(kind)), SubprocVecEnv(wanderers(kind))
+    seen = trace(ours)
+    assert_same(seen, trace(theirs))
+    ends = {info["ends"] for step in seen[1:] for info in step[3]}
+    assert ends == {(False, False), (True, False), (False, True), (True, True)}
+    assert_same(ours.reset(), theirs.reset())  # a seed is used once
+    for env in (ours, theirs):
+        env.seed(4)
+        env.set_options([{"shift": 10.0 * i} for i in range(N)])
+    assert_same(ours.reset(), theirs.reset())
+    assert_same(list(ours.reset_infos), list(theirs.reset_infos))
+    assert_same(ours.reset(), theirs.reset())  # so are options
+    theirs.close()
+
+
+def test_attributes_methods_and_pictures_of_the_environments_can_be_reached(make):
+    env = make([lambda f=f: Monitor(f()) for f in wanderers(render_mode="rgb_array")])
+    assert env.get_attr("name") == [0, 1, 2]
+    assert env.get_attr("name", indices=[2, 0, -2]) == [2, 0, 1]
+    assert env.get_attr("name", indices=2) == [2]
+    env.set_attr("colour", np.arange(2), indices=[2])
+    with pytest.raises(AttributeError, match="colour"):
+        env.get_attr("colour")
+    env.set_attr("colour", np.zeros(2), indices=[0, 1])
+    np.testing.assert_array_equal(np.array(env.get_attr("colour"))[:, 1], [0, 0, 1])
+    assert env.get_attr("colour")[0].flags.writeable
+    assert env.has_attr("kind")
+    assert not env.has_attr("no_such_attribute")
+    assert env.env_method("double", 10, plus=0.5, indices=[2, 1]) == [22.5, 21.5]
+    assert env.env_is_wrapped(Monitor) == [True] * N
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit, indices=[0]) == [False]
+    assert [image[0, 0, 0] for image in env.get_images()] == [0, 1, 2]
+    assert env.render().shape == (8, 8, 3)  # tiled
+    assert len(set(env.env_method("pid"))) == 2  # one process for each actor
+    with pytest.raises(ValueError, match="2 actions were given: 3 environments"):
+        env.step(actions(0, 2))
+    # An error of an environment is raised as it is, and does no harm to the others.
+    with pytest.raises(KeyError, match="lost key"):
+        env.env_method("fail", indices=[1])
+    assert env.get_attr("name") == [0, 1, 2]
+
+
+def csv_log(vec_env, tmp_path, algorithm):
+    """Train a little; return what was logged, but for times, and the policy."""
+    name = type(vec_env).__name__
+    if algorithm == "PPO":
+        model = PPO("MlpPolicy", vec_env, n_steps=20, batch_size=20, n_epochs=1, seed=0, device="cpu")
+    else:
+        kwargs = dict(beta=float("inf")) if vec_env.observation_space.shape == (1, 128, 128) else {}
+        if kwargs:
+            kwargs.update(n_epochs=1, batch_size=None, policy_kwargs={})
+        model = tiny_tdpg(vec_env, n_episodes=4, **kwargs)
+    path = tmp_path / f"{name}.csv"
+    model.set_logger(Logger(str(tmp_path), [CSVOutputFormat(str(path))]))
+    if algorithm == "PPO":
+        model.learn(80)
+    else:
+        train_epochs(model, 2)
+    vec_env.close()
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    columns = [i for i, key in enumerate(rows[0]) if not key.startswith("time/") or key == "time/total_timesteps"]
+    assert len(rows) == 3
+    assert "rollout/ep_rew_mean" in rows[0]
+    return [[row[i] for i in columns] for row in rows], parameters(model.policy)
+
+
+@pytest.mark.parametrize("env_id, algorithm", [
+    ("Lava-v0", "TDPG"),
+    pytest.param("Lava-v0", "PPO", marks=pytest.mark.slow),
+    pytest.param("PandaGrasp-v0", "TDPG", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_a_training_gives_the_log_that_it_gives_with_subproc_vec_env(env_id, algorithm, tmp_path):
+    # With the module: the server that SubprocVecEnv's processes are forked from may be that of an earlier test.
+    logs, policies = zip(*[
+        csv_log(make_vec_env(f"sb3_tdpg:{env_id}", n_envs=2, seed=1, vec_env_cls=vec_env), tmp_path, algorithm)
+        for vec_env in (RayVecEnv, SubprocVecEnv)
+    ], strict=True)  # fmt: skip
+    assert logs[0] == logs[1]
+    assert_same_parameters(*policies)
+
+
+def test_the_block_of_the_guide_trains():
+    guide = (REPOSITORY / "docs" / "guide" / "zoo.md").read_text()
+    (code,) = re.findall(r"<!-- no-run -->\n```python\n(from stable.*?)^```", guide, re.MULTILINE | re.DOTALL)
+    small = {"n_envs=40": "n_envs=4", "n_actors=8": "n_actors=2", "seed=0": "seed=0, n_episodes=40", "40_000": "80"}
+    for full, brief in small.items():
+        assert code.count(full) == 1
+        code = code.replace(full, brief)
+    namespace = {}
+    exec(code, namespace)
+    try:
+        assert isinstance(namespace["env"], RayVecEnv)
+        assert namespace["model"].num_timesteps == 80
+    finally:
+        namespace["env"].close()
+
+
+# -- an actor that dies -----------------------------------------------------------------------------------------------
+
+
+def test_a_dead_actor_is_reported_by_name_at_every_call_and_the_rest_can_be_closed(make):
+    env = make(wanderers())
+    env.reset()
+    kill(env, 2)
+    for call in (lambda: env.step(actions(0)), env.reset, lambda: env.get_attr("name")):
+        with pytest.raises(DeadActorError, match=r"actor 1 of 2 \(environments 1 to 2\) has died.*last checkpoint"):
+            call()
+    assert env.get_attr("name", indices=[0]) == [0]
+    env.close()
+    env.close()
+
+
+def test_a_replaced_actor_goes_on_as_if_nothing_had_happened(make):
+    lengths = []
+
+    def settings_and_deaths(env, deaths):
+        def before_step(t):
+            if t == 2:
+                env.set_attr("gain", 0.5)  # in mid-episode
+            if t == 9:
+                env.set_attr("gain", 0.25, indices=[1])
+            if t == 11:  # in mid-episode, too
+                lengths.append(env.get_attr("t", indices=[1, 2]))
+            if t in deaths:
+                kill(env, deaths[t])
+
+        return before_step
+
+    undisturbed = make(wanderers("dict"))
+    expected = trace(undisturbed, before_step=settings_and_deaths(undisturbed, {}))
+    undisturbed.close()
+    env = make(wanderers("dict"), max_restarts=2)
+    with pytest.warns(UserWarning, match=r"actor . of 2 .* is replaced \(restart . of at most 2\)") as warned:
+        seen = trace(env, before_step=settings_and_deaths(env, {0: 2, 11: 1}))
+    assert_same(seen, expected)
+    assert len(warned) == 2
+    assert lengths[0] == lengths[1]
+    assert 0 not in lengths[0]
+    kill(env, 1)
+    with pytest.raises(DeadActorError, match=r"max_restarts=2"):
+        env.step(actions(0))
+
+
+class Lava(gym.Wrapper):
+    """Tells in which process it is."""
+
+    def __init__(self):
+        super().__init__(gym.make("Lava-v0"))
+        self.pid = os.getpid()
+
+
+def lava_model(env):
+    return tiny_tdpg(env, n_episodes=4)
+
+
+def killing_at(*steps):
+    """Kill an actor in mid-training; Lava takes ten steps an epoch here."""
+
+    def strike(callback):
+        if callback.n_calls in steps:
+            os.kill(callback.training_env.get_attr("pid")[1], signal.SIGKILL)
+
+    return AtEveryStep(strike)
+
+
+def test_a_training_that_loses_actors_ends_with_the_parameters_of_one_that_does_not(make, tmp_path):
+    undisturbed = lava_model(make([Lava] * 2))
+    train_epochs(undisturbed, 4)
+    undisturbed.env.close()
+    replaced = lava_model(make([Lava] * 2, max_restarts=2))
+    with pytest.warns(UserWarning, match="is replaced"):
+        train_epochs(replaced, 4, callback=killing_at(7, 23))
+    assert_same_parameters(parameters(replaced.policy), parameters(undisturbed.policy))
+
+
+def test_a_training_goes_on_from_its_checkpoint_after_a_dead_actor_was_reported(make, tmp_path):
+    path = tmp_path / "checkpoint.zip"
+    undisturbed = lava_model(make([Lava] * 2))
+    train_epochs(undisturbed, 4, callback=TrainingCheckpointCallback(tmp_path / "other.zip", 1))
+    undisturbed.env.close()
+    broken = lava_model(make([Lava] * 2))
+    with pytest.raises(DeadActorError, match="actor 1 of 2"):
+        train_epochs(broken, 4, callback=[TrainingCheckpointCallback(path, 1), killing_at(23)])
+    broken.env.close()
+    resumed = TDPG.load(path, env=make([Lava] * 2), device="cpu")
+    assert resumed.epoch == 2
+    resumed.learn(resumed.remaining_timesteps, callback=TrainingCheckpointCallback(path, 1), reset_num_timesteps=False)
+    assert_same_parameters(parameters(resumed.policy), parameters(undisturbed.policy))
+
+
+@pytest.mark.parametrize("noise_in, n_steps", [("reset", 0), ("reward", 2)])
+def test_an_actor_whose_environments_do_not_come_out_as_before_is_reported_not_replaced(noise_in, n_steps, make):
+    env = make(wanderers(env_class=OwnNoiseEnv, noise_in=noise_in), max_restarts=3)
+    env.seed(1)
+    env.reset()
+    for t in range(n_steps):
+        env.step(actions(t))
+    assert env.get_attr("t", indices=[0]) == [n_steps]  # still the first episode
+    kill(env, 0)
+    for _ in range(2):  # nothing goes on with other episodes
+        with pytest.warns(UserWarning), pytest.raises(DeadActorError, match="more than np_random and the actions"):
+            env.step(actions(1))
+
+
+def test_an_actor_is_not_replaced_after_a_method_that_may_have_changed_its_environments(make):
+    env = make(wanderers(), max_restarts=3)
+    env.reset()
+    env.env_method("double", 1)
+    kill(env, 0)
+    with pytest.raises(DeadActorError, match=r"env_method\('double'\) may have changed"):
+        env.step(actions(0))
+
+
+@pytest.mark.slow
+def test_an_action_that_kills_every_replacement_is_reported_in_the_end(make):
+    env = make(wanderers(n=2, env_class=CrashingEnv), max_restarts=2)
+    env.reset()
+    with pytest.warns(UserWarning) as warned, pytest.raises(DeadActorError, match=r"actor 1 of 2.*max_restarts=2"):
+        env.step(np.array([[0, 0], [1, 0]], np.float32))
+    assert len(warned) == 2
+
+
+@pytest.mark.parametrize("max_restarts", [0, 1])
+def test_an_actor_that_does_not_answer_counts_as_dead(max_restarts, make, tmp_path):
+    env = make([lambda: SleepingEnv(tmp_path / "marker")], 1, max_restarts=max_restarts, step_timeout=2.0)
+    env.reset()
+    action = np.array([[1, 0]], np.float32)
+    if max_restarts == 0:
+        with pytest.raises(DeadActorError, match=r"actor 0 of 1 .*timed out"):
+            env.step(action)
+    else:
+        with pytest.warns(UserWarning, match="is replaced"):
+            env.step(action)
+
+
+def test_files_of_monitor_are_not_begun_anew_by_a_replacement(make, tmp_path):
+    env_fns = [lambda: Monitor(WanderEnv(), str(tmp_path / "log"))]
+    with pytest.raises(ValueError, match=r"VecMonitor\(env, filename\)"):
+        make(env_fns, 1, max_restarts=1)
+
+
+# -- Ray, and bad input -----------------------------------------------------------------------------------------------
+
+
+def test_more_cpus_than_the_cluster_has_are_refused_after_a_while(make):
+    with pytest.raises(TimeoutError, match=r"1 of 1 actors did not start .*'num_cpus': 3.*'CPU': 2\.0, .*n_actors"):
+        make(wanderers(), 1, actor_options=dict(num_cpus=3), start_timeout=1.0)
+    assert make(wanderers(), 1).num_envs == N  # what was asked for is not still waited for
+
+
+def test_an_error_while_the_environments_are_made_is_raised_as_it_is(make):
+    with pytest.raises(gym.error.NameNotFound, match="NoSuchEnv"):
+        make([lambda: WanderEnv(), lambda: gym.make("NoSuchEnv-v0")])
+
+
+@pytest.mark.parametrize("kwargs, message", [
+    (dict(env_fns=[]), "env_fns is empty"),
+    (dict(n_actors=0), "n_actors=0 must be an integer of at least 1"),
+    (dict(n_actors=N + 1), "n_actors=4 must be at most the number of environments: 3"),
+    (dict(max_restarts=-1), "max_restarts=-1"),
+    (dict(actor_options=dict(max_restarts=1)), "give max_restarts to RayVecEnv itself"),
+    (dict(start_timeout=0), "start_timeout=0"),
+    (dict(step_timeout=-1.0), r"step_timeout=-1\.0"),
+])  # fmt: skip
+def test_bad_arguments_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        RayVecEnv(**{"env_fns": wanderers(), **kwargs})
+
+
+def test_without_ray_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ImportError, match=r"pip install sb3_tdpg\[ray\]"):
+        RayVecEnv(wanderers())
+
+
+OWN_INSTANCE = """
+import os
+import gymnasium as gym
+import ray
+from stable_baselines3.common.env_util import make_vec_env
+from sb3_tdpg.distributed.ray_vec_env import RayVecEnv
+
+class Polite(gym.Wrapper):
+    niceness = property(lambda self: os.nice(0))
+
+train = make_vec_env("Lava-v0", 2, wrapper_class=Polite, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=1))
+assert train.get_attr("niceness") == [os.nice(0)] * 2  # as SubprocVecEnv's processes; Ray's default is 15
+assert "RAY_worker_niceness" not in os.environ
+assert ray.is_initialized() and ray.cluster_resources()["CPU"] == 1
+evaluate = make_vec_env("Lava-v0", 1, vec_env_cls=RayVecEnv)  # is given a place, too
+train.reset()
+train.close()
+assert evaluate.reset().shape == (1, 2)  # still in use
+evaluate.close()
+assert not ray.is_initialized()
+print("shut down")
+"""
+
+
+@pytest.mark.slow
+def test_an_instance_of_its_own_is_started_and_shut_down_by_the_last_that_uses_it():
+    done = subprocess.run([sys.executable, "-c", OWN_INSTANCE], cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "shut down" in done.stdout

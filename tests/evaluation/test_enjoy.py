@@ -1,0 +1,316 @@
+"""``python -m sb3_tdpg enjoy``: episodes of a saved model, printed and recorded as a film."""
+
+import re
+import sys
+from unittest.mock import Mock
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from PIL import Image
+from small_problems import ToyEnv, tiny_tdpg
+from stable_baselines3 import PPO
+
+from sb3_tdpg.cli import main
+from sb3_tdpg.evaluation.animation import Episode, save_animation
+from sb3_tdpg.evaluation.enjoy import enjoy, parse_keywords
+
+pytest.importorskip("matplotlib")
+
+# Every episode starts alike, so that only the policy's noise can make a difference.
+SAME_START = dict(renderer="fast", robot_range=[0.5, 0.5])
+
+
+class PictureEnv(ToyEnv):
+    """A discrete problem whose picture is small, and which ends early now and then."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
+
+    def __init__(self, render_mode=None):
+        super().__init__(action_space=spaces.Discrete(2), horizon=3)
+        self.render_mode = render_mode
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated or self.x > 0, truncated, info
+
+    def render(self):
+        return np.full((30, 50, 3), int(100 * (self.x + 1)), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def lava(tmp_path_factory):
+    path = tmp_path_factory.mktemp("lava") / "model.zip"
+    tiny_tdpg().save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    path = tmp_path_factory.mktemp("ball") / "model.zip"
+    tiny_tdpg("BallCatch-v0", beta=1.0).save(path)
+    return path
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Register an environment of the tests for one test only."""
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+
+    def register(entry_point):
+        gym.register("Own-v0", entry_point)
+        return "Own-v0"
+
+    return register
+
+
+def frames_of(path):
+    """Every frame of a GIF as an array, and for how many ms it is shown."""
+    with Image.open(path) as film:
+        frames, durations = [], []
+        for i in range(film.n_frames):
+            film.seek(i)
+            frames.append(np.asarray(film.convert("RGB")))
+            durations.append(film.info["duration"])
+    return frames, durations
+
+
+def costs_printed(text):
+    return [float(cost) for cost in re.findall(r"episode \d+: cost (\S+)(?:,|\n)", text)]
+
+
+# -- what is printed ------------------------------------------------------------------------------------------
+
+
+def test_each_episodes_cost_and_final_state_are_printed_and_no_file_is_written(lava, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["enjoy", str(lava), "--env", "Lava-v0", "--n-episodes", "3"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"episode 3: cost \d+\.\d\d, final state \[.+\]\n", printed)
+    costs = costs_printed(printed)
+    assert len(set(costs)) == 3
+    mean = float(re.search(r"mean cost (\S+)", printed)[1])
+    assert mean == pytest.approx(np.mean(costs), abs=0.01)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(lava, capsys):
+    printed = []
+    for arguments in (["--seed", "1"], ["--seed", "1", "--n-episodes", "2"], ["--seed", "2"]):
+        main(["enjoy", str(lava), "--env", "Lava-v0", *arguments])
+        printed.append(capsys.readouterr().out.splitlines()[0])
+    assert printed[0] == printed[1] != printed[2]
+
+
+def test_a_deterministic_policy_repeats_an_episode_that_starts_alike(ball):
+    first, second = enjoy(ball, "BallCatch-v0", SAME_START, n_episodes=2, deterministic=True)
+    np.testing.assert_array_equal(first.trvs, second.trvs)
+    np.testing.assert_array_equal(first.costs, second.costs)
+    first, second = enjoy(ball, "BallCatch-v0", SAME_START, n_episodes=2)
+    assert not np.array_equal(first.trvs, second.trvs)
+
+
+def test_recording_does_not_change_the_episodes(ball, tmp_path):
+    settings = dict(env_kwargs=dict(SAME_START, pixel_noise_std=0.1), n_episodes=2)
+    (first, second), recorded = enjoy(ball, "BallCatch-v0", **settings), tmp_path / "film.gif"
+    for episode, seen in zip((first, second), enjoy(ball, "BallCatch-v0", **settings, record=recorded), strict=True):
+        np.testing.assert_array_equal(episode.trvs, seen.trvs)
+        np.testing.assert_array_equal(episode.costs, seen.costs)
+
+
+def test_keywords_of_the_environment_reach_it(ball, tmp_path, capsys):
+    keywords = ["renderer=fast", "texture=violet_dots", "robot_range=[0.5, 0.5]", "control_gain=1.0e-9"]
+    command = ["enjoy", str(ball), "--env", "BallCatch-v0", "--record", str(tmp_path / "film.gif")]
+    assert main([*command, "--env-kwargs", *keywords[:2], "--env-kwargs", *keywords[2:]]) == 0
+    printed = capsys.readouterr().out
+    assert "final state [ 0.5 " in printed, "a robot that starts there and cannot move ends there"
+    red, green, blue = frames_of(tmp_path / "film.gif")[0][0][:200, 400:500].reshape(-1, 3).mean(0)
+    assert min(red, blue) > 1.2 * green, "the wall is not violet"
+
+
+# -- the film -------------------------------------------------------------------------------------------------
+
+
+def test_a_gif_has_a_frame_for_each_state_and_holds_the_last_one(lava, tmp_path):
+    path = tmp_path / "made" / "film.gif"
+    assert main(["enjoy", str(lava), "--env", "Lava-v0", "--n-episodes", "2", "--record", str(path)]) == 0
+    frames, durations = frames_of(path)
+    assert durations == 2 * (5 * [500] + [1000])  # lava is drawn twice a second
+    assert {frame.shape for frame in frames} == {(96 + 190, 480, 3)}
+    assert [file.name for file in path.parent.iterdir()] == ["film.gif"]
+
+
+def test_a_frame_has_the_environments_picture_above_the_lines_up_to_the_present(lava, tmp_path):
+    (episode,) = enjoy(lava, "Lava-v0", record=tmp_path / "film.gif")
+    frames, _ = frames_of(tmp_path / "film.gif")
+    for frame, picture in zip(frames, episode.pictures, strict=True):
+        assert np.abs(frame[: len(picture)].astype(int) - picture).mean() < 4  # a GIF has 256 colours
+    # The first TRV is drawn in vermillion, in columns 62 to 404; right of them is the legend.
+    lines = [(np.abs(frame[110:245, 62:404].astype(int) - (0xD5, 0x5E, 0x00)).sum(-1) < 60) for frame in frames]
+    reach = [np.flatnonzero(line.any(0)).max() for line in lines]
+    assert reach == sorted(reach)
+    assert reach[0] < 10
+    steps = np.diff(reach[:5])
+    np.testing.assert_allclose(steps, (404 - 62) / 5, atol=3)  # the axis goes to the horizon of 5
+    assert reach[5] == reach[4], "there is no x~_T"
+
+
+def test_the_axes_do_not_move_while_the_lines_grow(lava, tmp_path):
+    enjoy(lava, "Lava-v0", n_episodes=2, record=tmp_path / "film.gif")
+    frames, _ = frames_of(tmp_path / "film.gif")
+    for frame in frames[1:]:
+        np.testing.assert_array_equal(frame[120:, :60], frames[0][120:, :60])  # ticks and label of the TRVs
+        np.testing.assert_array_equal(frame[255:], frames[0][255:])  # and of the time
+
+
+def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(registered, tmp_path):
+    env_id = registered(PictureEnv)
+    tiny_tdpg(gym.make(env_id)).save(tmp_path / "model.zip")
+    episodes = enjoy(tmp_path / "model.zip", env_id, n_episodes=6, record=tmp_path / "film.gif")
+    assert {len(episode.trvs) for episode in episodes} == {1, 3}
+    frames, _ = frames_of(tmp_path / "film.gif")
+    assert len(frames) == sum(len(episode.trvs) + 1 for episode in episodes)
+    assert frames[0].shape == (8 * 30 + 190, 8 * 50, 3)
+
+
+def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
+    pictures = [np.full((40, 500, 3), 10 * t, np.uint8) for t in range(4)]
+    save_animation([Episode(pictures, np.zeros((3, 20)), np.ones(3))], tmp_path / "film.gif", horizon=3, fps=1000)
+    assert frames_of(tmp_path / "film.gif")[1] == [20, 20, 20, 1000]
+
+
+def test_a_film_that_could_not_be_written_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):
+    pictures = [np.zeros((40, 500, 3), np.uint8)] * 4
+    episodes, path = [Episode(pictures, np.zeros((3, 2)), np.ones(3))], tmp_path / "film.gif"
+    path.write_bytes(b"old")
+
+    def interrupted(image, file, *args, **kwargs):
+        file.write_bytes(b"ne")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Image.Image, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save_animation(episodes, path, horizon=3, fps=10)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_mp4_is_written_without_an_ffmpeg_on_the_path(lava, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    enjoy(lava, "Lava-v0", record=tmp_path / "film.mp4")
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_grasp_is_shown_from_beginning_to_end(tmp_path):
+    env = gym.make("PandaGrasp-v0")
+    tiny_tdpg(env).save(tmp_path / "model.zip")
+    (episode,) = enjoy(tmp_path / "model.zip", "PandaGrasp-v0", record=tmp_path / "film.gif")
+    frames, _ = frames_of(tmp_path / "film.gif")
+    assert len(episode.between[0]) > 5
+    assert len(frames) == len(episode.pictures) + len(episode.between[0])
+    times = [time for time, _ in episode.film()]
+    assert times == sorted(times)
+    assert (times[0], times[-1]) == (0.0, 1.0)
+
+
+# -- bad input ------------------------------------------------------------------------------------------------
+
+
+def test_keywords_are_read_as_yaml():
+    texts = ["texture=violet_dots", "a=0.2", "b=1e-3", "c=[[8.0, 1], [8, 1e0]]", "d=null", "e=true", "f=7", "g=x=y"]
+    values = dict(texture="violet_dots", a=0.2, b=0.001, c=[[8.0, 1], [8, 1.0]], d=None, e=True, f=7, g="x=y")
+    assert parse_keywords(texts) == values
+    assert [type(value) for value in parse_keywords(texts).values()] == [type(value) for value in values.values()]
+
+
+@pytest.mark.parametrize(("texts", "message"), [
+    (["texture"], "'texture' is no keyword .* key=value"),
+    (["=3"], "'=3' is no keyword"),
+    (["a b=3"], "'a b=3' is no keyword"),
+    (["a={b: 1}"], "must be a number, a text, .* or a list of these"),
+    (["a=[{b: 1}]"], "must be a number"),
+    (["a=[1, 2"], "must be a number"),
+    (["a=2020-01-31"], "must be a number"),
+    (["a=1", "a=2"], "a is given twice"),
+], ids=str)  # fmt: skip
+def test_a_keyword_that_cannot_be_read_is_refused(texts, message):
+    with pytest.raises(ValueError, match=message):
+        parse_keywords(texts)
+
+
+@pytest.mark.parametrize(("arguments", "fragments"), [
+    (["--env", "Nope-v0"], ["Nope", "cannot be made"]),
+    (["--env", "BallCatch-v0", "--env-kwargs", "renderer=fast"], ["observation_space", "does not fit"]),
+    (["--env", "Lava-v0", "--env-kwargs", "horizon=7"], ["horizon of 5", "has 7"]),
+    (["--env", "Lava-v0", "--env-kwargs", "depth=1"], ["depth"]),
+    (["--env", "Lava-v0", "--env-kwargs", "depth"], ["'depth' is no keyword"]),
+    (["--env", "Lava-v0", "--seed", "-1"], ["seed=-1 must not be negative"]),
+    (["--env", "Lava-v0", "--record", "film.avi"], ["film.avi", "'.avi'", ".gif or .mp4"]),
+    (["--env", "Lava-v0", "--record", "film"], ["''", ".gif or .mp4"]),
+    (["--env", "Lava-v0", "--record", "film.gif", "--env-kwargs", "render_mode=null"], ["None", "'rgb_array'"]),
+], ids=str)  # fmt: skip
+def test_bad_input_is_reported_in_one_line_with_exit_code_2(arguments, fragments, lava, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["enjoy", str(lava), *arguments]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert all(fragment in line for fragment in fragments), line
+    assert "episode 1" not in captured.out
+    assert not list(tmp_path.iterdir())
+
+
+def a_missing_file(path):
+    return "cannot be read (No such file"
+
+
+def a_folder(path):
+    path.mkdir()
+    return "cannot be read (Is a directory)"
+
+
+def no_zip(path):
+    path.write_text("text")
+    return "wasn't a zip-file"
+
+
+def a_model_of_ppo(path):
+    PPO("MlpPolicy", "Lava-v0", device="cpu").save(path)
+    return "saved by another algorithm"
+
+
+@pytest.mark.parametrize("make", [a_missing_file, a_folder, no_zip, a_model_of_ppo])
+def test_what_is_no_model_is_reported_in_one_line_with_exit_code_2(make, tmp_path, capsys):
+    path = tmp_path / "model.zip"
+    expected = make(path)
+    assert main(["enjoy", str(path), "--env", "Lava-v0"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert expected in line
+
+
+def test_without_ffmpeg_an_mp4_is_refused_before_an_episode_is_run(lava, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert main(["enjoy", str(lava), "--env", "Lava-v0", "--record", str(tmp_path / "film.mp4")]) == 2
+    captured = capsys.readouterr()
+    assert "ffmpeg" in captured.err
+    assert "use .gif" in captured.err
+    assert "episode 1" not in captured.out
+
+
+def test_an_environment_that_draws_nothing_cannot_be_recorded(registered, tmp_path, monkeypatch):
+    env_id = registered(PictureEnv)
+    tiny_tdpg(gym.make(env_id)).save(tmp_path / "model.zip")
+    monkeypatch.setattr(PictureEnv, "render", lambda self: None)
+    with pytest.raises(ValueError, match=r"must return an array \(height, width, 3\) of uint8"):
+        enjoy(tmp_path / "model.zip", env_id, record=tmp_path / "film.gif")
+
+
+def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sb3_tdpg.envs.lava.LavaEnv.step", Mock(side_effect=KeyboardInterrupt))
+    assert main(["enjoy", str(lava), "--env", "Lava-v0", "--record", str(tmp_path / "film.gif")]) == 130
+    assert capsys.readouterr().err.strip() == "interrupted"
+    assert not list(tmp_path.iterdir())

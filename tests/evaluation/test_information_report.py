@@ -1,0 +1,218 @@
+"""What a policy's TRVs know: of each component of the state, in the report with its figures, and in the log."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from information_problems import channel, gaussian_batch, generator
+from small_problems import CountdownEnv, tiny_tdpg, train_epochs
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_tdpg import BatchedVecEnv, InformationCallback, SelectionCallback, make_episodes_env
+from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.evaluation import (
+    information_report,
+    information_timeline,
+    interval_frame,
+    knowledge_map,
+    save_figure,
+    state_knowledge,
+)
+from sb3_tdpg.measurement import information_interval
+from sb3_tdpg.measurement.interval import component_estimates, min_episodes
+
+PROBLEM = "Lava-v0"
+
+
+def looking_at_the_first_then_the_second():
+    """Two time steps: the TRVs tell the first component of three, then the second; the third is constant."""
+    rng = np.random.default_rng(0)
+    states = rng.standard_normal((2, 300, 3)) * np.array([1.0, 5.0, 0.0])
+    return channel(states, 3 * np.stack([states[0, :, :1], states[1, :, 1:2] / 5]), 1.0, rng)
+
+
+def test_the_knowledge_is_of_the_component_that_the_trvs_tell():
+    frame = state_knowledge(looking_at_the_first_then_the_second(), names=("a", "b", "c"))
+    assert list(frame.columns) == ["t", "component", "nats", "nats_lower", "r2"]
+    assert list(frame["component"].unique()) == ["a", "b"]
+    nats, r2 = (frame.pivot(index="t", columns="component", values=name) for name in ("nats", "r2"))
+    truth = 0.5 * math.log(10)
+    np.testing.assert_allclose(nats, [[truth, 0], [0, truth]], atol=0.15)
+    np.testing.assert_allclose(r2, [[0.9, 0], [0, 0.9]], atol=0.05)
+    assert (frame["nats_lower"] <= frame["nats"]).all()
+    assert (frame["nats_lower"] > 0).tolist() == [True, False, False, True]
+
+
+def test_what_many_trvs_know_of_two_components_is_found_in_each_of_them():
+    # Given one component, the density of the TRVs is a band along the other one.
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (1, 500, 2))
+    batch = channel(states, np.tanh(2 * states @ rng.standard_normal((2, 16))), 0.2, rng)
+    frame = state_knowledge(batch)
+    assert (frame["r2"] > 0.9).all()
+    assert (frame["nats_lower"] > 0.8).all()
+    # No more than a sensor that shows nothing but this component, with as much noise as the regression leaves.
+    assert (frame["nats"] < -0.5 * np.log(1 - frame["r2"]) + 0.3).all()
+
+
+def test_a_component_that_is_constant_at_one_step_only_has_no_number_there():
+    batch = looking_at_the_first_then_the_second()
+    batch.states[0, :, 1] = 2.0
+    estimates, limits = component_estimates(batch)
+    np.testing.assert_array_equal(np.isnan(estimates), [[False, True, True], [False, False, True]])
+    np.testing.assert_array_equal(np.isnan(limits), np.isnan(estimates))
+    frame = state_knowledge(batch)
+    assert frame["r2"].isna().tolist() == [False, True, False, False]
+
+
+def test_names_must_be_as_many_as_components():
+    with pytest.raises(ValueError, match="a name for each of the 3"):
+        state_knowledge(looking_at_the_first_then_the_second(), names=("a", "b"))
+
+
+def test_the_report_on_a_policy_has_frames_a_badge_and_figures(tmp_path):
+    model = tiny_tdpg(PROBLEM)
+    env = make_episodes_env(PROBLEM, n_episodes=40)
+    report = information_report(model, env, n_episodes=50, seed=3, names=("d", "v"))
+    assert len(report.costs) == 50
+    assert report.frame["t"].tolist() == list(range(model.horizon))
+    assert (report.frame["n_episodes"] == 50).all()
+    assert (report.frame["lower"] <= report.frame["upper"]).all()
+    assert "summed over time" in str(report)
+    assert report.badge.passed
+    assert set(report.knowledge["component"]) == {"d", "v"}
+    assert report.knowledge.loc[report.knowledge["component"] == "v", "nats"].isna().tolist()[0], "v_0 = 0"
+    for name, figure in report.figures().items():
+        save_figure(figure, tmp_path / f"{name}.png")
+    assert (tmp_path / "timeline.png").exists()
+    assert (tmp_path / "knowledge.png").exists()
+    again = information_report(model, env, n_episodes=50, seed=3, names=("d", "v"))
+    pd.testing.assert_frame_equal(report.frame, again.frame)
+    env.close()
+
+
+class CalledEnv(LavaEnv):
+    """The lava problem with other names of its state."""
+
+    state_names = ("place", "speed")
+
+
+class NamelessEnv(LavaEnv):
+    """The lava problem whose state has no names."""
+
+    state_names = None
+
+
+@pytest.mark.parametrize(
+    "env_class, names",
+    [(LavaEnv, {"d (m)", "v (m/step)"}), (CalledEnv, {"place", "speed"}), (NamelessEnv, {"x0", "x1"})],
+)
+def test_the_report_calls_the_components_as_the_environment_does(env_class, names):
+    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(env_class(), 50), n_episodes=50, seed=0)
+    assert set(report.knowledge["component"]) == names
+    labels = report.figures()["knowledge"].axes[0].get_yticklabels()
+    assert {label.get_text() for label in labels} == names
+
+
+def test_names_that_are_given_win_over_those_of_the_environment():
+    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(LavaEnv(), 50), 50, names=("a", "b"))
+    assert set(report.knowledge["component"]) == {"a", "b"}
+
+
+def test_a_report_tells_of_the_steps_that_its_sum_leaves_out():
+    env = DummyVecEnv([lambda: CountdownEnv(0, (4,))] + 59 * [lambda: CountdownEnv(1, (2,))])
+    report = information_report(tiny_tdpg(env, n_episodes=60), env, n_episodes=60, seed=0)
+    assert report.frame["upper"].isna().tolist() == [False, False, True, True]
+    assert "60 episodes, 2 steps with too few of them left out" in str(report)
+
+
+@pytest.mark.parametrize(
+    "model, env, message",
+    [
+        (
+            lambda: PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8),
+            lambda: make_episodes_env(PROBLEM, 4),
+            "is of PPO.*TDPG",
+        ),
+        (
+            tiny_tdpg,
+            lambda: make_vec_env("Pendulum-v1", 4),
+            r"observation_space is Box\(-inf.*environment's is Box\(\[",
+        ),
+    ],
+    ids=["another algorithm", "another environment"],
+)
+def test_a_report_of_what_does_not_fit_is_refused(model, env, message):
+    with pytest.raises(ValueError, match=message):
+        information_report(model(), env(), n_episodes=40)
+
+
+@pytest.mark.parametrize("callback", [InformationCallback(), SelectionCallback(cost_limit=1.0)])
+def test_a_callback_of_tdpg_refuses_other_algorithms(callback):
+    model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match=f"{type(callback).__name__} is for TDPG.*PPO"):
+        model.learn(8, callback=callback)
+
+
+def test_rounds_of_episodes_differ():
+    model = tiny_tdpg(PROBLEM)
+    env = make_episodes_env(PROBLEM, n_episodes=25)
+    report = information_report(model, env, n_episodes=50, seed=0)
+    assert len(set(report.costs.tolist())) == 50
+    env.close()
+
+
+def test_the_map_shows_every_value_and_marks_what_is_not_known():
+    frame = state_knowledge(looking_at_the_first_then_the_second(), names=("a", "b", "c"))
+    axes = knowledge_map(frame).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["a", "b"]
+    texts = [text.get_text() for text in axes.texts]
+    assert len(texts) == 4
+    assert [text.startswith("(") for text in texts] == [False, True, True, False]
+    np.testing.assert_allclose(
+        axes.images[0].get_array(), frame.pivot(index="component", columns="t", values="nats").to_numpy()
+    )
+    with pytest.raises(ValueError, match="no component"):
+        knowledge_map(frame.iloc[:0])
+
+
+def test_the_timeline_names_the_bounds():
+    interval = information_interval(gaussian_batch(100, [[0.0, 0.0], [100.0, 100.0]], generator=generator()))
+    axes = information_timeline(interval_frame(interval)).axes[0]
+    labels = axes.get_legend_handles_labels()[1]
+    assert "lower: frozen critic" in labels
+    assert "lower: never negative" in labels
+    assert any("ln N" in label for label in labels)
+
+
+def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the_training(tmp_path):
+    from stable_baselines3.common.logger import configure
+
+    losses = []
+    for callback in (None, InformationCallback(2)):
+        model = tiny_tdpg(PROBLEM, n_episodes=30, beta=float("inf"))
+        folder = tmp_path / str(callback is None)
+        model.set_logger(configure(str(folder), ["csv"]))
+        train_epochs(model, 4, callback=callback)
+        losses.append(pd.read_csv(folder / "progress.csv"))
+    plain, watched = losses
+    pd.testing.assert_series_equal(plain["rollout/ep_cost_mean"], watched["rollout/ep_cost_mean"])
+    assert not [name for name in plain if name.startswith("mi/")]
+    assert {"mi/lower", "mi/upper", "mi/knows_d", "mi/knows_v"} <= set(watched)
+    # The CSV logger fills what is missing in a row with nothing.
+    assert watched["mi/upper"].notna().tolist() == [True, False, True, False]
+    assert (watched["mi/lower"].dropna() <= watched["mi/upper"].dropna()).all()
+
+
+def test_a_callback_is_refused_where_an_epoch_has_too_few_episodes_for_an_interval():
+    model = tiny_tdpg(PROBLEM, n_episodes=min_episodes(2) - 1)
+    with pytest.raises(ValueError, match=r"n_episodes=19 are too few.* at least 20"):
+        train_epochs(model, 1, callback=InformationCallback())
+
+
+def test_a_callback_without_epochs_between_is_refused():
+    with pytest.raises(ValueError, match="eval_freq=0"):
+        InformationCallback(0)

@@ -1,0 +1,295 @@
+"""From the command line to results in a folder, with tiny settings: train, evaluate, interrupt, go on."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pandas as pd
+import pytest
+from small_problems import assert_same_parameters, parameters
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.callbacks import TDPGProgressBar
+from sb3_tdpg.cli import main
+from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.evaluation import aggregate_seeds
+from sb3_tdpg.experiments.runs import Run, complete_run, complete_runs, read_progress
+from sb3_tdpg.paper.lava import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
+CHEAP = dict(n_timesteps=800, n_episodes=20, mi_kwargs=dict(gradient_steps=2, warmup_gradient_steps=2))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Small epochs, so that a run of a few hundred steps has several."""
+    block = Run.settings.fget
+    monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 20}))
+
+
+def tiny_run(seed=0, **overrides):
+    return replace(lava_run("TDPG", "table", seed, **{**CHEAP, **overrides}), max_attempts=1)
+
+
+def policy_of(folder):
+    return TDPG.load(folder / "model.zip", device="cpu").policy.state_dict()
+
+
+def test_demo_writes_everything_that_it_promises(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    assert main(["demo", "--out", str(tmp_path), *TINY]) == 0
+
+    printed = capsys.readouterr().out
+    assert "PG (paper)" in printed
+    assert "31.04 (7.19)" in printed
+    assert (tmp_path / "table.md").read_text().strip() in printed
+    records = pd.read_csv(tmp_path / "episodes.csv")
+    assert len(records) == 2 * len(LAVA) * 8
+    assert set(records["model"]) == {"PG", "TDPG"}
+    assert np.isfinite(records["cost"]).all()
+    for picture in ("histograms.png", "trajectories.png", "training.png"):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert [run["seed"] for run in config["runs"]] == [0, 0]
+    assert config["provenance"]["versions"]["torch"]
+    model = TDPG.load(tmp_path / "tdpg.zip")
+    assert model.predict(np.zeros(2, np.float32), deterministic=True)[0].shape == (1,)
+    assert TDPG.load(tmp_path / "pg.zip").mi_coef == 0
+
+
+def test_demo_called_again_trains_nothing_and_prints_the_same(tmp_path, capsys, monkeypatch):
+    main(["demo", "--out", str(tmp_path), *TINY])
+    first = capsys.readouterr().out.split("\n\n")[1]
+    monkeypatch.setattr(TDPG, "learn", lambda *args, **kwargs: pytest.fail("it trains again"))
+    assert main(["demo", "--out", str(tmp_path), *TINY]) == 0
+    assert capsys.readouterr().out.split("\n\n")[1] == first
+
+
+def test_a_folder_with_another_run_is_refused_and_left_alone(tmp_path, capsys):
+    complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=r"with other settings, seed: 0 there, 1 here: choose another folder"):
+        complete_run(tiny_run(seed=1), tmp_path, LAVA[:1], n_eval_episodes=4)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_command_line_tells_bad_input_in_one_line_with_exit_code_2(tmp_path, capsys):
+    main(["demo", "--out", str(tmp_path), *TINY])
+    assert main(["demo", "--out", str(tmp_path), "--n-timesteps", "900", "--n-eval-episodes", "8"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: ")
+    assert "settings" in error
+    with pytest.raises(SystemExit) as refused:
+        main(["demo", "--n-timesteps", "0"])
+    assert refused.value.code == 2
+
+
+def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_tdpg.experiments.runs.MAX_CHECKPOINT_EPOCHS", 2)
+    complete_run(tiny_run(), tmp_path / "whole", LAVA, n_eval_episodes=4)
+
+    def interrupt(callback):
+        if callback.model.epoch == 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TDPGProgressBar, "_on_rollout_end", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        complete_run(tiny_run(), tmp_path / "halved", LAVA, n_eval_episodes=4, progress_bar=True)
+    assert (tmp_path / "halved" / "attempt0" / "checkpoint.zip").exists()
+    assert not (tmp_path / "halved" / "episodes.csv").exists()
+    complete_run(tiny_run(), tmp_path / "halved", LAVA, n_eval_episodes=4)
+
+    whole, halved = policy_of(tmp_path / "whole"), policy_of(tmp_path / "halved")
+    assert all(bool((whole[name] == halved[name]).all()) for name in whole)
+    for name in ("episodes.csv",):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "halved" / name).read_bytes()
+    logs = [
+        read_progress(tmp_path / name).drop(columns=["time/fps", "time/time_elapsed"]) for name in ("whole", "halved")
+    ]
+    assert logs[0]["time/total_timesteps"].tolist() == logs[1]["time/total_timesteps"].tolist()
+    pd.testing.assert_series_equal(logs[0]["rollout/ep_cost_mean"], logs[1]["rollout/ep_cost_mean"])
+
+
+def test_a_run_keeps_the_selected_policy_and_says_whether_an_epoch_met_the_limits(tmp_path):
+    complete_run(tiny_run(), tmp_path / "none", LAVA[:1], n_eval_episodes=4)
+    assert not pd.read_csv(tmp_path / "none" / "episodes.csv")["selected"].any()
+    loose = [{"sb3_tdpg.callbacks.SelectionCallback": {"cost_limit": 1e6}}]
+    complete_run(tiny_run(callback=loose), tmp_path / "some", LAVA[:1], n_eval_episodes=4)
+    assert pd.read_csv(tmp_path / "some" / "episodes.csv")["selected"].all()
+    assert {"epoch", "cost", "information"} == set(json.loads((tmp_path / "some" / "selected.json").read_text()))
+
+
+def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
+    complete_run(tiny_run(), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
+    with pytest.raises(ValueError, match=r"scenarios\[1\]: not there, \{.* here"):
+        complete_run(tiny_run(), tmp_path / "first", LAVA[:2], n_eval_episodes=4)
+    second = replace(tiny_run(), start=tmp_path / "first")
+    complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
+    complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
+    shutil.rmtree(tmp_path / "first")
+    complete_run(tiny_run(seed=5), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
+    with pytest.raises(ValueError, match=r"settings, start_policy: \"\w+\" there, \"\w+\" here: choose"):
+        complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
+
+
+def test_attempts_go_on_until_one_meets_the_limits(tmp_path):
+    run = replace(tiny_run(), max_attempts=3)
+    complete_run(run, tmp_path / "none", LAVA[:1], n_eval_episodes=4)
+    records = pd.read_csv(tmp_path / "none" / "episodes.csv")
+    assert set(records["attempts"]) == {3}
+    assert not records["selected"].any()
+    costs = [read_progress(tmp_path / "none" / name)["rollout/ep_cost_mean"] for name in ("attempt0", "attempt1", ".")]
+    assert not costs[0].equals(costs[1])
+    assert not costs[1].equals(costs[2])
+
+    # A limit between the attempts' best epochs: those before the one that meets it were in vain.
+    best = [cost.min() for cost in costs]
+    first = int(np.argmin(best[:2]))
+    limits = [{"sb3_tdpg.callbacks.SelectionCallback": {"cost_limit": float(np.mean(best[:2])), "mi_limit": 1e6}}]
+    complete_run(
+        replace(run, overrides={**run.overrides, "callback": limits}), tmp_path / "some", LAVA[:1], n_eval_episodes=4
+    )
+    records = pd.read_csv(tmp_path / "some" / "episodes.csv")
+    assert set(records["attempts"]) == {first + 1}
+    assert records["selected"].all()
+    assert json.loads((tmp_path / "some" / "selected.json").read_text())["cost"] == pytest.approx(best[first])
+
+
+def test_a_run_killed_between_training_and_evaluation_does_not_train_again(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("sb3_tdpg.experiments.runs.evaluate_scenarios", Mock(side_effect=KeyboardInterrupt))
+        complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    monkeypatch.setattr(TDPG, "learn", lambda *args, **kwargs: pytest.fail("it trains again"))
+    complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    assert (tmp_path / "model.zip").exists()
+    assert not (tmp_path / "attempt0").exists()
+
+
+def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    # In this process: the workers would not see the small epochs of this module.
+    monkeypatch.setattr(
+        "sb3_tdpg.paper.lava.complete_runs",
+        lambda tasks, *, n_eval_episodes, jobs: [
+            complete_run(*task, n_eval_episodes=n_eval_episodes) for task in tasks
+        ],
+    )
+    monkeypatch.setattr("sb3_tdpg.paper.lava.aggregate_seeds", partial(aggregate_seeds, n_bootstrap=10))
+    tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
+    summary = reproduce_lava(
+        tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200, publish=published
+    )
+
+    assert (tmp_path / "summary.md").read_text() == summary
+    assert {path.name for path in published.iterdir()} == {path.name for path in tmp_path.iterdir()} - {"runs"}
+    for title in ("The table's reading", "The text's reading", "The paper's own settings"):
+        assert f"## {title}" in summary
+    assert "MISSED" in summary, "two epochs reach no goal, and the summary must say so"
+    for reading in READINGS:
+        records = pd.read_csv(tmp_path / f"episodes_{reading}.csv.gz")
+        assert len(records) == len(METHODS) * 2 * len(LAVA) * 4
+        assert (tmp_path / f"trajectories_{reading}.png").exists()
+    seeds = pd.read_csv(tmp_path / "seeds.csv")
+    assert len(seeds) == 2 * len(METHODS) * 2 + len(paper_runs(1))
+    recomputed = (
+        pd.read_csv(tmp_path / "episodes_text.csv.gz")
+        .query("model == 'PG' and train_seed == 301 and scenario == 'Training'")["cost"]
+        .mean()
+    )
+    found = seeds.query("group == 'text' and model == 'PG' and train_seed == 301")["mean"].item()
+    assert found == pytest.approx(recomputed, abs=1e-4)
+
+
+def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
+    command = [sys.executable, "-m", "sb3_tdpg", "reproduce", "lava", "--out", str(tmp_path), "--jobs", "2"]
+
+    def hear_ctrl_c():
+        # A job in the background ignores it, and hands that on.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    with subprocess.Popen(
+        command, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True, preexec_fn=hear_ctrl_c
+    ) as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)  # a training takes longer
+    assert process.returncode == 130
+    assert "the same command goes on" in error
+    assert "Traceback" not in error
+    assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
+
+
+@pytest.mark.parametrize("storage", [[], ["--storage", "study.log"]], ids=["pool", "storage"])
+def test_the_workers_of_a_command_that_is_killed_end_with_it(storage, tmp_path):
+    if storage:
+        pytest.importorskip("optuna")
+    command = [sys.executable, "-m", "sb3_tdpg", "sweep", "--env", "Lava-v0", "--betas", "inf", "--seeds", "2"]
+    command += ["--jobs", "2", "--cost-limit", "40", "--out", str(tmp_path), *storage]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("runs/*/attempt0/*")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.kill()
+        process.communicate(timeout=20)  # until nobody is left who could write there; a training takes longer
+    assert not list(tmp_path.glob("runs/*/episodes.csv"))
+
+
+def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
+    overrides = {"n_timesteps": 200, "n_episodes": 20}
+    first = Run("PG", "Lava-v0", "Lava-v0-pg", 0, overrides)
+    # A rate of zero: what comes out is what it started from.
+    second = Run("more", "Lava-v0", "Lava-v0-pg", 0, {**overrides, "learning_rate": 0.0}, start=tmp_path / "first")
+    tasks = [(second, tmp_path / "second", LAVA[:1]), (first, tmp_path / "first", LAVA[:1])]
+    complete_runs(tasks, n_eval_episodes=4, jobs=2)
+    models = [TDPG.load(tmp_path / name / "model.zip", device="cpu") for name in ("first", "second")]
+    assert_same_parameters(*(parameters(model.policy) for model in models))
+
+
+def test_the_progress_bar_moves_before_a_run_is_finished(tmp_path, capsys):
+    run = Run("PG", "Lava-v0", "Lava-v0-pg", 0, dict(n_timesteps=1050, n_episodes=20))
+    complete_runs([(replace(run, seed=seed), tmp_path / str(seed), LAVA[:1]) for seed in range(2)], jobs=1)
+    bars = re.findall(r"\| ([\d.]+)/2 \[[^\]]*, ([\d,]+) epochs", capsys.readouterr().err)
+    assert ("1.8", bars[-1][1]) in bars, "both are trained as one batch, and are to be evaluated"
+    assert bars[-1][0] == "2.0"
+    assert float(bars[-1][1]) == 2 * 11
+    runs = [float(done) for done, _ in bars]
+    assert runs == sorted(runs)
+
+
+def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_path):
+    run = replace(tiny_run(), start=tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="nowhere, and there is none: train it first"):
+        complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=4)
+    assert not list(tmp_path.iterdir())
+
+
+def test_runs_that_wait_for_each_other_are_refused(tmp_path):
+    run = replace(tiny_run(), start=tmp_path / "run")
+    with pytest.raises(ValueError, match="wait for each other"):
+        complete_runs([(run, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
+
+
+@pytest.mark.slow
+def test_the_reproduction_runs_in_worker_processes(tmp_path):
+    arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]
+    assert main([*arguments, "--n-timesteps", "2500", "--n-eval-episodes", "4"]) == 0
+    assert len(list(tmp_path.glob("runs/*/*/episodes.csv"))) == 2 * len(METHODS) + len(paper_runs(1))
+
+
+def test_every_method_of_the_reproduction_has_goals_on_both_readings():
+    assert set(GOALS) == set(READINGS)
+    assert all(set(goals) == set(METHODS) for goals in GOALS.values())

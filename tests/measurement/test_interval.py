@@ -1,0 +1,197 @@
+"""The interval holds the information, and is made from batches that are fit for it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from information_problems import channel, gaussian_batch, gaussian_channels, generator, half_dead, random_batch
+
+from sb3_tdpg.information import LeaveOneOut, own_sample_bound
+from sb3_tdpg.measurement import information_interval
+from sb3_tdpg.measurement.interval import (
+    LOWER_BOUNDS,
+    UPPER_BOUNDS,
+    joint_quantile,
+    limit,
+    min_episodes,
+    miss_of_each_limit,
+    normal_quantile,
+)
+from sb3_tdpg.measurement.interval_bounds import Estimate
+
+
+def test_the_interval_holds_the_information_of_gaussian_channels_and_is_narrow():
+    # tests/benchmarks/interval_coverage.py is the long version of this.
+    missed, n_draws = 0, 20
+    for dim, nats in ((2, 0.1), (2, 2.0), (8, 0.5), (16, 2.0)):
+        interval = information_interval(gaussian_channels(nats, dim, 200, n_draws, np.random.default_rng(dim)))
+        missed += ((interval.lower > nats) | (interval.upper < nats)).sum()
+        assert interval.width.mean() < 0.4
+    # Of 80 intervals that miss with probability 5 %, 12 or more do so once in a thousand times.
+    assert missed < 12
+
+
+def test_the_limits_spend_three_fifths_and_one_fifth_of_the_probability_to_miss():
+    # With all of it, some rows of tests/benchmarks/interval_coverage.py fall below 95 %: by chance, and by skewness.
+    batch = gaussian_batch(100, [[0.3, 0.3], [1.0, 1.0], [4.0, 4.0]], generator=generator())
+    interval = information_interval(batch, confidence=0.9)
+    for t in range(3):
+        (below, below_error), (above, above_error) = (
+            np.array([(interval.estimates[name][t], interval.errors[name][t]) for name in names]).T
+            for names in (LOWER_BOUNDS, UPPER_BOUNDS)
+        )
+        best, nearest = below.argmax(), above.argmin()
+        gap = (above[nearest] - below[best]) / max(below_error[best], above_error[nearest])
+        miss = miss_of_each_limit(0.06, gap)
+        assert 0.03 <= miss <= 0.06
+        # Between the limit of a bound alone and that of bounds that are independent of each other.
+        alone, independent = normal_quantile(miss), normal_quantile(miss / 2)
+        assert (below - independent * below_error).max() <= interval.lower[t] or interval.lower[t] == 0
+        assert interval.lower[t] <= max((below - alone * below_error).max(), 0)
+        miss = miss_of_each_limit(0.02, gap)
+        assert 0.01 <= miss <= 0.02
+        alone, independent = normal_quantile(miss), normal_quantile(miss / 3)
+        assert (above + alone * above_error).min() <= interval.upper[t] <= (above + independent * above_error).min()
+
+
+def test_the_probability_to_miss_is_shared_by_the_gap():
+    assert miss_of_each_limit(0.05, 0) == pytest.approx(0.025)
+    assert miss_of_each_limit(0.05, math.inf) == pytest.approx(0.05)
+    for no_gap in (-1.0, math.nan):
+        assert miss_of_each_limit(0.05, no_gap) == miss_of_each_limit(0.05, 0)
+    # The estimates of two bounds that are one standard error apart: the worst truths are the bounds themselves.
+    c = normal_quantile(miss_of_each_limit(0.05, 1.0))
+    lower, upper = np.random.default_rng(0).standard_normal((2, 400_000)) + np.array([[0.0], [1.0]])
+    for truth, most in ((0.0, 0.05), (0.5, 0.045), (1.0, 0.05)):
+        missed = (lower - c > truth).mean() + (upper + c < truth).mean()
+        assert missed < most + 0.001
+        assert truth == 0.5 or missed > most - 0.001
+
+
+def test_several_limits_hold_together_but_for_the_probability_to_miss():
+    assert joint_quantile(0.02, []) == pytest.approx(normal_quantile(0.02))
+    assert joint_quantile(0.02, [1.0, 1.0]) == pytest.approx(normal_quantile(0.02))
+    assert normal_quantile(0.0068) < joint_quantile(0.02, [0.0, 0.0]) < normal_quantile(0.02 / 3)
+    assert joint_quantile(0.02, [-1.0, -1.0]) == pytest.approx(normal_quantile(0.02 / 3), abs=1e-3)
+    noise = np.random.default_rng(0).standard_normal((400_000, 3))
+    for of_first, apart in ((0.9, 0.7), (0.98, 0.95), (0.5, 0.0)):
+        covariance = np.array([[1, of_first, of_first], [of_first, 1, apart], [of_first, apart, 1]])
+        exceeds = noise @ np.linalg.cholesky(covariance).T > joint_quantile(0.02, [of_first, of_first])
+        assert 0.016 < exceeds.any(axis=1).mean() < 0.0206
+
+
+def test_the_limit_is_the_tightest_and_allows_for_the_others():
+    parts = np.random.default_rng(0).standard_normal((3, 1000))
+    near, noisy, far = Estimate(1.0, parts[0]), Estimate(1.01, 10 * parts[1]), Estimate(3.0, parts[2])
+    for sign, bounds in ((1, (near, noisy, far)), (-1, [e._replace(value=-e.value) for e in (near, noisy, far)])):
+        name, value = limit(dict(zip("abc", bounds, strict=True)), 0.02, sign)
+        assert name == "a"
+        expected = near.value + joint_quantile(0.02, [near.correlation(noisy), near.correlation(far)]) * near.error
+        assert sign * value == pytest.approx(expected)
+    assert limit({}, 0.02, 1) == ("", math.inf)
+    assert limit(dict(a=near), 0.02, 1)[1] == pytest.approx(1 + normal_quantile(0.02) * near.error)
+
+
+def test_above_the_logarithm_of_n_the_lower_limit_stays_below_the_truth():
+    for nats in (8.0, 20.0):
+        interval = information_interval(gaussian_channels(nats, 2, 100, 10, np.random.default_rng(0)))
+        assert (interval.lower < nats).all()
+        assert (interval.lower < math.log(100**2 / 10)).all()
+        assert (interval.upper > nats).mean() >= 0.8
+
+
+def test_with_four_modes_the_interval_is_narrow_where_the_log_det_bound_is_loose():
+    rng = np.random.default_rng(0)
+    states = 10.0 * (2 * rng.integers(0, 2, (20, 300, 2)) - 1)
+    interval = information_interval(channel(states, states, 1.0, rng))
+    assert ((interval.lower <= math.log(4)) & (math.log(4) <= interval.upper)).sum() >= 17
+    assert interval.width.max() < 0.2
+    assert set(interval.upper_name) <= {"loo", "marginal"}
+    assert (interval.estimates["logdet"] > 3).all()
+
+
+def test_a_state_on_a_circle_and_a_noise_that_depends_on_the_state_are_held():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-math.pi, math.pi, (10, 300, 1))
+    means = 3 * np.concatenate([np.sin(angle), np.cos(angle)], axis=2)
+    stds = 0.3 + 0.2 * np.abs(angle) * np.ones(2)
+    # The truth where the encoder sees the state, from many samples.
+    many = 3000
+    angles = rng.uniform(-math.pi, math.pi, (1, many, 1))
+    of_many = channel(
+        angles,
+        3 * np.concatenate([np.sin(angles), np.cos(angles)], axis=2),
+        0.3 + 0.2 * np.abs(angles) * np.ones(2),
+        rng,
+    )
+    truth = LeaveOneOut(1, 1, 2)(of_many).item()
+    assert own_sample_bound(of_many).item() == pytest.approx(truth, abs=0.02)
+    interval = information_interval(channel(angle, means, stds, rng))
+    assert ((interval.lower <= truth) & (truth <= interval.upper)).sum() >= 9
+    assert interval.width.mean() < 0.8
+
+
+def test_the_lower_limit_is_on_the_information_about_the_state_and_not_about_the_encoders_input():
+    # I[x; x~] < I[y; x~]: what is true of the latter only would be above the former here.
+    rng = np.random.default_rng(0)
+    states = rng.standard_normal((20, 400, 1))
+    batch = channel(states, 4 * (states + rng.standard_normal(states.shape)), 1.0, rng)
+    about_state, about_observation = (0.5 * math.log(r) for r in (33 / 17, 33.0))
+    interval = information_interval(batch)
+    assert (interval.lower <= about_state).sum() >= 18
+    assert (interval.lower > 0.4 * about_state).all()
+    assert (interval.upper >= about_observation).sum() >= 18
+
+
+def test_the_same_seed_gives_the_same_interval_and_the_global_generators_are_left_alone():
+    batch = gaussian_batch(100, [[1.0, 1.0]], generator=generator())
+    before = th.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    first, second, other = (information_interval(batch, seed=seed) for seed in (1, 1, 2))
+    assert first.lower == second.lower
+    assert first.lower != other.lower
+    assert th.equal(before[0], th.get_rng_state())
+    assert (before[1] == np.random.get_state()[1]).all()  # noqa: NPY002
+
+
+def test_only_living_episodes_count_and_a_step_with_too_few_has_no_interval():
+    batch = random_batch(alive=half_dead())
+    interval = information_interval(batch)
+    assert interval.n_episodes.tolist() == batch.alive.sum(1).tolist()
+    has_any = interval.n_episodes >= min_episodes(2)
+    assert has_any.any()
+    assert not has_any.all()
+    np.testing.assert_array_equal(np.isfinite(interval.upper), has_any)
+    np.testing.assert_array_equal(np.isfinite(interval.lower), has_any)
+    dead = batch._replace(trvs=th.where(batch.alive[..., None], batch.trvs, math.nan))
+    np.testing.assert_array_equal(information_interval(dead).upper, interval.upper)
+    assert interval.total[1] == pytest.approx(interval.upper[has_any].sum())
+    assert interval.n_left_out == (~has_any).sum() == 1
+    # Nothing is left out of a sum after the last episode has ended.
+    ended = information_interval(batch._replace(alive=batch.alive & (th.arange(4) < 3)[:, None]))
+    assert (ended.n_left_out, ended.n_episodes[3]) == (0, 0)
+
+
+def test_a_higher_confidence_is_a_wider_interval():
+    batch = gaussian_batch(100, [[1.0, 1.0]], generator=generator())
+    wide, narrow = (information_interval(batch, confidence=c) for c in (0.99, 0.8))
+    assert wide.lower < narrow.lower
+    assert narrow.upper < wide.upper
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (dict(states=th.zeros(4, 60)), "shapes"),
+    (dict(trvs=th.zeros(4, 60, 3)), "shapes"),
+    (dict(states=th.zeros(4, 59, 2)), "shapes"),
+    (dict(means=th.full((4, 60, 2), math.nan)), "means are not all finite"),
+    (dict(stds=th.zeros(4, 60, 2)), "stds must be positive"),
+], ids=str)  # fmt: skip
+def test_a_batch_that_is_not_fit_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        information_interval(random_batch()._replace(**change))
+
+
+@pytest.mark.parametrize("confidence", [0.0, 1.0, 95, math.nan])
+def test_a_confidence_out_of_its_range_is_refused(confidence):
+    with pytest.raises(ValueError, match="confidence="):
+        information_interval(random_batch(), confidence=confidence)

@@ -1,0 +1,155 @@
+"""Baselines lower the variance and leave the gradient as it is."""
+
+import pytest
+import torch as th
+
+from sb3_tdpg.advantages import BASELINES, episode_mean_advantages, get_baseline, value_advantages
+from sb3_tdpg.losses import cost_to_go
+
+T, N = 3, 400
+
+
+@pytest.fixture
+def rollouts():
+    states = th.randn(T, N, 2)
+    costs = 10 * states[..., 0] ** 2 + 5 * (states[..., 1] > 0) + th.randn(T, N)
+    return costs, states, th.ones(T, N)
+
+
+def test_the_papers_baseline_is_the_whole_episodes_cost_less_the_mean_at_every_step():
+    costs = th.tensor([[1.0, 2.0], [3.0, 8.0]])
+    advantages = episode_mean_advantages(costs, th.zeros(2, 2, 1), th.ones(2, 2), 1.0)
+    assert advantages.tolist() == [[-3, 3], [-3, 3]]
+
+
+def test_the_value_baseline_uses_the_cost_to_come_only(rollouts):
+    costs, states, alive = rollouts
+    expensive_start = costs.clone()
+    expensive_start[0] += 1000 * th.rand(N)
+    first = value_advantages(costs, states, alive, 1.0)
+    second = value_advantages(expensive_start, states, alive, 1.0)
+    th.testing.assert_close(first[1:], second[1:])
+    assert not th.allclose(first[0], second[0])
+
+
+def test_the_value_baseline_explains_what_the_state_tells_of_the_cost(rollouts):
+    costs, states, alive = rollouts
+    last = value_advantages(costs, states, alive, 1.0)[-1]
+    assert last.var() < 0.35 * costs[-1].var()
+    assert abs(last.mean()) < 0.3
+
+
+def test_the_value_baseline_lowers_the_variance_below_the_mean_baselines(rollouts):
+    value, mean = (BASELINES[name](*rollouts, 1.0) for name in ("value", "mean"))
+    assert value.var() < 0.8 * mean.var()
+
+
+def test_an_episodes_own_cost_never_enters_its_own_baseline(rollouts):
+    costs, states, alive = rollouts
+    targets = cost_to_go(costs)
+    baseline = targets - value_advantages(costs, states, alive, 1.0)
+    changed = costs.clone()
+    changed[:, 6] += 1e4
+    new_baseline = cost_to_go(changed) - value_advantages(changed, states, alive, 1.0)
+    th.testing.assert_close(new_baseline[:, 6], baseline[:, 6], rtol=0, atol=0.02)
+    assert (new_baseline[:, 7] - baseline[:, 7]).abs().max() > 1  # but it does enter those of the other half
+
+
+@pytest.fixture
+def long_rollouts():
+    """Six episodes of a state that wanders, half of which end early; a cost that the state tells exactly."""
+    states = 0.95 ** th.arange(200.0)[:, None, None] * th.randn(6, 1) + 0.3 * th.randn(200, 6, 1)
+    alive = th.ones(200, 6)
+    alive[120:, ::2] = 0.0
+    return alive * states[..., 0] ** 2, states, alive
+
+
+def test_a_long_horizon_with_few_episodes_has_enough_for_one_regression_that_all_steps_share(long_rollouts):
+    costs, states, alive = long_rollouts
+    living = alive > 0
+    advantages = value_advantages(costs, states, alive, 0.5, 0.0)[living]
+    targets = cost_to_go(costs, 0.5)[living]
+    assert advantages.var() < 0.3 * targets.var()
+    # Step by step three episodes would have to tell what the other three cost.
+    per_step = [value_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(0, 198)]
+    assert advantages.var() < 0.5 * th.stack(per_step)[living[:198]].var()
+
+
+def test_the_end_of_a_long_horizon_is_told_from_its_middle():
+    costs, alive = th.ones(200, 6), th.ones(200, 6)
+    advantages = value_advantages(costs, th.randn(200, 6, 1), alive, 0.9)
+    assert advantages.abs().max() < 1.0  # the cost to come falls from 10 to 1 over the last steps
+
+
+def test_also_over_a_long_horizon_an_episodes_own_cost_never_enters_its_own_baseline(long_rollouts):
+    costs, states, alive = long_rollouts
+    baseline = cost_to_go(costs) - value_advantages(costs, states, alive)
+    changed = costs.clone()
+    changed[:100, 2] += 50
+    new_baseline = cost_to_go(changed) - value_advantages(changed, states, alive)
+    th.testing.assert_close(new_baseline[:, 2], baseline[:, 2], rtol=0, atol=0.02)
+    assert (new_baseline[:, 3] - baseline[:, 3]).abs().max() > 1
+
+
+def test_a_smaller_lambda_keeps_the_noise_of_later_costs_out(rollouts):
+    costs, states, alive = rollouts
+    noisy_end = costs.clone()
+    noisy_end[-1] += 100 * th.randn(N)
+    all_of_it, little = (value_advantages(noisy_end, states, alive, gae_lambda=x)[0].std() for x in (1.0, 0.0))
+    assert all_of_it > 90
+    assert little < 60
+
+
+def test_with_lambda_zero_the_advantage_is_the_residual_of_one_step():
+    # The state foretells the last cost exactly: the first step must not be blamed for it.
+    states = th.randn(2, N, 1)
+    states[1] = states[0]
+    costs = th.stack([th.zeros(N), 50 * states[1, :, 0]])
+    advantages = value_advantages(costs, states, th.ones(2, N), gae_lambda=0.0)
+    assert advantages.abs().median() < 1
+    assert costs[1].abs().median() > 10
+
+
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_the_discount_weights_later_costs(name, rollouts):
+    costs, states, alive = rollouts
+    late = costs.clone()
+    late[-1] += 100 * th.rand(N)
+    differences = [
+        (BASELINES[name](late, states, alive, gamma) - BASELINES[name](costs, states, alive, gamma))[0].abs().max()
+        for gamma in (1.0, 0.1)
+    ]
+    assert differences[1] < 0.1 * differences[0]
+
+
+def test_dead_episodes_do_not_enter_the_regression(rollouts):
+    costs, states, alive = rollouts
+    alive[1:, ::3] = 0.0
+    costs = costs * alive
+    garbage = th.where(alive[..., None] > 0, states, 50 * th.randn_like(states))
+    zeros = th.where(alive[..., None] > 0, states, th.zeros_like(states))
+    living = alive > 0
+    first, second = (value_advantages(costs, x, alive, 1.0)[living] for x in (garbage, zeros))
+    assert th.isfinite(first).all()
+    # Only the places of the bumps may depend on dead states: the quality of the fit must not.
+    assert first.var().item() == pytest.approx(second.var().item(), rel=0.1)
+
+
+@pytest.mark.parametrize("n_episodes", [2, 3])
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_a_batch_of_few_episodes_with_a_constant_state_gives_finite_advantages(name, n_episodes):
+    costs = th.rand(T, n_episodes)
+    advantages = get_baseline(name)(costs, th.zeros(T, n_episodes, 2), th.ones(T, n_episodes), 1.0)
+    assert advantages.shape == (T, n_episodes)
+    assert th.isfinite(advantages).all()
+
+
+def test_a_step_at_which_nobody_lives_gives_finite_advantages(rollouts):
+    costs, states, alive = rollouts
+    alive[2] = 0.0
+    assert th.isfinite(value_advantages(costs * alive, states * alive[..., None], alive, 1.0)).all()
+
+
+def test_an_unknown_baseline_is_refused_with_the_list():
+    with pytest.raises(ValueError, match=r"baseline='median' is unknown: use one of \['mean', 'value'\]"):
+        get_baseline("median")
