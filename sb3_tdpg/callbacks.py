@@ -98,8 +98,8 @@ class SelectionCallback(TDPGCallback):
         super().__init__(verbose)
         if cost_limit is None and mi_limit is None:
             raise ValueError(
-                "give cost_limit (selects the lowest information below that cost), mi_limit (the lowest cost below that "
-                "information), or both"
+                "give cost_limit (selects the lowest information below that cost), mi_limit (the lowest cost below "
+                "that information), or both"
             )
         for name, limit in (("cost_limit", cost_limit), ("mi_limit", mi_limit)):
             if limit is not None and np.isnan(limit):

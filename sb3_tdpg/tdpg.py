@@ -19,6 +19,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_tdpg import losses
 from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
@@ -26,13 +27,6 @@ from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
-from sb3_tdpg.losses import (
-    clipped_policy_loss,
-    information_loss,
-    normalized,
-    policy_distance,
-    policy_gradient_loss,
-)
 from sb3_tdpg.policies import RebuiltTRVs, TRVPolicy
 from sb3_tdpg.problem import reward_threshold
 from sb3_tdpg.settings import check_action_space, check_arguments, check_beta, check_count, defaults_for, fill_in
@@ -310,7 +304,7 @@ class TDPG(EpisodicAlgorithm):
         cost_scale = th.ones(())  # what the advantages, and with them the penalty, are divided by
         if self.normalize_advantage:
             negligible = 1e-5 * batch.costs.abs().max()
-            advantages, cost_scale = normalized(advantages, batch.alive, negligible)
+            advantages, cost_scale = losses.normalized(advantages, batch.alive, negligible)
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
@@ -323,18 +317,20 @@ class TDPG(EpisodicAlgorithm):
                 part = batch.select(episodes)
                 log_prob, rebuilt = self._evaluate(part, rebuild=mi_coef > 0.0)
                 if old_log_prob is None:
-                    policy_loss = policy_gradient_loss(log_prob, advantages[:, episodes], part.alive)
+                    policy_loss = losses.policy_gradient_loss(log_prob, advantages[:, episodes], part.alive)
                 else:
                     old = old_log_prob[:, episodes]
-                    policy_loss = clipped_policy_loss(log_prob, old, advantages[:, episodes], part.alive, clip_range)
-                    kl, clip_fraction = policy_distance(log_prob.detach(), old, part.alive, clip_range)
+                    policy_loss = losses.clipped_policy_loss(
+                        log_prob, old, advantages[:, episodes], part.alive, clip_range
+                    )
+                    kl, clip_fraction = losses.policy_distance(log_prob.detach(), old, part.alive, clip_range)
                     self.logger.record_mean("train/approx_kl", kl.item())
                     self.logger.record_mean("train/clip_fraction", clip_fraction.item())
                 loss = policy_loss
                 if rebuilt is not None and mi_coef > 0.0:
                     # Equation 15: the critics are frozen, and the gradient flows through the rebuilt TRVs.
                     estimate = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
-                    mi_loss = mi_coef * information_loss(estimate)
+                    mi_loss = mi_coef * losses.information_loss(estimate)
                     loss = loss + mi_loss / cost_scale
                     self.logger.record_mean("train/mi_loss", mi_loss.item())
                 self._check_finite("policy loss", policy_loss)

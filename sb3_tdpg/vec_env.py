@@ -30,8 +30,8 @@ class BatchedVecEnv(VecEnv):
     """
     An SB3 ``VecEnv`` that steps N episodes of one environment in a single NumPy call.
 
-    It calls the methods of the environment that ``gymnasium.make`` gives with a leading dimension of N instead of 1: the
-    dynamics cannot differ. All episodes run in lockstep. As in every SB3 ``VecEnv``, a finished episode is
+    It calls the methods of the environment from ``gymnasium.make`` with a leading dimension of N instead of 1, so that
+    the dynamics cannot differ. All episodes run in lockstep. As in every SB3 ``VecEnv``, a finished episode is
     reset at once; like ``Monitor``, it reports ``info["episode"]``.
 
     :param env: The environment, without wrappers.
@@ -181,8 +181,8 @@ def make_episodes_env(
     Vectorise a registered id in the fastest way available.
 
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, else its largest divisor
-        up to 50.
+    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, else its largest
+        divisor up to 50.
     :param n_episodes: Episodes per epoch; default: TDPG's default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.

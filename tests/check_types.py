@@ -1,8 +1,8 @@
 """
 Check the types of the package: ``make type``.
 
-``envs/`` and ``hyperparams/`` lie beside ``sb3_tdpg/`` but belong to it. mypy's command line derives a module's name from
-its folder alone, so that this script names their modules itself.
+``envs/`` and ``hyperparams/`` lie beside ``sb3_tdpg/`` but belong to it. mypy's command line derives a module's name
+from its folder alone, so this script names their modules itself.
 """
 
 import sys
