@@ -53,7 +53,7 @@ ARGUMENTS = {
     "bptt_steps none": (dict(bptt_steps=0), "bptt_steps=0", "integer of at least 1"),
     "no threads": (dict(n_threads=0), "n_threads=0", "integer of at least 1"),
     "bptt_steps of a time-varying policy": (dict(bptt_steps=2), "bptt_steps=2", "horizon of 5", "time_varying=False"),
-    "batch_size in steps": (dict(batch_size=2000), "batch_size=2000", "number of episodes"),
+    "batch_size in steps": (dict(batch_size=2000), "batch_size=2000", "counts episodes"),
     "clip_range zero": (dict(clip_range=0.0), "clip_range=0.0", "positive", "inf"),
     "clip_range NaN": (dict(clip_range=math.nan), "clip_range=nan", "positive"),
     "clip_range a schedule that ends below zero": (dict(clip_range=lambda progress: progress - 0.5), "clip_range=-0.5"),
@@ -92,11 +92,11 @@ ARGUMENTS = {
     "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),
     "max_grad_norm negative": (dict(max_grad_norm=-1.0), "max_grad_norm=-1.0", "positive, or None"),
     "max_grad_norm NaN": (dict(max_grad_norm=math.nan), "max_grad_norm=nan", "positive, or None"),
-    "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "not negative|positive"),
+    "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "non-negative"),
     "learning_rate NaN": (dict(learning_rate=math.nan), "learning_rate=nan", "not negative|positive|finite"),
     "learning_rate a string": (dict(learning_rate="1e-3"), "learning_rate='1e-3'", "number"),
     "learning_rate a schedule that goes below zero": (
-        dict(learning_rate=lambda progress: progress - 0.5), "learning_rate=-0.5", "not negative|positive"
+        dict(learning_rate=lambda progress: progress - 0.5), "learning_rate=-0.5", "non-negative"
     ),
     "unknown environment": (dict(env="Larva-v0"), "Larva"),
     "environment without a horizon": (
