@@ -114,7 +114,7 @@ PERTURBATIONS: dict[str, Perturbation] = {
         ),
         Perturbation(
             "noise_minmax", "image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25),
-            images.noise_minmax, summary="noise on every pixel, then each image rescaled to the bounds (as in the paper)",
+            images.noise_minmax, summary="noise on every pixel, then each image rescaled to the bounds (the paper's)",
         ),
         Perturbation(
             "brightness", "image", "offset, share of the range", (0.05, 0.10, 0.20, 0.30, 0.40), images.brightness,
@@ -174,7 +174,7 @@ PERTURBATIONS: dict[str, Perturbation] = {
         ),
         Perturbation(
             "vector_dropout", "vector", "share of the readings", (0.1, 0.2, 0.35, 0.5, 0.7), vectors.dropout,
-            vectors.draw_phase, summary="random components set to 0, drawn anew at every step",
+            vectors.draw_phase, summary="some components set to 0, different ones at every step",
         ),
         Perturbation(
             "vector_delay", "vector", "steps", (1, 2, 3, 4, 5), history.delay, history.draw_delay,
