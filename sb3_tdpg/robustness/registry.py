@@ -110,55 +110,55 @@ PERTURBATIONS: dict[str, Perturbation] = {
     for row in (
         Perturbation(
             "noise", "image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25), images.noise,
-            summary="noise on every pixel, cut off at the bounds",
+            summary="noise on every pixel, clipped to the bounds",
         ),
         Perturbation(
             "noise_minmax", "image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25),
-            images.noise_minmax, summary="noise on every pixel, then each image stretched to the bounds (the paper's)",
+            images.noise_minmax, summary="noise on every pixel, then each image rescaled to the bounds (the paper's)",
         ),
         Perturbation(
             "brightness", "image", "offset, share of the range", (0.05, 0.10, 0.20, 0.30, 0.40), images.brightness,
-            images.draw_sign, summary="brighter or darker, for an episode; on depth: an offset",
+            images.draw_sign, summary="brighter or darker, constant in an episode; an offset on depth images",
         ),
         Perturbation(
             "contrast", "image", "factor", (0.8, 0.6, 0.45, 0.3, 0.15), images.contrast,
-            summary="nearer to the image's mean",
+            summary="contrast reduced towards the image's mean",
         ),
         Perturbation(
             "hue", "image", "angle, degrees", (20.0, 45.0, 80.0, 120.0, 180.0), images.hue, images.draw_turn,
-            summary="colours turned about the axis of greys, one way or the other, for an episode",
+            summary="hues rotated in either direction, constant in an episode",
             channels=(3,), on_depth=False,
         ),
         Perturbation(
             "blur", "image", "standard deviation, share of the height", (0.008, 0.016, 0.025, 0.04, 0.06), images.blur,
-            summary="blurred by a Gaussian",
+            summary="Gaussian blur",
         ),
         Perturbation(
             "occlusion", "image", "side, share of the image's", (0.2, 0.3, 0.4, 0.5, 0.6), images.occlusion,
-            images.draw_square, summary="a rectangle of one colour, somewhere, for an episode",
+            images.draw_square, summary="a rectangle of one colour at a random place, constant in an episode",
         ),
         Perturbation(
             "dropped_pixels", "image", "share of the pixels", (0.01, 0.05, 0.1, 0.2, 0.4), images.dropped_pixels,
-            summary="the lowest value in some pixels, others in every frame",
+            summary="random pixels set to the lowest value, drawn anew in every frame",
         ),
         Perturbation(
             "dropped_frames", "image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), history.dropped_frames,
-            history.draw_frames, summary="the last frame that arrived in place of a lost one",
+            history.draw_frames, summary="lost frames replaced by the last frame that arrived",
             later_only=True, raw=True,
         ),
         Perturbation(
             "delay", "image", "steps", (1, 2, 3, 4, 5), history.delay, history.draw_delay,
-            summary="frames come late; until the first one does, it is shown already", later_only=True, raw=True,
+            summary="frames arrive late; the first frame is repeated until then", later_only=True, raw=True,
         ),
         Perturbation(
             "texture_overlay", "image", "opacity", (0.1, 0.2, 0.35, 0.5, 0.7), images.texture_overlay,
-            images.draw_texture, summary="one of 16 textures over the image, for an episode",
+            images.draw_texture, summary="one of 16 textures overlaid on the image, constant in an episode",
             channels=(1, 3), on_depth=False,
         ),
         Perturbation(
             "camera_shift", "image", "distance, share of the height", (0.02, 0.04, 0.07, 0.10, 0.15),
             images.camera_shift, images.draw_shift,
-            summary="shifted in some direction, for an episode: a camera turned a little",
+            summary="image shifted in a random direction, as by a rotated camera, constant in an episode",
         ),
         Perturbation(
             "vector_noise", "vector", "standard deviation, scales", (0.05, 0.1, 0.2, 0.4, 0.8), vectors.noise,
@@ -166,19 +166,19 @@ PERTURBATIONS: dict[str, Perturbation] = {
         ),
         Perturbation(
             "vector_bias", "vector", "offset, scales", (0.05, 0.1, 0.2, 0.4, 0.8), vectors.bias, vectors.draw_signs,
-            summary="every component too high or too low, for an episode",
+            summary="an offset on every component, constant in an episode",
         ),
         Perturbation(
             "vector_scale", "vector", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), vectors.scale, vectors.draw_signs,
-            summary="every component multiplied or divided, for an episode",
+            summary="every component multiplied or divided, constant in an episode",
         ),
         Perturbation(
             "vector_dropout", "vector", "share of the readings", (0.1, 0.2, 0.35, 0.5, 0.7), vectors.dropout,
-            vectors.draw_phase, summary="some components read 0, others at every step",
+            vectors.draw_phase, summary="some components set to 0, different ones at every step",
         ),
         Perturbation(
             "vector_delay", "vector", "steps", (1, 2, 3, 4, 5), history.delay, history.draw_delay,
-            summary="observations come late; until the first one does, it is shown already", later_only=True, raw=True,
+            summary="observations arrive late; the first one is repeated until then", later_only=True, raw=True,
         ),
     )
 }  # fmt: skip
