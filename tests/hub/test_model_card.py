@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from unittest.mock import Mock
 
+import huggingface_hub
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,8 +21,6 @@ from sb3_tdpg.experiments.rerun import rerun
 from sb3_tdpg.hub import pull_from_hub, write_model_card
 from sb3_tdpg.hub.model_card import results_with_intervals
 from sb3_tdpg.hub.publication import Publication, read_run
-
-huggingface_hub = pytest.importorskip("huggingface_hub")
 
 
 def test_the_metadata_has_the_mean_of_the_records_and_the_training_environment_first(card):
@@ -84,7 +83,7 @@ def test_the_card_tells_seed_commit_versions_settings_and_which_policy_it_is(car
     read = json.loads(json.dumps(yaml.safe_load(settings)))
     assert read == config["settings"] == json.loads(json.dumps(yaml.safe_load((card / "config.yml").read_text())))
     epoch = json.loads((runs / "tdpg-seed0" / "selected.json").read_text())["epoch"]
-    assert f"The policy is that of epoch {epoch}," in text
+    assert f"The selection chose the policy of epoch {epoch}:" in text
     assert "from the policy of another run, pg-seed0" in text
 
 
@@ -188,7 +187,7 @@ def test_a_damaged_model_is_refused_and_no_card_is_written(runs, tmp_path):
 
 def test_a_card_that_could_not_be_finished_does_not_stand_in_the_way(runs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("sb3_tdpg.hub.card_text", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr("sb3_tdpg.hub.transfer.model_card", Mock(side_effect=KeyboardInterrupt))
         write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
     assert not (tmp_path / "card").exists()
     write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)

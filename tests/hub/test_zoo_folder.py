@@ -71,9 +71,7 @@ def test_a_folder_of_the_zoo_is_evaluated_and_told_of(zoo_folder, tmp_path):
     assert "gym.make('Lava-v0', action_cost=1.0)" in text
     assert "training seed: 3\n" in text
     assert re.search(r"versions: Python \d.*PyTorch \d", text)
-    # The zoo's own program leaves the last policy, whatever a selection has chosen.
-    assert "the policy is the one of the end of the training." in text
-    assert "The policy is that of" not in text
+    assert "The policy is the last one." in text
     assert (card / "training.png").exists()
 
 
@@ -90,7 +88,7 @@ def test_a_folder_of_the_zoo_without_its_last_policy_gives_the_best_one(zoo_fold
     (copy / "Lava-v0.zip").unlink()
     publication = read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1])
     assert publication.model == copy / "best_model.zip"
-    assert "did best" in publication.notes[0]
+    assert "best evaluation" in publication.notes[1]
     (copy / "best_model.zip").unlink()
     with pytest.raises(ValueError, match=r"neither Lava-v0.zip nor best_model.zip: let the training end first"):
         read_publication(copy)
@@ -103,11 +101,11 @@ def test_the_card_of_a_folder_of_ours_says_which_policy_it_is(zoo_folder, tmp_pa
     def notes():
         return " ".join(read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1]).notes)
 
-    assert "the policy is the one of the end" in notes()  # the zoo's own program leaves the last one
+    assert "The policy is the last one" in notes()  # the zoo's own program saves this one
     assert "epoch 3" not in notes()
     (copy / "run.json").write_text(json.dumps(dict(provenance=provenance())))
-    assert "The policy is that of epoch 3, which the selection chose" in notes()
-    assert "of the end" not in notes()
+    assert "The selection chose the policy of epoch 3" in notes()
+    assert "last" not in notes()
     (copy / "checkpoint.zip").touch()  # interrupted
-    assert "the policy is the one of the end" in notes()
+    assert "The policy is the last one" in notes()
     assert "epoch 3" not in notes()
