@@ -210,7 +210,7 @@ def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -
             archive.write(path, path.name)
     write_frame_atomically(publication.records, out / "episodes.csv")
     if "config.json" not in publication.files:
-        config = dict(method=publication.method, env_id=publication.env_id, seed=publication.seed)
+        config: dict[str, Any] = dict(method=publication.method, env_id=publication.env_id, seed=publication.seed)
         rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=row.env_kwargs) for row in publication.scenarios]
         config.update(settings=publication.settings, n_eval_episodes=int(training["n"]), scenarios=rows)
         write_run_config(out / "config.json", config)
