@@ -137,12 +137,7 @@ def read_run(folder: Path) -> Publication:
 
 
 def read_zoo_folder(
-    folder: Path,
-    *,
-    scenarios: Sequence[Scenario] | None = None,
-    n_eval_episodes: int = 1000,
-    seed: int = 0,
-    progress_bar: bool = False,
+    folder: Path, *, scenarios: Sequence[Scenario] | None = None, n_eval_episodes: int = 1000, seed: int = 0
 ) -> Publication:
     """
     Read a folder that rl-zoo3's ``train`` wrote (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
@@ -154,7 +149,6 @@ def read_zoo_folder(
         environment. The keywords of a scenario take precedence over those of the training environment.
     :param n_eval_episodes: Episodes of each scenario.
     :param seed: Seed of the evaluation.
-    :param progress_bar: Show a progress bar.
     :raises ValueError: if there is no policy.
     """
     inner = next(folder.glob("*/args.yml")).parent
@@ -163,21 +157,15 @@ def read_zoo_folder(
         raise ValueError(f"{folder} has neither {inner.name}.zip nor best_model.zip: let the training end first")
     # The zoo reads its files like this. They are the user's own, and the model is unpickled, too.
     args, settings = (dict(yaml.load((inner / n).read_text(), yaml.UnsafeLoader)) for n in ("args.yml", "config.yml"))
-    settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
+    env_kwargs = settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
     env_id, env = str(args["env"]), None
     if (inner / "vecnormalize.pkl").exists():
-        env = make_episodes_env(env_id, 1, env_kwargs=settings["env_kwargs"])
-        env = VecNormalize.load(str(inner / "vecnormalize.pkl"), env)
+        env = VecNormalize.load(str(inner / "vecnormalize.pkl"), make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
     model = TDPG.load(model_path, env=env, device="cpu")
     rows = PAPER_ROWS.get(env_id, [Scenario("Training", env_id)]) if scenarios is None else scenarios
+    labels = dict(train_seed=args["seed"])
     records = evaluate_scenarios(
-        {"TDPG": model},
-        rows,
-        n_eval_episodes,
-        seed=seed,
-        env_kwargs=settings["env_kwargs"],
-        labels=dict(train_seed=args["seed"]),
-        progress_bar=progress_bar,
+        {"TDPG": model}, rows, n_eval_episodes, seed=seed, env_kwargs=env_kwargs, labels=labels
     )
     progress = None
     if get_monitor_files(str(folder)):  # the mean cost of each epoch, from the log of episodes
