@@ -83,6 +83,8 @@ def write_model_card(
             enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=video)
         pictures = [path.name for path in folder.iterdir()]
         model_card(publication, results, repo_id, pictures).save(folder / "README.md")
+        if out.exists():
+            out.rmdir()
     return out
 
 

@@ -154,7 +154,7 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
         plt.switch_backend("agg")  # the plots end with plt.show(), which does nothing here
         warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
     {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
-    if given.save is not None:
+    if given.save is not None and plt.get_fignums():  # --kind all prints tables only
         given.save.parent.mkdir(parents=True, exist_ok=True)
         plt.savefig(given.save, dpi=150)
         print(f"the figure is in {given.save}")

@@ -1,4 +1,4 @@
-"""A published model, read back by all who would read it."""
+"""Load a published model with this plugin, with Stable-Baselines3's package and with rl-zoo3."""
 
 import json
 import re
@@ -106,7 +106,7 @@ def test_the_zoo_finds_all_files_that_it_asks_for(card, tmp_path, monkeypatch):
     assert yaml.safe_load((folder / "Lava-v0" / "args.yml").read_text())["env_kwargs"] == {}
 
 
-def test_results_json_is_the_zoos(card):
+def test_results_json_has_the_format_of_the_zoo(card):
     results = json.loads((card / "results.json").read_text())
     assert results.pop("eval_datetime")[:2] == "20"
     costs = costs_of(card)

@@ -69,7 +69,7 @@ def http_error(status, text):
         (errors.HTTPError("refused"), r"\(refused\): try again"),
     ],
 )
-def test_what_goes_wrong_on_the_way_is_told_in_one_line(error, message, card, api):
+def test_errors_of_the_hub_are_reported_in_one_line(error, message, card, api):
     api.error = error
     with pytest.raises(ValueError, match="someone/tdpg-Lava-v0 cannot be written " + message) as told:
         push_to_hub(card, REPO_ID)

@@ -1,4 +1,4 @@
-"""``sb3-tdpg train``, ``enjoy``, ``record-video`` and ``plot``: rl-zoo3's programs with TDPG among the algorithms."""
+"""``sb3-tdpg train``, ``enjoy``, ``record-video`` and ``plot``: the programs of rl-zoo3 with TDPG as an algorithm."""
 
 import json
 import os
@@ -32,7 +32,7 @@ CARTPOLE = ["-params", "n_episodes:4", "batch_size:4", "-n", "100", "--eval-freq
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Run in an empty folder, since the zoo writes to logs/ in the present one."""
+    """Run in an empty folder, since the zoo writes to logs/ in the working directory."""
     monkeypatch.chdir(tmp_path)
     # Its plots would open a window.
     monkeypatch.setenv("MPLBACKEND", "agg")
@@ -57,7 +57,7 @@ def test_train_leaves_a_model_and_says_how_it_was_made(here):
     assert not list(folder.rglob("*.partial"))
 
 
-def test_episodes_of_an_environment_of_ours_go_as_a_batch_for_any_algorithm(here, monkeypatch):
+def test_our_environments_run_as_a_batch_for_any_algorithm(here, monkeypatch):
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     made = []
@@ -80,7 +80,7 @@ def test_episodes_of_an_environment_of_ours_go_as_a_batch_for_any_algorithm(here
     PPO.load(folder_of(here, algo="ppo") / "Lava-v0.zip", device="cpu")
 
 
-def test_an_interrupted_training_goes_on_as_if_it_had_not_been(here):
+def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     arguments = ["train", *LAVA, "-params", "n_episodes:20", "-n", "20000", "--seed", "1"]
     process = start(arguments, here)
     wait_for(folder_of(here) / "checkpoint.zip", process)
@@ -99,7 +99,7 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(here):
     assert_same_training(here)
 
 
-def test_a_killed_training_with_normalised_observations_goes_on(here):
+def test_a_killed_training_with_normalised_observations_is_resumed_exactly(here):
     settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
     arguments = ["train", *LAVA, "-params", *settings, "-n", "20000", "--seed", "1"]
     process = start(arguments, here)
@@ -146,7 +146,7 @@ def wait_for(path, process):
         time.sleep(0.02)
 
 
-def test_the_selected_policy_is_the_one_that_is_kept(here, capsys):
+def test_the_selected_policy_is_saved(here, capsys):
     selection = "callback:[{'sb3_tdpg.callbacks.SelectionCallback':{'cost_limit':1e6}}]"
     assert main(["train", *LAVA, "-params", "n_episodes:20", selection, "-n", "2000", "--seed", "1"]) == 0
     assert "was selected" in capsys.readouterr().out
@@ -156,7 +156,7 @@ def test_the_selected_policy_is_the_one_that_is_kept(here, capsys):
     assert_same_parameters(parameters(chosen.policy), parameters(kept.policy))
 
 
-def test_enjoy_finds_what_train_has_left_and_acts_as_it_was_trained(here, capsys, monkeypatch):
+def test_enjoy_finds_the_latest_model_and_runs_its_stochastic_policy(here, capsys, monkeypatch):
     main(["train", *SHORT])
     drawn = []
     predict = TDPG.predict
@@ -168,7 +168,7 @@ def test_enjoy_finds_what_train_has_left_and_acts_as_it_was_trained(here, capsys
     assert drawn[-1] is True
 
 
-def test_plot_and_film_of_a_training(here):
+def test_plot_and_video_of_a_training(here):
     main(["train", *SHORT])
     assert main(["plot", "-e", "Lava-v0", "--save", "curve.png"]) == 0
     assert (here / "curve.png").stat().st_size > 5000
@@ -177,7 +177,7 @@ def test_plot_and_film_of_a_training(here):
     assert film.stat().st_size > 1000
 
 
-def test_the_evaluation_has_the_keywords_of_the_block(here, monkeypatch):
+def test_the_evaluation_uses_the_keywords_of_the_block(here, monkeypatch):
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     made = []
@@ -216,7 +216,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
-def test_bad_input_is_told_in_a_line_and_leaves_nothing(arguments, message, here, capfd):
+def test_bad_input_is_reported_in_one_line_and_leaves_nothing(arguments, message, here, capfd):
     (here / "text.yml").write_text("Lava-v0: {policy: TRVPolicy, n_timesteps: 100, learning_rate: 1e-3}\n")
     (here / "broken.yml").write_text("Lava-v0: {policy\n")
     assert main(["train", *arguments]) == 2
@@ -297,7 +297,7 @@ def test_a_training_is_continued_from_a_model_with_other_settings(here):
     )
 
 
-def test_a_file_or_a_package_of_ones_own_and_a_policy_by_its_path(here, monkeypatch):
+def test_blocks_from_a_python_file_or_package_and_a_policy_by_its_path(here, monkeypatch):
     block = "policy='sb3_tdpg.policies.TRVPolicy', n_timesteps=200, n_episodes=20, mi_estimator='logdet', beta=1.0"
     (here / "my_settings.py").write_text(f"hyperparams = {{'Lava-v0': dict({block})}}\n")
     monkeypatch.syspath_prepend(str(here))
@@ -316,7 +316,7 @@ def test_help_lists_our_flags_and_the_zoos(capsys):
 
 
 def test_a_training_that_a_callback_ends_early_is_finished(here):
-    """As with SB3's StopTrainingOnMaxEpisodes: this is no interrupt."""
+    """A callback that ends a training is not an interrupt."""
     stop = "callback:[{'stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes':{'max_episodes':1}}]"
     assert main(["train", *LAVA, "-params", "n_episodes:20", stop, "-n", "20000"]) == 0
     assert TDPG.load(folder_of(here) / "Lava-v0.zip", device="cpu").num_timesteps < 20_000
