@@ -1,4 +1,4 @@
-"""The tests of rl-zoo3 2.9 for its own algorithms, repeated with TDPG as far as a third-party algorithm can take them."""
+"""The tests of rl-zoo3 2.9 for its own algorithms, repeated with TDPG where a third-party algorithm can take them."""
 
 import os
 import subprocess
