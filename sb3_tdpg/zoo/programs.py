@@ -52,7 +52,6 @@ def run(program: str, arguments: Sequence[str]) -> None:
     :raises ValueError: if the zoo refuses them.
     """
     given, flags = _split(program, arguments)
-    _check_pairs(flags)
     register()
     # The programs of the zoo read their flags from there.
     argv, sys.argv = sys.argv, [f"sb3-tdpg {program}"]
@@ -72,18 +71,16 @@ def _split(program: str, arguments: Sequence[str]) -> tuple[argparse.Namespace, 
     if program in FLAGS and {"-h", "--help"} & set(arguments):
         ours.print_help()
         print("\nand all flags of rl-zoo3:\n")
-    return ours.parse_known_args(arguments)
-
-
-def _check_pairs(flags: Sequence[str]) -> None:
-    """Refuse text without quotes in the pairs that the zoo reads as Python."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    given, flags = ours.parse_known_args(arguments)
+    shared = argparse.ArgumentParser(ours.prog, add_help=False, allow_abbrev=False)
+    shared.add_argument("--algo", default="tdpg")
     for names in (["--env-kwargs"], ["--eval-env-kwargs"], ["-params", "--hyperparams"]):
-        parser.add_argument(*names, nargs="+", action=StoreDict)
+        shared.add_argument(*names, nargs="+", action=StoreDict)
     try:
-        parser.parse_known_args(flags)
+        shared.parse_known_args(flags, given)
     except (NameError, SyntaxError) as e:
         raise ValueError(f"{e}: write key:value with a value in Python, text in quotes as in key:\"'text'\"") from e
+    return given, flags
 
 
 def _train(given: argparse.Namespace, flags: list[str]) -> None:
@@ -136,11 +133,9 @@ def _tune(given: argparse.Namespace, flags: list[str]) -> None:
     rl_zoo3.train.train()
 
 
-def _watch(program: str, _: argparse.Namespace, flags: list[str]) -> None:
+def _watch(program: str, given: argparse.Namespace, flags: list[str]) -> None:
     """Find models where ``train`` saves them, and let TDPG act with the stochastic policy that it trained."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo", default="tdpg")
-    is_stochastic = parser.parse_known_args(flags)[0].algo == "tdpg" and "--deterministic" not in flags
+    is_stochastic = given.algo == "tdpg" and "--deterministic" not in flags
     sys.argv += ["--algo", "tdpg", "-f", "logs", *(["--stochastic"] if is_stochastic else []), *flags]
     runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
 
