@@ -1,4 +1,4 @@
-"""What the tests of published models read of a card."""
+"""Helpers that read a model card."""
 
 import re
 

@@ -78,7 +78,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_every_module_environment_and_hyperparameter_file(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    expected = {"sb3_tdpg/py.typed"}
+    expected = {"sb3_tdpg/py.typed", "sb3_tdpg/hub/card.md"}
     expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("envs/**/*.py")}
     expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("hyperparams/*.yml")}
     expected |= {str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("sb3_tdpg/**/*.py")}

@@ -1,4 +1,4 @@
-"""A trained policy and all that is to be told of it: from a run's folder, from one of rl-zoo3, or by hand."""
+"""What a model card is made from: the folder of a run, a folder of rl-zoo3, or a publication made by hand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import yaml
 from stable_baselines3.common.monitor import get_monitor_files, load_results
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_tdpg.common.provenance import as_typed
+from sb3_tdpg.common.provenance import as_typed, jsonable
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.rerun import scenarios_of, with_numbers
@@ -29,24 +29,24 @@ from sb3_tdpg.vec_env import make_episodes_env
 @dataclass(frozen=True, kw_only=True)
 class Publication:
     """
-    A policy, how it did, and how it was made.
+    A trained policy, its evaluation, and how it was made.
 
     :param model: The model, or the file that ``model.save`` wrote.
     :param env_id: The training environment.
     :param records: Episodes of this one policy, from :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :param scenarios: The rows of the records, for their keywords.
-    :param method: What the policy's method is called ("PG", "TDPG").
+    :param scenarios: The scenarios of the records, for their keywords.
+    :param method: Name of the method ("PG", "TDPG").
     :param settings: Hyperparameters, as a block of ``hyperparams/tdpg.yml``; ``env_kwargs`` are the keywords of the
         training environment.
     :param seed: Training seed.
     :param progress: Training log, see :func:`~sb3_tdpg.evaluation.training_curves`.
-    :param notes: Sentences on the training.
-    :param command: The command that made it.
-    :param again: The command that makes it again, in the folder that is published.
-    :param how: From :func:`~sb3_tdpg.common.provenance.provenance`, of the training.
+    :param notes: Sentences about the training.
+    :param command: The command that made the model.
+    :param again: The command that makes it again, in the published folder.
+    :param how: From :func:`~sb3_tdpg.common.provenance.provenance`, at training.
     :param evaluated: When the records were made.
-    :param files: What else is published: the path in the folder, and where the file lies.
-    :param metrics: Files for the zoo's ``train_eval_metrics.zip``.
+    :param files: Further files: the path in the published folder, and the file.
+    :param metrics: Files for ``train_eval_metrics.zip``, which rl-zoo3 reads.
     """
 
     model: TDPG | Path
@@ -71,12 +71,17 @@ class Publication:
         return dict(self.settings.get("env_kwargs") or {})
 
 
+def plain(value: Any) -> Any:
+    """Turn a value into text, numbers (also infinite ones), lists and mappings, which YAML can hold."""
+    return with_numbers(jsonable(value))
+
+
 def read_publication(folder: Path, **evaluation: Any) -> Publication:
     """
-    Read a run's folder (:func:`read_run`) or one of rl-zoo3 (:func:`read_zoo_folder`), whichever it is.
+    Read the folder of a run (:func:`read_run`) or of rl-zoo3 (:func:`read_zoo_folder`).
 
     :param folder: The folder.
-    :param evaluation: Of what was not evaluated yet; see :func:`read_zoo_folder`.
+    :param evaluation: For a folder of rl-zoo3; see :func:`read_zoo_folder`.
     :raises ValueError: if it is neither.
     """
     if (folder / "config.json").exists():
@@ -97,23 +102,21 @@ def read_run(folder: Path) -> Publication:
     """
     if missing := [n for n in ("config.json", "model.zip", "episodes.csv") if not (folder / n).exists()]:
         raise ValueError(
-            f"{folder} holds no finished run, since {', '.join(missing)} is missing: complete it with the command that "
-            "began it, or give the folder of one run"
+            f"{folder} holds no finished run, since {', '.join(missing)} is missing: finish it with the command that "
+            "started it, or give the folder of one run"
         )
     config = json.loads((folder / "config.json").read_text())
-    settings = with_numbers(config["settings"])
+    settings, records = with_numbers(config["settings"]), pd.read_csv(folder / "episodes.csv")
     files = {name: folder / name for name in ("config.json", "episodes.csv", "selected.json")}
-    records = pd.read_csv(folder / "episodes.csv")
     notes = [_selection_note(folder, settings)]
     if (attempts := int(records["attempts"].iloc[0])) > 1:
-        notes.append(f"It comes from attempt {attempts} of at most {config['max_attempts']}, each from another seed.")
+        notes.append(f"It comes from attempt {attempts} of at most {config['max_attempts']}, each with another seed.")
     start = config.get("start")
     if start is not None:
         notes.append(f"The training started from the policy of another run, {start}.")
         files[f"{start}/model.zip"] = folder.parent / start / "model.zip"
-    files = {name: path for name, path in files.items() if path.exists()}
-    # Runs of early versions lack the keywords of their scenarios.
-    is_whole = "scenarios" in config and (start is None or f"{start}/model.zip" in files)
+    # A run of an early version lacks its scenarios, and the policy that it started from may be gone.
+    is_repeatable = "scenarios" in config and (start is None or files[f"{start}/model.zip"].exists())
     return Publication(
         model=folder / "model.zip",
         env_id=config["env_id"],
@@ -124,68 +127,60 @@ def read_run(folder: Path) -> Publication:
         seed=config["seed"],
         progress=read_progress(folder),
         notes=notes,
-        command=_told_command(config["provenance"]["command"]),
-        again="python -m sb3_tdpg.experiments.rerun config.json again" if is_whole else None,
+        command=_typed_command(config["provenance"]["command"]),
+        again="python -m sb3_tdpg.experiments.rerun config.json again" if is_repeatable else None,
         how=config["provenance"],
         evaluated=datetime.fromtimestamp((folder / "episodes.csv").stat().st_mtime, timezone.utc),
-        files=files,
+        files={name: path for name, path in files.items() if path.exists()},
         metrics=sorted(folder.glob("progress_*.csv")),
     )
 
 
 def read_zoo_folder(
-    folder: Path,
-    *,
-    scenarios: Sequence[Scenario] | None = None,
-    n_eval_episodes: int = 1000,
-    seed: int = 0,
-    progress_bar: bool = False,
+    folder: Path, *, scenarios: Sequence[Scenario] | None = None, n_eval_episodes: int = 1000, seed: int = 0
 ) -> Publication:
     """
-    Read what rl-zoo3's ``train`` left (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
+    Read a folder that rl-zoo3's ``train`` wrote (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
 
-    That is the policy of the end of the training or, where there is none, ``best_model.zip``.
+    This is the policy at the end of the training or, if there is none, ``best_model.zip``.
 
     :param folder: The folder.
-    :param scenarios: What to evaluate; default: the rows of the paper's table, and where the environment has none, the
-        training environment. Keywords of the training environment apply beneath those of a row.
-    :param n_eval_episodes: Episodes of each.
+    :param scenarios: Where to evaluate; default: the rows of the paper's table or, without any, the training
+        environment. The keywords of a scenario take precedence over those of the training environment.
+    :param n_eval_episodes: Episodes of each scenario.
     :param seed: Seed of the evaluation.
-    :param progress_bar: Show a progress bar.
     :raises ValueError: if there is no policy.
     """
     inner = next(folder.glob("*/args.yml")).parent
-    candidates = {
-        folder / f"{inner.name}.zip": "of the end of the training",
-        folder / "best_model.zip": "that did best in it",
-    }
-    model_path = next((path for path in candidates if path.exists()), None)
-    if model_path is None:
-        raise ValueError(f"{folder} has neither {' nor '.join(p.name for p in candidates)}: let the training end first")
-    # As the zoo itself reads it. It is the user's own, and the model is unpickled, too.
+    model_path = folder / f"{inner.name}.zip"
+    if not (is_last := model_path.exists()) and not (model_path := folder / "best_model.zip").exists():
+        raise ValueError(f"{folder} has neither {inner.name}.zip nor best_model.zip: let the training end first")
+    # The zoo reads its files like this. They are the user's own, and the model is unpickled, too.
     args, settings = (dict(yaml.load((inner / n).read_text(), yaml.UnsafeLoader)) for n in ("args.yml", "config.yml"))
-    settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
+    env_kwargs = settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
     env_id, env = str(args["env"]), None
-    normalize = inner / "vecnormalize.pkl"
-    if normalize.exists():
-        env = VecNormalize.load(str(normalize), make_episodes_env(env_id, 1, env_kwargs=settings["env_kwargs"]))
+    if (inner / "vecnormalize.pkl").exists():
+        env = VecNormalize.load(str(inner / "vecnormalize.pkl"), make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
     model = TDPG.load(model_path, env=env, device="cpu")
     rows = PAPER_ROWS.get(env_id, [Scenario("Training", env_id)]) if scenarios is None else scenarios
+    labels = dict(train_seed=args["seed"])
     records = evaluate_scenarios(
-        {"TDPG": model},
-        rows,
-        n_eval_episodes,
-        seed=seed,
-        env_kwargs=settings["env_kwargs"],
-        labels=dict(train_seed=args["seed"]),
-        progress_bar=progress_bar,
+        {"TDPG": model}, rows, n_eval_episodes, seed=seed, env_kwargs=env_kwargs, labels=labels
     )
-    files = {
-        "args.yml": inner / "args.yml",
-        "config.yml": inner / "config.yml",
-        "command.txt": inner / "command.txt",
-        "vec_normalize.pkl": normalize,
-    }
+    progress = None
+    if get_monitor_files(str(folder)):  # the mean cost of each epoch, from the log of episodes
+        costs = -load_results(str(folder))["r"].to_numpy()
+        means = costs[: len(costs) // model.n_episodes * model.n_episodes].reshape(-1, model.n_episodes).mean(axis=1)
+        progress = pd.DataFrame({"time/iterations": np.arange(1, len(means) + 1), "rollout/ep_cost_mean": means})
+    # Our `train` saves the selected policy when it is finished, the zoo's the last one.
+    is_ours = (folder / "run.json").exists()
+    if is_ours and is_last and not (folder / "checkpoint.zip").exists():
+        note = _selection_note(folder, settings)
+    else:
+        note = "The policy is the last one." if is_last else "The policy is the one with the best evaluation."
+    names = {name: name for name in ("args.yml", "config.yml", "command.txt")}
+    files = {name: inner / source for name, source in {**names, "vec_normalize.pkl": "vecnormalize.pkl"}.items()}
+    files = {name: path for name, path in files.items() if path.exists()}
     return Publication(
         model=model_path,
         env_id=env_id,
@@ -193,35 +188,24 @@ def read_zoo_folder(
         scenarios=rows,
         settings=settings,
         seed=args["seed"],
-        progress=_monitored_progress(folder, model.n_episodes),
-        notes=_zoo_notes(folder, settings, model_path, candidates[model_path]),
-        command=_told_command((inner / "command.txt").read_text()) if (inner / "command.txt").exists() else None,
-        how=_zoo_provenance(folder, model_path),
-        files={name: path for name, path in files.items() if path.exists()},
+        progress=progress,
+        notes=["Trained with rl-zoo3.", note],
+        command=_typed_command(files["command.txt"].read_text()) if "command.txt" in files else None,
+        how=json.loads((folder / "run.json").read_text())["provenance"] if is_ours else _saved_versions(model_path),
+        files=files,
         metrics=sorted([*folder.glob("*.csv"), *folder.glob("evaluations.npz")]),
     )
 
 
-def _told_command(command: str) -> str | None:
-    """Return a command as a user would type it; ``None`` for that of a worker process, which tells nothing."""
+def _typed_command(command: str) -> str | None:
+    """Return a command as a user would type it; ``None`` for that of a worker process, which says nothing."""
     if "multiprocessing" in command or not command.strip():
         return None
     return shlex.join(as_typed(shlex.split(command)))
 
 
-def _zoo_notes(folder: Path, settings: Mapping[str, Any], model_path: Path, which: str) -> list[str]:
-    """Say which policy it is. Our ``train`` puts the selected one in the place of the last one when it is finished."""
-    is_finished = (folder / "run.json").exists() and not (folder / "checkpoint.zip").exists()
-    if is_finished and model_path.name != "best_model.zip":
-        return ["Trained with rl-zoo3.", _selection_note(folder, settings)]
-    return [f"Trained with rl-zoo3; the policy is the one {which}."]
-
-
-def _zoo_provenance(folder: Path, model_path: Path) -> dict[str, Any]:
-    """Return what our ``train`` has recorded; of the zoo's own only what SB3 saves of the machine with a model."""
-    if (folder / "run.json").exists():
-        how: dict[str, Any] = json.loads((folder / "run.json").read_text())["provenance"]
-        return how
+def _saved_versions(model_path: Path) -> dict[str, Any]:
+    """Return what SB3 saves about the machine with a model."""
     with zipfile.ZipFile(model_path) as archive:
         lines = archive.read("system_info.txt").decode().splitlines()
     versions = dict(line.removeprefix("- ").split(": ", 1) for line in lines if line.startswith("- ") and ": " in line)
@@ -229,23 +213,13 @@ def _zoo_provenance(folder: Path, model_path: Path) -> dict[str, Any]:
 
 
 def _selection_note(folder: Path, settings: Mapping[str, Any]) -> str:
-    """Say which epoch's policy it is."""
-    path = folder / "selected.json"
-    if path.exists():
-        best = json.loads(path.read_text())
+    """Say which epoch the policy is from."""
+    if (folder / "selected.json").exists():
+        best = json.loads((folder / "selected.json").read_text())
         return (
-            f"The policy is that of epoch {best['epoch']}, which the selection chose: mean cost {best['cost']:.4g}, "
-            f"information {best['information']:.3g} nat, both on the epoch's own episodes."
+            f"The selection chose the policy of epoch {best['epoch']}: mean cost {best['cost']:.4g}, information "
+            f"{best['information']:.3g} nat, both measured on the episodes of that epoch."
         )
     if "SelectionCallback" in str(settings.get("callback")):
-        return "No epoch met the limits of the selection: the policy is that of the last one."
-    return "The policy is that of the last epoch."
-
-
-def _monitored_progress(folder: Path, n_episodes: int) -> pd.DataFrame | None:
-    """Return the mean cost of each epoch by what SB3's monitor wrote of its episodes."""
-    if not get_monitor_files(str(folder)):
-        return None
-    costs = -load_results(str(folder))["r"].to_numpy()
-    epochs = costs[: len(costs) // n_episodes * n_episodes].reshape(-1, n_episodes)
-    return pd.DataFrame({"time/iterations": np.arange(1, len(epochs) + 1), "rollout/ep_cost_mean": epochs.mean(axis=1)})
+        return "No epoch met the limits of the selection, so the policy is the last one."
+    return "The policy is the last one."

@@ -1,4 +1,4 @@
-"""rl-zoo3's programs with TDPG among its algorithms: train, watch, tune and plot from the command line."""
+"""Train, watch, tune and plot from the command line: the programs of rl-zoo3 with TDPG among the algorithms."""
 
 from sb3_tdpg.zoo.manager import register
 

@@ -1,13 +1,13 @@
-"""The zoo's manager of an experiment, with what this plugin knows better."""
+"""The experiment manager of rl-zoo3, extended for the environments and the algorithm of this plugin."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import warnings
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -16,9 +16,8 @@ import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.wrappers import HistoryWrapper, HistoryWrapperObsDict
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.common.provenance import write_run_config
@@ -26,49 +25,36 @@ from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import batched_class, default_n_envs, make_episodes_env
 from sb3_tdpg.zoo.blocks import check_block, find_file
 
-CHECKPOINT = "checkpoint.zip"
-RECORD = "run.json"
-# A checkpoint resets the environments: rarely enough that this is no matter, often enough that little is lost.
+CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
+# A checkpoint resets the environments: rare enough not to matter, frequent enough to lose little.
 CHECKPOINT_EPOCHS = 10
-
-
-def register() -> None:
-    """
-    Make TDPG known to rl-zoo3's programs in this process, as its documentation tells third-party algorithms to.
-
-    Afterwards ``rl_zoo3.train.train()`` and the others take ``--algo tdpg``.
-    """
-    ALGOS["tdpg"] = TDPG  # one dictionary, which all of them share
-    rl_zoo3.train.ExperimentManager = TDPGExperimentManager  # type: ignore[misc]
 
 
 class TDPGExperimentManager(ExperimentManager):
     """
-    What one of the zoo's trainings is made of.
+    Set up and run one training of rl-zoo3.
 
-    - All episodes of one of this plugin's environments go side by side in one call
-      (:class:`~sb3_tdpg.vec_env.BatchedVecEnv`), unless ``--vec-env subproc`` or a wrapper of single environments is
-      asked for. This holds for every algorithm.
-    - Blocks of this plugin's own files are found without ``--conf-file``.
-    - A key that no one reads, or a number that YAML reads as text, is refused before anything is written.
-    - The evaluation has the ``env_kwargs`` of the block, unless it is given its own.
-    - TDPG is evaluated as it is trained: stochastic.
-    - A killed or interrupted training of TDPG leaves a checkpoint from which it can be resumed, and a finished one the
-      policy that the block's :class:`~sb3_tdpg.SelectionCallback` has chosen.
+    - All episodes of an environment of this plugin run side by side in one call
+      (:class:`~sb3_tdpg.vec_env.BatchedVecEnv`), for every algorithm, unless ``--vec-env subproc`` or wrappers of
+      single environments are given.
+    - Blocks of this plugin's files are found without ``--conf-file``, and are checked before anything is written.
+    - The evaluation environment gets the ``env_kwargs`` of the block unless it is given its own.
+    - TDPG is evaluated with the stochastic policy that it trains.
+    - An interrupted training of TDPG leaves a checkpoint to resume from, a finished one the policy that the
+      :class:`~sb3_tdpg.SelectionCallback` of its block selected.
     """
 
-    # Set by the programs of this plugin before the zoo makes the manager, since the zoo has no flags for them.
+    # The zoo has no flags for these: a program sets them in a subclass.
     block: str | None = None
     resume: Path | None = None
     arguments: tuple[str, ...] = ()
-    # And told them by it: the zoo itself ends an interrupted training like a finished one.
-    was_interrupted = False
 
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         kwargs["config"] = kwargs.get("config") or find_file(algo, self.block or env_id)
         super().__init__(args, algo, env_id, *rest, **kwargs)
-        if algo == "tdpg":
-            self.deterministic_eval = False
+        self.is_batch = batched_class(env_id) is not None and self.vec_env_class is DummyVecEnv
+        self.is_interrupted = False
+        self.deterministic_eval = self.deterministic_eval and algo != "tdpg"
         if self.resume is not None:
             self.save_path = str(self.resume)
             self.params_path = f"{self.save_path}/{self.env_name}"
@@ -76,7 +62,7 @@ class TDPGExperimentManager(ExperimentManager):
             self.continue_training = True
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """See the zoo. Nothing is left behind if it cannot be set up."""
+        """Create the environment and the model; if this fails, remove the folder that was made for them."""
         was_there = os.path.exists(self.save_path)
         try:
             return super().setup_experiment()
@@ -86,197 +72,131 @@ class TDPGExperimentManager(ExperimentManager):
             raise
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Read and check the block; see the zoo."""
+        """Read and check the block of hyperparameters."""
         env_name, block = self.env_name, self.block or self.env_name.gym_id
-        _check_file(self.config)
-        self.env_name = EnvironmentName(block)  # under which the zoo looks the block up
+        self.env_name = EnvironmentName(block)  # the name by which the zoo looks the block up
         try:
             hyperparams, saved = super().read_hyperparameters()
-        except ValueError as e:
-            if "Hyperparameters not found" not in str(e):
-                raise
+        except (OSError, ValueError, AttributeError, yaml.YAMLError) as e:
+            reason = " ".join(str(e).split())
             raise ValueError(
-                f"{self.config} has no block {block!r} for {self.algo}: give --block with one that it has, or "
-                "--conf-file with a file of your own"
+                f"{self.config} has no readable block {block!r} for {self.algo} ({reason}): choose another one with "
+                "--block, or another file with --conf-file"
             ) from e
         finally:
             self.env_name = env_name
         check_block(hyperparams, self.algo, f"block {block} of {self.config}")
         return hyperparams, saved
 
-    def load_trial(
-        self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True
-    ) -> dict[str, Any]:
-        """Return the block of a trial of ``tune``; of another algorithm's trial, see the zoo."""
-        if self.algo != "tdpg":
-            return super().load_trial(storage, study_name, trial_id, convert)
-        from sb3_tdpg.zoo.tuning import block_of_trial
-
-        return block_of_trial(storage, study_name, trial_id)
-
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if self.algo == "tdpg" and "n_envs" not in hyperparams:
-            hyperparams["n_envs"] = self._count_episodes(hyperparams)
+            # The keywords of the command line replace those of the block.
+            env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs")
+            env = self._make_env(env_kwargs, n_episodes=hyperparams.get("n_episodes"), use_processes=False)
+            hyperparams["n_envs"] = env.num_envs if self.is_batch else default_n_envs(env.num_envs)
+            env.close()
         processed, wrap, *others = super()._preprocess_hyperparams(hyperparams)
-        self.env_wrapper = None if wrap is None else partial(_wrap_with_horizon, wrap)
+        self.env_wrapper = None if wrap is None else lambda env: _TaskHorizon(wrap(env), env)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         return processed, self.env_wrapper, *others
 
-    def _count_episodes(self, hyperparams: dict[str, Any]) -> int:
-        """As many environments as an epoch has episodes if these go as a batch, otherwise a divisor of that."""
-        # On the command line they replace those of the block.
-        env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs")
-        env = self._make_batch(env_kwargs, n_episodes=hyperparams.get("n_episodes"), use_processes=False)
-        n_envs = env.num_envs
-        env.close()
-        is_batch = batched_class(self.env_name.gym_id) is not None
-        return n_envs if is_batch and self.vec_env_class is DummyVecEnv else default_n_envs(n_envs)
-
-    def _make_batch(self, env_kwargs: dict[str, Any] | None, **kwargs: Any) -> VecEnv:
+    def _make_env(self, env_kwargs: dict[str, Any] | None, **kwargs: Any) -> VecEnv:
         try:
             return make_episodes_env(self.env_name.gym_id, env_kwargs=env_kwargs, **kwargs)
         except TypeError as e:  # an unknown keyword
             raise ValueError(f"{self.env_name.gym_id} cannot be made with env_kwargs={env_kwargs}: {e}") from e
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """See the zoo."""
-        is_batch = (
-            batched_class(self.env_name.gym_id) is not None
-            and self.env_wrapper is None
-            and self.vec_env_class is DummyVecEnv
-        )
-        if not is_batch:
-            return super().create_envs(n_envs, eval_env, no_log)
-        env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
-        env = self._make_batch(env_kwargs, n_envs=n_envs, seed=self.seed)
-        with warnings.catch_warnings():
-            # It tells its episodes' returns itself, but writes no file, which the zoo's plots read.
-            warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Monitor`")
+        """Create the environments, as a batch where this is possible."""
+        if self.is_batch and self.env_wrapper is None:
             is_logged = not (eval_env or no_log or self.optimize_hyperparameters)
-            env = VecMonitor(env, self._new_monitor() if is_logged else None)
-        if self.vec_env_wrapper is not None:
-            env = self.vec_env_wrapper(env)
-        env = self._maybe_normalize(env, eval_env)
-        return env if self.frame_stack is None else VecFrameStack(env, self.frame_stack)
+            env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+            self.vec_env_class = partial(self._make_batch, env_kwargs, is_logged)  # type: ignore[assignment]
+        return super().create_envs(n_envs, eval_env, no_log)
 
-    def _new_monitor(self) -> str:
-        """Return a name for the log of episodes: one that is resumed goes on in another file, which the plots add."""
-        n = len(list(Path(self.save_path).glob("*.monitor.csv")))
-        return os.path.join(self.save_path, str(n))
+    def _make_batch(self, env_kwargs: dict[str, Any], is_logged: bool, env_fns: list[Any]) -> VecEnv:
+        env = self._make_env(env_kwargs, n_envs=len(env_fns), seed=self.seed)
+        # A resumed training logs its episodes to another file; the zoo's plots read all files of a folder.
+        n_logs = len(list(Path(self.save_path).glob("*.monitor.csv")))
+        with warnings.catch_warnings():
+            # The batch reports the returns of its episodes itself, but does not write them to a file.
+            warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Monitor`")
+            return VecMonitor(env, os.path.join(self.save_path, str(n_logs)) if is_logged else None)
 
     def create_callbacks(self) -> None:
-        """See the zoo. The policy that is selected, and what a training is resumed from, are in its folder, too."""
+        """Create the callbacks. TDPG's write the selected policy and the checkpoint to the folder of the training."""
         super().create_callbacks()
         if self.algo != "tdpg" or self.optimize_hyperparameters:
             return
         for callback in self.callbacks:
             if isinstance(callback, SelectionCallback) and callback.save_path is None:
                 callback.save_path = Path(self.save_path, "selected.zip")
-        checkpoint = Path(self.save_path, CHECKPOINT)
-        self.callbacks.append(_Checkpoint(checkpoint, CHECKPOINT_EPOCHS, Path(self.params_path, "vecnormalize.pkl")))
-
-    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
-        if self.resume is None:
-            return super()._load_pretrained_agent(hyperparams, env)
-        # Nothing is changed in it: neither the seed, nor a schedule that has come half of its way.
-        return TDPG.load(
-            self.trained_agent, env=env, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device
-        )
+        self.callbacks.append(TrainingCheckpointCallback(Path(self.save_path, CHECKPOINT), CHECKPOINT_EPOCHS))
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """See the zoo."""
-        super().learn(_Resumed(model) if self.resume is not None else model)  # type: ignore[arg-type]
+        """Train the model. An interrupt ends the training; :meth:`save_trained_model` raises it again."""
+
+        def learn(n_timesteps: int, **kwargs: Any) -> None:
+            if self.resume is not None:
+                assert isinstance(model, TDPG)
+                n_timesteps, kwargs["reset_num_timesteps"] = model.remaining_timesteps, False
+            try:
+                model.learn(n_timesteps, **kwargs)
+            except KeyboardInterrupt:  # the zoo swallows it
+                self.is_interrupted = True
+                raise
+
+        # These are the attributes that the zoo's loop uses.
+        super().learn(SimpleNamespace(env=model.env, policy=model.policy, learn=learn))  # type: ignore[arg-type]
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """See the zoo. The last policy is replaced by the selected one."""
-        if not isinstance(model, TDPG):
-            super().save_trained_model(model)
-            return
-        checkpoint = Path(self.save_path, CHECKPOINT)
-        is_finished = model.num_timesteps >= model._total_timesteps
-        if is_finished:
-            for callback in self.callbacks:
-                if isinstance(callback, SelectionCallback):
-                    _restore_selected(callback, model)
+        """Save the model, at the end of a training with the policy that was selected."""
+        selections = [] if self.is_interrupted else [c for c in self.callbacks if isinstance(c, SelectionCallback)]
+        for selection in selections:
+            assert isinstance(model, TDPG)
+            try:
+                best = selection.restore(model)
+                print(
+                    f"the policy of epoch {best.epoch} was selected: cost {best.cost:.3g}, {best.information:.3g} nat"
+                )
+            except ValueError as e:
+                print(f"no policy was selected: {e}")
         super().save_trained_model(model)
-        if is_finished:
+        checkpoint = Path(self.save_path, CHECKPOINT)
+        if not self.is_interrupted:
             checkpoint.unlink(missing_ok=True)
             return
-        type(self).was_interrupted = True
         print(f"interrupted after {model.num_timesteps} of {model._total_timesteps} steps")
         if checkpoint.exists():
-            print(f"`sb3-tdpg train --resume {self.save_path}` goes on from the last checkpoint")
+            print(f"`sb3-tdpg train --resume {self.save_path}` continues from the last checkpoint")
+        raise KeyboardInterrupt
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        if self.resume is not None:  # it says how the training began
-            return
-        super()._save_config(saved_hyperparams)
-        config = dict(
-            algo=self.algo,
-            env_id=self.env_name.gym_id,
-            block=self.block or self.env_name.gym_id,
-            seed=self.seed,
-            arguments=list(self.arguments),
-            hyperparams=dict(saved_hyperparams),
-        )
-        write_run_config(Path(self.save_path, RECORD), config)
+        if self.resume is None:  # otherwise the record of the first start stays
+            super()._save_config(saved_hyperparams)
+            env_id = self.env_name.gym_id
+            start = dict(algo=self.algo, env_id=env_id, block=self.block or env_id, seed=self.seed)
+            config = dict(**start, arguments=list(self.arguments), hyperparams=dict(saved_hyperparams))
+            write_run_config(Path(self.save_path, RECORD), config)
 
 
-class _Checkpoint(TrainingCheckpointCallback):
-    """Also keeps the statistics of ``normalize``, where the zoo looks for them."""
+def register(manager: type[ExperimentManager] = TDPGExperimentManager) -> None:
+    """
+    Add TDPG to the algorithms of rl-zoo3 in this process.
 
-    def __init__(self, save_path: Path, save_freq: int, statistics: Path) -> None:
-        super().__init__(save_path, save_freq)
-        self.statistics = statistics
+    Afterwards ``rl_zoo3.train.train()`` and the other programs of the zoo accept ``--algo tdpg``.
 
-    def _on_rollout_start(self) -> None:
-        normalize = self.model.get_vec_normalize_env()
-        if isinstance(normalize, VecNormalize) and self.tdpg.epoch % self.save_freq == 0:
-            normalize.save(str(self.statistics))
-        super()._on_rollout_start()
+    :param manager: The experiment manager that ``train`` uses.
+    """
+    ALGOS["tdpg"] = TDPG  # all programs of the zoo share this dictionary
+    rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
 
 
-class _Resumed:
-    """What the zoo's ``learn`` needs of a model, which then goes on instead of beginning anew."""
+class _TaskHorizon(gym.Wrapper):
+    """Show the horizon of the task, since rl-zoo3's ``HistoryWrapper`` stores its own length under the same name."""
 
-    def __init__(self, model: BaseAlgorithm) -> None:
-        assert isinstance(model, TDPG)
-        self.model = model
-
-    @property
-    def env(self) -> VecEnv | None:
-        return self.model.env
-
-    def learn(self, _: int, **kwargs: Any) -> None:
-        self.model.learn(self.model.remaining_timesteps, reset_num_timesteps=False, **kwargs)
-
-
-def _wrap_with_horizon(wrap: Callable[[gym.Env], gym.Env], env: gym.Env) -> gym.Env:
-    """Wrap an environment and show its horizon again, where the zoo's wrapper calls the length of its history so."""
-    wrapped = layer = wrap(env)
-    while layer is not env and isinstance(layer, gym.Wrapper):
-        if isinstance(layer, (HistoryWrapper, HistoryWrapperObsDict)):
-            del layer.horizon  # it has made its arrays, and reads this no more
-        layer = layer.env
-    return wrapped
-
-
-def _restore_selected(selection: SelectionCallback, model: TDPG) -> None:
-    try:
-        best = selection.restore(model)
-    except ValueError as e:
-        print(f"no policy was selected: {e}")
-    else:
-        print(f"the policy of epoch {best.epoch} was selected: cost {best.cost:.3g}, {best.information:.3g} nat")
-
-
-def _check_file(path: str) -> None:
-    if not path.endswith((".yml", ".yaml")):
-        return  # Python, which the zoo reads
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as e:
-        raise ValueError(f"--conf-file {path} cannot be read: {' '.join(str(e).split())}") from e
-    if not isinstance(content, dict):
-        raise ValueError(f"--conf-file {path} must map environment ids to blocks of hyperparameters")
+    def __init__(self, env: gym.Env, task: gym.Env) -> None:
+        super().__init__(env)
+        limit = None if task.spec is None else task.spec.max_episode_steps
+        self.horizon = task.get_wrapper_attr("horizon") if task.has_wrapper_attr("horizon") else limit

@@ -1,9 +1,10 @@
-"""A published model, read back by all who would read it."""
+"""Load a published model with this plugin, with Stable-Baselines3's package and with rl-zoo3."""
 
 import json
 import re
 from pathlib import Path
 
+import huggingface_hub
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +17,6 @@ from sb3_tdpg.hub import load_from_hub
 from sb3_tdpg.hub.model_card import model_name
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-huggingface_hub = pytest.importorskip("huggingface_hub")
 
 
 def test_the_code_in_the_card_runs_the_policy(card, on_the_hub, capsys):
@@ -72,7 +72,7 @@ def test_nothing_is_unpickled_without_trust(monkeypatch):
     for trust, variable in ((None, None), (None, "False"), (False, "True")):
         if variable is not None:
             monkeypatch.setenv("TRUST_REMOTE_CODE", variable)
-        with pytest.raises(ValueError, match="if you trust who made it, give trust_remote_code=True"):
+        with pytest.raises(ValueError, match="if you trust its author, give trust_remote_code=True"):
             load_from_hub(REPO_ID, "tdpg-Lava-v0.zip", trust_remote_code=trust)  # offline(): nothing is fetched
 
 
@@ -106,7 +106,7 @@ def test_the_zoo_finds_all_files_that_it_asks_for(card, tmp_path, monkeypatch):
     assert yaml.safe_load((folder / "Lava-v0" / "args.yml").read_text())["env_kwargs"] == {}
 
 
-def test_results_json_is_the_zoos(card):
+def test_results_json_has_the_format_of_the_zoo(card):
     results = json.loads((card / "results.json").read_text())
     assert results.pop("eval_datetime")[:2] == "20"
     costs = costs_of(card)

@@ -1,11 +1,13 @@
-"""The card of a published model: what it tells, what lies beside it, and what is refused."""
+"""The card of a published model: its content, the files beside it, and the input that is refused."""
 
 import json
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import Mock
 
+import huggingface_hub
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,10 +20,8 @@ from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.rerun import rerun
 from sb3_tdpg.hub import pull_from_hub, write_model_card
-from sb3_tdpg.hub.model_card import results_with_intervals
+from sb3_tdpg.hub.model_card import model_card, results_with_intervals
 from sb3_tdpg.hub.publication import Publication, read_run
-
-huggingface_hub = pytest.importorskip("huggingface_hub")
 
 
 def test_the_metadata_has_the_mean_of_the_records_and_the_training_environment_first(card):
@@ -66,7 +66,7 @@ def test_the_table_has_the_95_percent_interval_of_every_scenario(card):
     assert "`sensor_noise_std=0.03162`" in text_of(card)
 
 
-def test_everything_that_the_card_refers_to_lies_beside_it(card):
+def test_all_files_that_the_card_links_to_are_in_its_folder(card):
     links = re.findall(r"\]\((?!https:)([^)]*)\)", text_of(card))
     assert "training.png" in links
     assert "episodes.csv" in links
@@ -74,7 +74,7 @@ def test_everything_that_the_card_refers_to_lies_beside_it(card):
     assert (card / "training.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_card_tells_seed_commit_versions_settings_and_which_policy_it_is(card, runs):
+def test_the_card_names_seed_commit_versions_settings_and_the_selected_epoch(card, runs):
     text, config = text_of(card), json.loads((runs / "tdpg-seed0" / "config.json").read_text())
     assert "training seed: 0\n" in text
     assert f"torch {config['provenance']['versions']['torch']}" in text
@@ -84,11 +84,11 @@ def test_the_card_tells_seed_commit_versions_settings_and_which_policy_it_is(car
     read = json.loads(json.dumps(yaml.safe_load(settings)))
     assert read == config["settings"] == json.loads(json.dumps(yaml.safe_load((card / "config.yml").read_text())))
     epoch = json.loads((runs / "tdpg-seed0" / "selected.json").read_text())["epoch"]
-    assert f"The policy is that of epoch {epoch}," in text
+    assert f"The selection chose the policy of epoch {epoch}:" in text
     assert "from the policy of another run, pg-seed0" in text
 
 
-def test_the_command_of_a_user_is_told_and_that_of_a_worker_process_is_not(runs, tmp_path):
+def test_the_command_of_a_user_is_shown_and_that_of_a_worker_process_is_not(runs, tmp_path):
     folder = runs / "pg-seed0"
     config = json.loads((folder / "config.json").read_text())
     for i, (command, told) in enumerate(
@@ -146,9 +146,12 @@ def test_shares_of_failures_have_wilsons_interval():
         pytest.approx(0.01788, abs=1e-5),
         pytest.approx(0.40415, abs=1e-5),
     )
+    publication = Publication(model=Path("model.zip"), env_id="Lava-v0", records=records)
+    text = model_card(publication, results_with_intervals(records), REPO_ID).text
+    assert "| Training |  | 10 | 0.00 [0.00, 0.00] | 0.00 | 10.0% [1.8%, 40.4%] |" in text
 
 
-def test_the_film_of_some_episodes_lies_beside_the_card(runs, tmp_path):
+def test_the_video_of_an_episode_is_in_the_folder_of_the_card(runs, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     card = write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=1)
     assert b"ftyp" in (card / "replay.mp4").read_bytes()[:12]
@@ -156,7 +159,7 @@ def test_the_film_of_some_episodes_lies_beside_the_card(runs, tmp_path):
 
 
 @pytest.mark.parametrize("missing", ["config.json", "model.zip", "episodes.csv"])
-def test_what_is_not_finished_is_refused_and_nothing_is_written(missing, runs, tmp_path):
+def test_an_unfinished_run_is_refused_and_nothing_is_written(missing, runs, tmp_path):
     copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
     (copy / missing).unlink()
     message = "holds no training" if missing == "config.json" else f"no finished run, since {missing} is missing"
@@ -186,16 +189,16 @@ def test_a_damaged_model_is_refused_and_no_card_is_written(runs, tmp_path):
     assert not (tmp_path / "card").exists()
 
 
-def test_a_card_that_could_not_be_finished_does_not_stand_in_the_way(runs, tmp_path, monkeypatch):
+def test_an_interrupted_card_leaves_nothing_and_can_be_written_again(runs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("sb3_tdpg.hub.card_text", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr("sb3_tdpg.hub.transfer.model_card", Mock(side_effect=KeyboardInterrupt))
         write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
     assert not (tmp_path / "card").exists()
     write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
     assert [path.name for path in tmp_path.iterdir()] == ["card"]
 
 
-def test_a_folder_with_something_in_it_is_left_alone(card, runs, tmp_path):
+def test_a_folder_that_is_not_empty_is_left_alone(card, runs, tmp_path):
     before = {path: path.read_bytes() for path in card.rglob("*") if path.is_file()}
     for refused in (lambda: write_model_card(runs / "pg-seed0", card, REPO_ID), lambda: pull_from_hub(REPO_ID, card)):
         with pytest.raises(ValueError, match="exists already: choose another folder, or remove it"):

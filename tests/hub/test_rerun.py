@@ -1,4 +1,4 @@
-"""A published run, made again by the command in its card."""
+"""Repeat a published run with the command in its card."""
 
 import os
 import shlex
@@ -18,7 +18,7 @@ from sb3_tdpg.experiments.rerun import rerun
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def test_the_command_in_the_card_makes_the_run_again(card, runs, tmp_path):
+def test_the_command_in_the_card_repeats_the_run(card, runs, tmp_path):
     copy = shutil.copytree(card, tmp_path / "copy")  # with the policy to start from in it
     program, *arguments = shlex.split(blocks(copy, "bash")[-1])
     assert program == "python"
@@ -29,14 +29,14 @@ def test_the_command_in_the_card_makes_the_run_again(card, runs, tmp_path):
     assert_same_parameters(parameters(first.policy), parameters(second.policy))
 
 
-def test_a_rerun_keeps_to_the_recorded_settings_whatever_became_of_the_block(runs, tmp_path, monkeypatch):
+def test_a_rerun_uses_the_recorded_settings_and_not_the_block(runs, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_tdpg.experiments.runs.load_hyperparams", lambda block: pytest.fail("it reads the block"))
     rerun(runs / "pg-seed0" / "config.json", tmp_path / "again", progress_bar=False)
     assert (tmp_path / "again" / "episodes.csv").read_bytes() == (runs / "pg-seed0" / "episodes.csv").read_bytes()
     assert TDPG.load(tmp_path / "again" / "model.zip", device="cpu").mi_coef == 0  # beta is inf, and not a text
 
 
-def test_a_rerun_without_the_very_policy_it_started_from_is_refused(card, runs, tmp_path, capsys):
+def test_a_rerun_without_the_policy_that_the_run_started_from_is_refused(card, runs, tmp_path, capsys):
     shutil.copy(card / "config.json", tmp_path)
     with pytest.raises(ValueError, match="is not trained yet: put the run's own there"):
         rerun(tmp_path / "config.json", tmp_path / "again")

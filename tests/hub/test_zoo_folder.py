@@ -1,4 +1,4 @@
-"""A card of what the zoo's train leaves, and of our own folders: which policy it is, and how it was trained."""
+"""Cards of folders that rl-zoo3's train and ours wrote: which policy they describe, and how it was trained."""
 
 import json
 import re
@@ -24,7 +24,7 @@ from sb3_tdpg.hub.publication import read_publication
 
 @pytest.fixture(scope="module")
 def zoo_folder(tmp_path_factory):
-    """What the zoo's train leaves of a training on normalised observations, with the evaluations of a callback."""
+    """Folder that the zoo's train wrote: normalised observations, and evaluations by a callback."""
     pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
     import rl_zoo3.train
     from rl_zoo3.exp_manager import ExperimentManager
@@ -50,7 +50,7 @@ def zoo_folder(tmp_path_factory):
     return folder / "logs" / "tdpg" / "Lava-v0_1"
 
 
-def test_a_folder_of_the_zoo_is_evaluated_and_told_of(zoo_folder, tmp_path):
+def test_the_policy_of_a_zoo_folder_is_evaluated_and_described(zoo_folder, tmp_path):
     card = write_model_card(zoo_folder, tmp_path / "card", REPO_ID, n_eval_episodes=10, seed=5, scenarios=LAVA[:2])
     records = pd.read_csv(card / "episodes.csv")
     assert records.groupby("scenario").size().to_dict() == {"Training": 10, "Sensor noise 1e-3": 10}
@@ -71,13 +71,11 @@ def test_a_folder_of_the_zoo_is_evaluated_and_told_of(zoo_folder, tmp_path):
     assert "gym.make('Lava-v0', action_cost=1.0)" in text
     assert "training seed: 3\n" in text
     assert re.search(r"versions: Python \d.*PyTorch \d", text)
-    # The zoo's own program leaves the last policy, whatever a selection has chosen.
-    assert "the policy is the one of the end of the training." in text
-    assert "The policy is that of" not in text
+    assert "The policy is the last one." in text
     assert (card / "training.png").exists()
 
 
-def test_the_training_of_the_zoo_is_drawn_by_its_monitors(zoo_folder):
+def test_the_training_curve_of_a_zoo_folder_comes_from_its_monitor_files(zoo_folder):
     progress = read_publication(zoo_folder, n_eval_episodes=2, scenarios=LAVA[:1]).progress
     rewards = load_results(str(zoo_folder))["r"].to_numpy()
     assert len(rewards) == 100
@@ -85,29 +83,29 @@ def test_the_training_of_the_zoo_is_drawn_by_its_monitors(zoo_folder):
     assert progress["rollout/ep_cost_mean"].to_numpy() == pytest.approx(-rewards.reshape(5, 20).mean(axis=1))
 
 
-def test_a_folder_of_the_zoo_without_its_last_policy_gives_the_best_one(zoo_folder, tmp_path):
+def test_a_zoo_folder_without_its_last_policy_gives_the_best_one(zoo_folder, tmp_path):
     copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
     (copy / "Lava-v0.zip").unlink()
     publication = read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1])
     assert publication.model == copy / "best_model.zip"
-    assert "did best" in publication.notes[0]
+    assert "best evaluation" in publication.notes[1]
     (copy / "best_model.zip").unlink()
     with pytest.raises(ValueError, match=r"neither Lava-v0.zip nor best_model.zip: let the training end first"):
         read_publication(copy)
 
 
-def test_the_card_of_a_folder_of_ours_says_which_policy_it_is(zoo_folder, tmp_path):
+def test_the_card_of_our_own_folder_says_which_policy_it_is(zoo_folder, tmp_path):
     copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
     (copy / "selected.json").write_text(json.dumps(dict(epoch=3, cost=17.0, information=0.5)))
 
     def notes():
         return " ".join(read_publication(copy, n_eval_episodes=2, scenarios=LAVA[:1]).notes)
 
-    assert "the policy is the one of the end" in notes()  # the zoo's own program leaves the last one
+    assert "The policy is the last one" in notes()  # the zoo's own program saves this one
     assert "epoch 3" not in notes()
     (copy / "run.json").write_text(json.dumps(dict(provenance=provenance())))
-    assert "The policy is that of epoch 3, which the selection chose" in notes()
-    assert "of the end" not in notes()
+    assert "The selection chose the policy of epoch 3" in notes()
+    assert "last" not in notes()
     (copy / "checkpoint.zip").touch()  # interrupted
-    assert "the policy is the one of the end" in notes()
+    assert "The policy is the last one" in notes()
     assert "epoch 3" not in notes()

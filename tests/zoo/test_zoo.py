@@ -1,7 +1,8 @@
-"""``sb3-tdpg train``, ``enjoy``, ``record-video`` and ``plot``: rl-zoo3's programs with TDPG among the algorithms."""
+"""``sb3-tdpg train``, ``enjoy``, ``record-video`` and ``plot``: the programs of rl-zoo3 with TDPG as an algorithm."""
 
 import json
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -31,7 +32,7 @@ CARTPOLE = ["-params", "n_episodes:4", "batch_size:4", "-n", "100", "--eval-freq
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Run in an empty folder, since the zoo writes to logs/ in the present one."""
+    """Run in an empty folder, since the zoo writes to logs/ in the working directory."""
     monkeypatch.chdir(tmp_path)
     # Its plots would open a window.
     monkeypatch.setenv("MPLBACKEND", "agg")
@@ -56,7 +57,7 @@ def test_train_leaves_a_model_and_says_how_it_was_made(here):
     assert not list(folder.rglob("*.partial"))
 
 
-def test_episodes_of_an_environment_of_ours_go_as_a_batch_for_any_algorithm(here, monkeypatch):
+def test_our_environments_run_as_a_batch_for_any_algorithm(here, monkeypatch):
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     made = []
@@ -79,7 +80,7 @@ def test_episodes_of_an_environment_of_ours_go_as_a_batch_for_any_algorithm(here
     PPO.load(folder_of(here, algo="ppo") / "Lava-v0.zip", device="cpu")
 
 
-def test_an_interrupted_training_goes_on_as_if_it_had_not_been(here):
+def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     arguments = ["train", *LAVA, "-params", "n_episodes:20", "-n", "20000", "--seed", "1"]
     process = start(arguments, here)
     wait_for(folder_of(here) / "checkpoint.zip", process)
@@ -95,18 +96,31 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(here):
     assert main(["train", "--resume", "logs/tdpg/Lava-v0_1"]) == 2  # it is finished
 
     assert main(arguments) == 0
-    resumed, whole = (TDPG.load(folder_of(here, n) / "Lava-v0.zip", device="cpu") for n in (1, 2))
-    assert_same_parameters(parameters(resumed.policy), parameters(whole.policy))
+    assert_same_training(here)
 
 
-def test_a_killed_training_with_normalised_observations_goes_on(here):
+def test_a_killed_training_with_normalised_observations_is_resumed_exactly(here):
     settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
-    process = start(["train", *LAVA, "-params", *settings, "-n", "20000"], here)
+    arguments = ["train", *LAVA, "-params", *settings, "-n", "20000", "--seed", "1"]
+    process = start(arguments, here)
     wait_for(folder_of(here) / "checkpoint.zip", process)
     process.kill()
     process.communicate()
     assert main(["train", "--resume", "logs/tdpg/Lava-v0_1"]) == 0
-    assert TDPG.load(folder_of(here) / "Lava-v0.zip", device="cpu").num_timesteps == 20_000
+    assert main(arguments) == 0
+    assert_same_training(here)
+
+
+def assert_same_training(path):
+    """Compare the policies of the first two trainings, and what was learned of the observations."""
+    resumed, whole = (TDPG.load(folder_of(path, n) / "Lava-v0.zip", device="cpu") for n in (1, 2))
+    assert resumed.num_timesteps == whole.num_timesteps
+    assert_same_parameters(parameters(resumed.policy), parameters(whole.policy))
+    statistics = [folder_of(path, n) / "Lava-v0" / "vecnormalize.pkl" for n in (1, 2)]
+    assert statistics[0].exists() == statistics[1].exists()
+    if statistics[0].exists():
+        resumed, whole = (pickle.loads(file.read_bytes()).obs_rms for file in statistics)
+        assert (resumed.mean == whole.mean).all() and (resumed.var == whole.var).all()
 
 
 def start(arguments, folder):
@@ -132,7 +146,7 @@ def wait_for(path, process):
         time.sleep(0.02)
 
 
-def test_the_selected_policy_is_the_one_that_is_kept(here, capsys):
+def test_the_selected_policy_is_saved(here, capsys):
     selection = "callback:[{'sb3_tdpg.callbacks.SelectionCallback':{'cost_limit':1e6}}]"
     assert main(["train", *LAVA, "-params", "n_episodes:20", selection, "-n", "2000", "--seed", "1"]) == 0
     assert "was selected" in capsys.readouterr().out
@@ -142,7 +156,7 @@ def test_the_selected_policy_is_the_one_that_is_kept(here, capsys):
     assert_same_parameters(parameters(chosen.policy), parameters(kept.policy))
 
 
-def test_enjoy_finds_what_train_has_left_and_acts_as_it_was_trained(here, capsys, monkeypatch):
+def test_enjoy_finds_the_latest_model_and_runs_its_stochastic_policy(here, capsys, monkeypatch):
     main(["train", *SHORT])
     drawn = []
     predict = TDPG.predict
@@ -154,7 +168,7 @@ def test_enjoy_finds_what_train_has_left_and_acts_as_it_was_trained(here, capsys
     assert drawn[-1] is True
 
 
-def test_plot_and_film_of_a_training(here):
+def test_plot_and_video_of_a_training(here):
     main(["train", *SHORT])
     assert main(["plot", "-e", "Lava-v0", "--save", "curve.png"]) == 0
     assert (here / "curve.png").stat().st_size > 5000
@@ -163,27 +177,16 @@ def test_plot_and_film_of_a_training(here):
     assert film.stat().st_size > 1000
 
 
-def test_the_evaluation_has_the_keywords_of_the_block(here, monkeypatch):
+def test_the_evaluation_uses_the_keywords_of_the_block(here, monkeypatch):
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     made = []
-    make = TDPGExperimentManager._make_batch
+    make = TDPGExperimentManager._make_env
     monkeypatch.setattr(
-        TDPGExperimentManager,
-        "_make_batch",
-        lambda self, kwargs, **k: (made.append(kwargs), make(self, kwargs, **k))[1],
+        TDPGExperimentManager, "_make_env", lambda self, kwargs, **k: (made.append(kwargs), make(self, kwargs, **k))[1]
     )
-    arguments = [
-        "train",
-        "--env",
-        "Lava-v0",
-        "--block",
-        "Lava-v0-logdet-table",
-        "-n",
-        "100",
-        "-params",
-        "n_episodes:20",
-    ]
+    arguments = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet-table", "-n", "100"]
+    arguments += ["-params", "n_episodes:20"]
     assert main(arguments) == 0
     assert all(kwargs["lava_stage_cost"] == 3.0 for kwargs in made)
     made.clear()
@@ -192,31 +195,47 @@ def test_the_evaluation_has_the_keywords_of_the_block(here, monkeypatch):
 
 
 BAD = {
-    "algorithm": (["--algo", "foo", "--env", "Lava-v0"], "invalid choice: 'foo'"),
-    "flag": (["--env", "Lava-v0", "--betas", "3"], "unrecognized arguments: --betas 3"),
     "environment": (["--env", "Lava-v9"], "Lava-v9 not found .* Lava-v0"),
     "key": ([*LAVA, "-params", "foo:3"], "foo, which is neither an argument of TDPG .* nor a key of rl-zoo3"),
-    "number as text": (["--env", "Lava-v0", "--conf-file", "text.yml"], "learning_rate: 1e-3.*write 1.0e-3"),
-    "no such file": (["--env", "Lava-v0", "--conf-file", "none.yml"], "none.yml cannot be read: .*No such file"),
-    "no YAML": (["--env", "Lava-v0", "--conf-file", "broken.yml"], "broken.yml cannot be read"),
-    "no such block": (["--env", "Acrobot-v1"], "no block 'Acrobot-v1' for tdpg: give --block"),
+    "number as text": (["--env", "Lava-v0", "--conf-file", "text.yml"], "learning_rate: 1e-3.*write 0.001"),
+    "no such file": (["--env", "Lava-v0", "--conf-file", "none.yml"], "none.yml has no readable block .*No such file"),
+    "no YAML": (["--env", "Lava-v0", "--conf-file", "broken.yml"], "broken.yml has no readable block .*while parsing"),
+    "no such block": (
+        ["--env", "Acrobot-v1"],
+        "no readable block 'Acrobot-v1' for tdpg .* with --block",
+    ),
     "keyword": (["--env", "Lava-v0", "--env-kwargs", "bar:1"], "cannot be made with env_kwargs={'bar': 1}"),
-    "unquoted text": (["--env", "Lava-v0", "--env-kwargs", "a:violet"], "a:violet must be .* a:\"'violet'\""),
+    "unquoted text": (
+        ["--env", "Lava-v0", "--env-kwargs", "a:violet"],
+        "'violet' is not defined: .* text in quotes",
+    ),
     "setting": ([*LAVA, "-params", "n_episodes:0"], "n_episodes=0 must be an integer of at least 1"),
     "agent": ([*LAVA, "-i", "none.zip"], "must be a valid path"),
-    "resume": (["--resume", "nothing"], "nothing is no folder of a training"),
+    "resume": (["--resume", "nothing"], "nothing is not the folder of a training"),
 }
 
 
 @pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
-def test_bad_input_is_told_in_a_line_and_leaves_nothing(arguments, message, here, capfd):
+def test_bad_input_is_reported_in_one_line_and_leaves_nothing(arguments, message, here, capfd):
     (here / "text.yml").write_text("Lava-v0: {policy: TRVPolicy, n_timesteps: 100, learning_rate: 1e-3}\n")
     (here / "broken.yml").write_text("Lava-v0: {policy\n")
     assert main(["train", *arguments]) == 2
     error = capfd.readouterr().err
     assert "Traceback" not in error
     assert re.search(message, error), error
-    assert len([line for line in error.splitlines() if line.startswith(("error:", "usage:"))]) == 1
+    assert len([line for line in error.splitlines() if line.startswith("error:")]) == 1
+    assert not list(here.glob("logs/*/*"))
+
+
+@pytest.mark.parametrize("flags, message", [
+    (["--betas", "3"], "unrecognized arguments: --betas 3"),
+    (["--algo", "foo"], "argument --algo: invalid choice: 'foo'"),
+], ids=["unknown", "choice"])  # fmt: skip
+def test_flags_that_the_zoo_does_not_know_are_refused_by_its_parser(flags, message, here, capfd):
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--env", "Lava-v0", *flags])
+    assert stop.value.code == 2
+    assert capfd.readouterr().err.splitlines()[-1].startswith(f"sb3-tdpg train: error: {message}")
     assert not list(here.glob("logs/*/*"))
 
 
@@ -278,7 +297,7 @@ def test_a_training_is_continued_from_a_model_with_other_settings(here):
     )
 
 
-def test_a_file_or_a_package_of_ones_own_and_a_policy_by_its_path(here, monkeypatch):
+def test_blocks_from_a_python_file_or_package_and_a_policy_by_its_path(here, monkeypatch):
     block = "policy='sb3_tdpg.policies.TRVPolicy', n_timesteps=200, n_episodes=20, mi_estimator='logdet', beta=1.0"
     (here / "my_settings.py").write_text(f"hyperparams = {{'Lava-v0': dict({block})}}\n")
     monkeypatch.syspath_prepend(str(here))
@@ -294,3 +313,11 @@ def test_help_lists_our_flags_and_the_zoos(capsys):
         assert stop.value.code == 0
         text = capsys.readouterr().out
         assert flag in text and ("--n-timesteps" in text or "--exp-folder" in text)
+
+
+def test_a_training_that_a_callback_ends_early_is_finished(here):
+    """A callback that ends a training is not an interrupt."""
+    stop = "callback:[{'stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes':{'max_episodes':1}}]"
+    assert main(["train", *LAVA, "-params", "n_episodes:20", stop, "-n", "20000"]) == 0
+    assert TDPG.load(folder_of(here) / "Lava-v0.zip", device="cpu").num_timesteps < 20_000
+    assert not (folder_of(here) / "checkpoint.zip").exists()

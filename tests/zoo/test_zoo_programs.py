@@ -1,7 +1,4 @@
-"""
-What rl-zoo3's own tests try with its algorithms, tried with TDPG: those of test_train, test_enjoy, test_callbacks,
-test_wrappers and test_hyperparams_opt that a third-party algorithm can take and that test_zoo and test_tuning have not.
-"""
+"""The tests of rl-zoo3 2.9 for its own algorithms, repeated with TDPG where a third-party algorithm can take them."""
 
 import os
 import subprocess
@@ -43,7 +40,7 @@ def test_train_does_not_load_what_only_other_programs_need():
     assert not {"pandas", "requests"} & (ours - theirs)
 
 
-def test_the_keywords_of_the_environments_are_those_of_the_command(here, monkeypatch):  # noqa: F811
+def test_environments_get_the_keywords_of_the_command_line(here, monkeypatch):  # noqa: F811
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     gravities = {}
@@ -60,7 +57,7 @@ def test_the_keywords_of_the_environments_are_those_of_the_command(here, monkeyp
     assert gravities == dict(training=8.0, evaluation=5.0)
 
 
-def test_the_monitor_keeps_what_the_block_asks_for(here):  # noqa: F811
+def test_the_monitor_writes_the_keywords_of_the_block(here):  # noqa: F811
     keywords = "monitor_kwargs:dict(info_keywords=('TimeLimit.truncated',))"
     command = ["train", "--env", "Pendulum-v1", "-n", "400", "-params", "n_episodes:2", "batch_size:2", keywords]
     assert main([*command, *NO_EVALUATION]) == 0
@@ -133,7 +130,7 @@ def test_enjoy_takes_the_best_model_and_the_checkpoints(here, capsys):  # noqa: 
 
 @pytest.mark.slow
 def test_the_zoos_benchmark_evaluates_tdpg(here):  # noqa: F811
-    """It runs enjoy.py of the folder that it is started in, here the script of a third-party algorithm."""
+    """The benchmark runs enjoy.py of its working directory, here the script of a third-party algorithm."""
     assert main(["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "-n", "100", "-params", "n_episodes:20",
                  *NO_EVALUATION]) == 0  # fmt: skip
     assert get_trained_models("logs") == {"tdpg-Lava-v0": ("tdpg", "Lava-v0")}
