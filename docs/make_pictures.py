@@ -3,10 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from PIL import Image
 
-from sb3_tdpg.certificates.lava import certificate_figure
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.ball_view import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
@@ -14,7 +12,6 @@ from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
-from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.robustness import perturbation_gallery
 
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
@@ -152,12 +149,6 @@ def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
         picture.convert("RGB").save(path, optimize=True)
 
 
-def certificate(folder: Path) -> None:
-    """The figure of ``sb3-tdpg certify``, from the numbers that it has left."""
-    frames = (pd.read_csv(folder / name) for name in ("random.csv.xz", "paper.csv"))
-    save_figure(certificate_figure(*frames, trivial=315.0), folder / "certificate.png")
-
-
 if __name__ == "__main__":
     folder = Path(__file__).parent / "environments"
     lava(folder / "lava.gif")
@@ -170,4 +161,3 @@ if __name__ == "__main__":
     guide = Path(__file__).parent / "guide"
     perturbations(guide / "perturbations_ball.png", "BallCatch-v0", renderer="fast")
     perturbations(guide / "perturbations_grasp.png", "PandaGrasp-v0")
-    certificate(guide.parent / "results" / "certificate")
