@@ -86,7 +86,7 @@ def ball_catch(path: Path) -> None:
         scene = Image.fromarray(picture[:, :512]).resize((320, 160), Image.Resampling.LANCZOS)
         seen = Image.fromarray(observation).resize((160, 160), Image.Resampling.NEAREST)
         frames.append(Image.fromarray(side_by_side([np.array(scene), np.array(seen)])))
-    # One palette for all frames, because a palette per frame flickers. Extra patches keep the colours of the small parts.
+    # One palette for all frames, because a palette per frame flickers. Extra patches keep the colours of small parts.
     rare = np.array([(0, 120, 0), (0, 155, 0), (0, 190, 0), (10, 30, 80), (15, 60, 130), (35, 35, 40)], np.uint8)
     patches = rare[None].repeat(81, axis=1)[:, : frames[0].width].repeat(600, axis=0)
     palette = Image.fromarray(np.concatenate([*frames[::6], patches])).quantize(64)
