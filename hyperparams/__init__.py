@@ -19,5 +19,5 @@ def load_hyperparams(block: str, algo: str = "tdpg") -> dict[str, Any]:
     """
     blocks = yaml.safe_load(resources.files(__name__).joinpath(f"{algo}.yml").read_text(encoding="utf-8"))
     if block not in blocks:
-        raise KeyError(f"{algo}.yml has no block {block!r}; available: {sorted(blocks)}")
+        raise KeyError(f"{algo}.yml has no block {block!r}; it has {sorted(blocks)}")
     return blocks[block]
