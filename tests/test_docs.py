@@ -1,5 +1,5 @@
 """
-The Python of the README, of the documentation and of its notebooks runs; what the map of the paper names is there.
+The Python of the README, the documentation and its notebooks runs; everything that the map of the paper names exists.
 """
 
 import importlib
@@ -236,7 +236,7 @@ def test_numbers_of_the_paper_that_the_code_cites_are_in_the_map():
 
 @pytest.mark.parametrize("folder", ["sb3_tdpg", "envs", "docs", "tests"])
 def test_no_latex_label_of_the_paper_is_cited(folder):
-    # No reader of the PDF can see a label.
+    # Readers of the PDF cannot see the labels.
     paths = [
         path for ending in ("py", "md") for path in (ROOT / folder).rglob(f"*.{ending}") if "_build" not in path.parts
     ]
