@@ -1,8 +1,8 @@
 """
 Draw the pictures of the results pages again from the published records: ``python docs/make_result_pictures.py``.
 
-The records in ``docs/results/`` call the ablation without the penalty "its control"; the pictures and pages use the
-longer name. ``training.png`` needs the training logs, which are not published, and is not drawn here.
+The records in ``docs/results/`` call the ablation without the penalty "its control". The pictures and pages call it
+"TDPG without the penalty". ``training.png`` needs the training logs, which are not published, and is not drawn here.
 """
 
 from itertools import cycle
@@ -28,8 +28,8 @@ RESULTS = Path(__file__).parent / "results"
 BENCHMARK_MI = Path(__file__).parents[1] / "tests" / "benchmarks" / "benchmark_mi"
 
 ABLATIONS = {
-    "its control": "ablation without the penalty",
-    "control, plain images": "ablation without the penalty, plain images",
+    "its control": "TDPG without the penalty",
+    "control, plain images": "TDPG without the penalty, plain images",
 }
 # Method in the records of ball catching -> name among the baselines, as in the table of results/baselines.md.
 RECORDED_BALL = {
