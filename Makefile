@@ -41,12 +41,8 @@ lint: $(STAMP) ## check style and format
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 
-# mypy does not see that the package extends __path__, so it is given the tree that a wheel has.
-TYPES := build/types
 type: $(STAMP) ## check the types
-	@rm -rf $(TYPES) && mkdir -p $(TYPES)/sb3_tdpg
-	@ln -s $(CURDIR)/sb3_tdpg/* $(CURDIR)/envs $(CURDIR)/hyperparams $(TYPES)/sb3_tdpg
-	cd $(TYPES) && $(abspath $(PY)) -m mypy --config-file $(CURDIR)/setup.cfg --cache-dir $(CURDIR)/.mypy_cache -p sb3_tdpg
+	$(PY) tests/check_types.py
 
 format: $(STAMP) ## mend style and format in place
 	$(PY) -m ruff check --fix .

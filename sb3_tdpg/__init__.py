@@ -4,8 +4,8 @@ import importlib.util
 import sys
 from pathlib import Path
 
-# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. When the checkout itself comes first
-# on sys.path (it is the working directory, or on PYTHONPATH), no finder knows that they are part of this package.
+# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. When the checkout itself is on
+# sys.path (as the working directory, or by PYTHONPATH), no finder knows that they are part of this package.
 _package = Path(__file__).resolve().parent
 for _name in ("envs", "hyperparams"):
     _init = _package.parent / _name / "__init__.py"

@@ -1,5 +1,5 @@
 """
-Baselines: what is subtracted from the costs before they weight the log-probabilities.
+Advantages: costs minus a baseline, which weight the log-probabilities in the policy gradient.
 
 Dimension key: T horizon, N episodes, X state, F features.
 """
@@ -12,10 +12,10 @@ from collections.abc import Callable
 import torch as th
 
 from sb3_tdpg.losses import cost_to_go
-from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
+from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON
 
 N_CENTRES = 20
-# Of a regression that all time steps share: it has more samples, from states that are further apart.
+# For a regression that all time steps share: it has more samples, and they are further apart.
 N_SHARED_CENTRES = 100
 
 AdvantageFunction = Callable[..., th.Tensor]
@@ -26,7 +26,7 @@ def episode_mean_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Subtract the batch's mean from the cost of the whole episode, as the paper does.
+    Subtract the batch mean from the cost of the whole episode, as in the paper.
 
     :param costs: ``(T, N)``
     :param states: ``(T, N, X)``, unused
@@ -43,23 +43,22 @@ def value_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Estimate advantages (Schulman et al., 2016) with a value V_t(x_t) of the true state, one regression per time step.
+    Estimate advantages (GAE, Schulman et al., 2016) with a value V_t(x_t) of the true state, one regression per step.
 
-    Beyond a horizon of 50, where the policy's steps share their weights by default, all time steps share one
-    regression, on the state and on what is left of the horizon: a few long episodes have many samples, but few for
-    each step.
+    Beyond a horizon of 50 all time steps share one regression on the state and the remaining horizon: a few long
+    episodes have many samples, but few at each step.
 
-    With ``gae_lambda=1`` this is the cost to come less its regression on the state. The true state is known in training
-    only, and only the baseline sees it: the gradient stays unbiased, since x_t precedes the noise of step t. Each half
-    of the episodes is predicted from the other half, so that no episode's own cost enters its baseline. A smaller
-    ``gae_lambda`` replaces later costs by V, which removes their noise; V knows nothing of the policy's memory, so that
-    what the TRVs carry from step to step is then credited less than it should be.
+    With ``gae_lambda=1`` this is the cost-to-go minus its regression on the state. Only the baseline uses the true
+    state, and x_t precedes the noise of step t, so that the gradient stays unbiased. Each half of the episodes is
+    predicted from the other half: no episode's own cost enters its baseline. A smaller ``gae_lambda`` replaces later
+    costs by V, which has less noise but ignores the policy's memory: it credits the TRVs too little for what they carry
+    from step to step.
 
     :param costs: ``(T, N)``
     :param states: x_t, ``(T, N, X)``
     :param alive: ``(T, N)``
     :param gamma: discount
-    :param gae_lambda: 1: costs as they were; 0: the next state's value instead of all later costs
+    :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
     :return: ``(T, N)``
     """
     targets = cost_to_go(costs, gamma)
@@ -74,11 +73,11 @@ def value_advantages(
 
 
 def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold: th.Tensor, gamma: float) -> th.Tensor:
-    """Regress on the state and on how much of the horizon is left, for all time steps at once: ``(T, N)``."""
-    # With a discount it tells only the last steps apart.
+    """Regress on the state and the remaining horizon, for all time steps at once: ``(T, N)``."""
+    # With a discount this distinguishes only the last steps.
     to_go = cost_to_go(th.ones_like(targets), gamma) / len(targets)
     living = alive.flatten().nonzero()[:, 0]
-    # In an order without a period, since every so many samples one is taken for a centre.
+    # An order without a period, because the centres are taken at regular intervals.
     golden = (math.sqrt(5) - 1) / 2
     order = living[th.argsort(th.arange(len(living), dtype=th.float64, device=living.device) * golden % 1)]
     inputs = th.cat([states, to_go[..., None]], dim=-1)
@@ -91,7 +90,7 @@ def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold
 
 
 def _held_out_predictions(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, fold: th.Tensor) -> th.Tensor:
-    """Predict each of two folds from the other one: ``(T, N)``."""
+    """Predict each of two folds from the other: ``(T, N)``."""
     predictions = th.zeros_like(targets)
     for held_out in (0, 1):
         predictions += (fold == held_out) * weight * _ridge(features, targets, weight * (fold != held_out))
@@ -99,7 +98,7 @@ def _held_out_predictions(features: th.Tensor, targets: th.Tensor, weight: th.Te
 
 
 def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: float = 0.5) -> th.Tensor:
-    """Fit a weighted ridge regression with a free intercept at each time step; return its predictions ``(T, N)``."""
+    """Predict by a weighted ridge regression with an intercept at each time step: ``(T, N)``."""
     total = weight.sum(1, keepdim=True).clamp(min=1.0)  # (T, 1)
     mean = (weight * targets).sum(1, keepdim=True) / total
     feature_mean = (weight[..., None] * features).sum(1, keepdim=True) / total[..., None]
@@ -108,7 +107,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
     gram = weighted.mT @ x + penalty * th.eye(x.shape[-1], dtype=x.dtype, device=x.device)
     coefficients = th.linalg.solve(gram, weighted.mT @ (targets - mean)[..., None])
     prediction = mean + (x @ coefficients)[..., 0]
-    # A few far-off states (one robot not in the lava, say) must not be extrapolated to.
+    # Do not extrapolate to outliers (the only robot outside the lava, say).
     seen = weight > 0
     low = targets.masked_fill(~seen, math.inf).amin(dim=1, keepdim=True)
     high = targets.masked_fill(~seen, -math.inf).amax(dim=1, keepdim=True)
@@ -116,7 +115,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
 
 
 def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENTRES) -> th.Tensor:
-    """Standardised state, its squares and Gaussian bumps centred on states of the batch, for each time step."""
+    """Compute features of each time step: standardised state, its squares, Gaussian bumps at states of the batch."""
     weight = alive[..., None]
     total = weight.sum(1, keepdim=True).clamp(min=1.0)
     mean = (weight * states).sum(1, keepdim=True) / total

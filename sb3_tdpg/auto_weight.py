@@ -1,4 +1,4 @@
-"""The weight of the information that keeps the expected cost at a limit: ``beta="auto"``."""
+"""Dual ascent on the weight of the information: ``beta="auto"``."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ import math
 
 class AutoWeight:
     """
-    Dual ascent on the weight w of "minimise the information, subject to an expected cost of at most C".
+    Adapt the weight w of "minimise the information subject to E[cost] <= C" by dual ascent.
 
-    The weight is 0 until the cost first meets the limit: before that there is nothing to trade. It starts where the
-    penalty is as large as the limit. From then on it grows while the cost is below the limit and shrinks while it is
-    above, as SAC's ``ent_coef="auto"`` does for the entropy:
+    The weight is 0 until the cost first meets the limit. It then starts where the penalty equals the limit, grows while
+    the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"`` does for the entropy:
 
         log w += rate * clip((C - cost) / abs(C), -2, 1)
 
     :param cost_limit: C
-    :param rate: Change of log w for an epoch whose cost is abs(C) below the limit, the largest there is.
-    :param max_growth: The weight stops at this multiple of its start: where the limit can be kept without any
-        information, nothing else would hold it.
+    :param rate: Largest increase of log w per epoch, reached at a cost of abs(C) below the limit.
+    :param max_growth: Largest multiple of the starting weight. Without it the weight would grow forever where the task
+        needs no information.
     """
 
     def __init__(self, cost_limit: float, rate: float = 0.3, max_growth: float = 1000.0) -> None:
@@ -31,10 +30,10 @@ class AutoWeight:
 
     def update(self, cost: float, information: float) -> None:
         """
-        Move the weight after an epoch.
+        Update the weight after an epoch.
 
-        :param cost: Expected cost of its episodes.
-        :param information: Of its TRVs, in nats, summed over time.
+        :param cost: Mean cost of the epoch's episodes.
+        :param information: Estimated information in nats, summed over time.
         """
         scale = abs(self.cost_limit)
         if self.value > 0.0:

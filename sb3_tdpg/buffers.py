@@ -29,26 +29,26 @@ class EpisodeBatch(NamedTuple):
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
 
     def select(self, episodes: th.Tensor | slice) -> EpisodeBatch:
-        """Only some episodes, by their columns."""
+        """Select episodes by their columns."""
         return EpisodeBatch(*(x[:, episodes] for x in self))
 
     def information_batch(self) -> InformationBatch:
-        """What the mutual-information estimators see, detached."""
+        """Return what the mutual-information estimators use, detached."""
         alive = None if bool(self.alive.all()) else self.alive.bool()
         return InformationBatch(self.states, self.trvs, self.means, self.stds, alive)
 
 
 class EpisodeBuffer(RolloutBuffer):
     """
-    A rollout buffer of ``(T, N, ...)`` arrays: time step by episode, where SB3's is time step by environment.
+    A rollout buffer of ``(T, N, ...)`` arrays: time step by episode instead of SB3's time step by environment.
 
-    ``buffer_size`` is the horizon T and ``n_envs`` the number of episodes N, however many environments produce them. An
-    episode that ends early leaves zeros behind it, and ``alive`` tells them apart.
+    ``buffer_size`` is the horizon T and ``n_envs`` the number of episodes N, whatever the number of environments. After
+    the end of a short episode the arrays hold zeros, and ``alive`` is 0 there.
 
     :param state_dim: X
     :param trv_dim: Z
-    :param args: as SB3's :class:`~stable_baselines3.common.buffers.RolloutBuffer`
-    :param kwargs: likewise
+    :param args: See :class:`~stable_baselines3.common.buffers.RolloutBuffer`.
+    :param kwargs: Likewise.
     """
 
     def __init__(self, *args: Any, state_dim: int, trv_dim: int, **kwargs: Any) -> None:
@@ -57,7 +57,7 @@ class EpisodeBuffer(RolloutBuffer):
         super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
-        """Forget the last epoch."""
+        """Clear the buffer."""
         shape = (self.buffer_size, self.n_envs)
         assert self.observation_space.dtype is not None
         self.observations = np.zeros((*shape, *self.obs_shape), self.observation_space.dtype)

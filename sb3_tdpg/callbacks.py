@@ -1,11 +1,11 @@
-"""Callbacks: fit the critics each epoch, select a policy, write checkpoints, show progress."""
+"""Callbacks that fit the critics each epoch, select a policy, write checkpoints and show progress."""
 
 from __future__ import annotations
 
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast
+from typing import ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -14,24 +14,22 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_tdpg.common.files import write_atomically
-
-if TYPE_CHECKING:
-    from sb3_tdpg.tdpg import TDPG
+from sb3_tdpg.episodic import EpisodicAlgorithm
 
 
 class TDPGCallback(BaseCallback):
-    """A callback that knows that its model is a :class:`TDPG`."""
+    """A callback for :class:`~sb3_tdpg.TDPG`."""
 
     def init_callback(self, model: BaseAlgorithm) -> None:
-        """Refuse other algorithms before they begin."""
-        if not hasattr(model, "mi_coef"):
-            raise ValueError(f"{type(self).__name__} is for TDPG, and the model is of {type(model).__name__}")
+        """Refuse other algorithms before they start."""
+        if not isinstance(model, EpisodicAlgorithm):
+            raise ValueError(f"{type(self).__name__} is for TDPG, but the model is a {type(model).__name__}")
         super().init_callback(model)
 
     @property
-    def tdpg(self) -> TDPG:
+    def tdpg(self) -> EpisodicAlgorithm:
         """The model."""
-        return cast("TDPG", self.model)
+        return cast(EpisodicAlgorithm, self.model)
 
     def _on_step(self) -> bool:
         return True
@@ -39,19 +37,22 @@ class TDPGCallback(BaseCallback):
 
 class MINECallback(TDPGCallback):
     """
-    Fit the mutual-information critics to an epoch's rollouts (lines 3 to 5 of Algorithm 2).
+    Fit the mutual-information critics to the rollouts of each epoch (lines 3 to 5 of Algorithm 2).
 
-    :class:`TDPG` installs it by itself, before the callbacks of the user, so that those find ``model.information``
-    up to date; one that is in the user's list takes its place. It does nothing in an epoch without a penalty
-    (``beta = inf``): no critic is trained for plain policy gradient.
+    :class:`~sb3_tdpg.TDPG` adds this callback before the user's callbacks, so that they see the current
+    ``model.information``; a MINECallback in the user's list replaces it. Without a penalty (``beta = inf``) it does
+    nothing: plain policy gradient trains no critic.
     """
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
-        if model.mi_coef == 0.0 and model.auto_weight is None:
+        if not model.needs_information:
             model.information = None
             return
-        diagnostics, information = self._fit()
+        batch = model.rollout_buffer.episode_batch().information_batch()
+        diagnostics = model.estimator.fit(batch)
+        with th.no_grad():
+            information = model.estimator(batch).cpu().numpy()  # (T,), nats
         model.information = information
         self.logger.record("mi/total", float(information.sum()))
         for name, value in diagnostics.items():
@@ -59,17 +60,9 @@ class MINECallback(TDPGCallback):
         for t, value in enumerate(information):
             self.logger.record(f"mi/t{t:02d}", float(value), exclude=("stdout", "log", "json", "csv"))
 
-    def _fit(self) -> tuple[dict[str, float], np.ndarray]:
-        """Fit the critics; return their diagnostics, and I[x_t; x~_t] in nats ``(T,)``."""
-        model = self.tdpg
-        batch = model.rollout_buffer.episode_batch().information_batch()
-        diagnostics = model.estimator.fit(batch)
-        with th.no_grad():
-            return diagnostics, model.estimator(batch).cpu().numpy()
-
 
 class Candidate(NamedTuple):
-    """The policy of one epoch, measured on the rollouts that it made itself."""
+    """The policy of one epoch, measured on its own rollouts."""
 
     epoch: int
     cost: float  # empirical expected cost
@@ -80,18 +73,17 @@ class SelectionCallback(TDPGCallback):
     """
     Keep the policy of the best epoch.
 
-    With ``cost_limit`` alone this is the paper's rule: the lowest information among the epochs whose empirical expected
-    cost is below the limit. With ``mi_limit`` it is the other way about: the lowest cost among the epochs whose
-    information is below ``mi_limit`` (and whose cost is below ``cost_limit``, if that is given, too). Where many
-    epochs reach an information of about 0, the paper's rule picks any of them, and the second rule the best.
+    With ``cost_limit`` alone this is the paper's rule: the lowest information among the epochs whose mean cost is below
+    the limit. With ``mi_limit`` it is the lowest cost among the epochs whose information is below ``mi_limit`` (and
+    whose cost is below ``cost_limit``, if given). Where many epochs reach about 0 nats, the paper's rule picks one of
+    them arbitrarily, and the second rule picks the cheapest.
 
-    The policy is kept in memory; :meth:`restore` puts it back into the model. With ``save_path`` it is also written
-    there whenever a better one is found, so that an interrupted training leaves it behind, and a resumed one goes on
-    from it.
+    The policy is kept in memory; :meth:`restore` puts it back into the model. With ``save_path`` each better policy is
+    also saved, so that it survives an interrupted training and a resumed training starts from it.
 
     :param cost_limit: Upper limit on the expected cost.
     :param mi_limit: Upper limit on the information in nats, summed over time.
-    :param save_path: Where to save the selected model (``.zip``); a ``.json`` beside it tells epoch, cost, information.
+    :param save_path: File of the selected model (``.zip``); a ``.json`` beside it has its epoch, cost and information.
     :param verbose: 1: print every new best epoch.
     :raises ValueError: if neither limit is given, or one is NaN or negative.
     """
@@ -106,7 +98,8 @@ class SelectionCallback(TDPGCallback):
         super().__init__(verbose)
         if cost_limit is None and mi_limit is None:
             raise ValueError(
-                "give cost_limit (lowest information under a cost), mi_limit (lowest cost under it) or both"
+                "give cost_limit (selects the lowest information below that cost), mi_limit (the lowest cost below "
+                "that information), or both"
             )
         for name, limit in (("cost_limit", cost_limit), ("mi_limit", mi_limit)):
             if limit is not None and np.isnan(limit):
@@ -121,18 +114,18 @@ class SelectionCallback(TDPGCallback):
 
     @property
     def criterion(self) -> Literal["lowest information", "lowest cost"]:
-        """What is minimised."""
+        """The quantity that the selection minimises."""
         return "lowest information" if self.mi_limit is None else "lowest cost"
 
     def _init_callback(self) -> None:
         resumes = self.model.num_timesteps > 0
-        # The record is written last; without it, that very epoch is run again.
+        # The record is written last; if it is missing, that epoch is run again.
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
             record = json.loads(_record_path(self.save_path).read_text())
             self.best = Candidate(record["epoch"], record["cost"], record["information"])
-            # Not the whole model: loading that seeds all random number generators.
+            # Loading the whole model would seed all random number generators.
             _, parameters, _ = load_from_zip_file(self.save_path, device=self.model.device, load_data=False)
             self._best_policy = cast("dict[str, th.Tensor]", parameters["policy"])
         elif not resumes:
@@ -163,11 +156,11 @@ class SelectionCallback(TDPGCallback):
             return (candidate.information, candidate.cost) < (best.information, best.cost)
         return candidate.cost < best.cost
 
-    def restore(self, model: TDPG) -> Candidate:
+    def restore(self, model: EpisodicAlgorithm) -> Candidate:
         """
         Put the selected policy into the model.
 
-        :return: when it was found, and what it measured
+        :return: its epoch, cost and information
         :raises ValueError: if no epoch met the limits.
         """
         if self.best is None or self._best_policy is None:
@@ -177,7 +170,7 @@ class SelectionCallback(TDPGCallback):
                 if limit is not None
             )
             raise ValueError(
-                f"no epoch met the limits ({limits}): train longer or loosen them; the last policy is kept"
+                f"no epoch met the limits ({limits}): train longer or loosen them; the model keeps its last policy"
             )
         model.policy.load_state_dict(self._best_policy)
         return self.best
@@ -185,20 +178,20 @@ class SelectionCallback(TDPGCallback):
 
 class TrainingCheckpointCallback(TDPGCallback):
     """
-    Write a file from which a killed training goes on exactly as if it had not been killed.
+    Write a file from which a killed training continues exactly as if it had not been killed.
 
-    Every ``save_freq`` epochs, before the epoch's rollouts, the model is saved with the state of all random number
-    generators, and the environments are reset: the reset makes the generators' state all there is to know of the
-    environments. The file is replaced atomically, so that there is always a whole one. To go on::
+    Every ``save_freq`` epochs, before the rollouts, the model is saved with the state of all random number generators,
+    and the environments are reset, so that the generators are their whole state. An older file is replaced only when
+    the new one is complete. To continue::
 
         model = TDPG.load("checkpoint.zip", env=env)
         model.learn(model.remaining_timesteps, reset_num_timesteps=False, callback=TrainingCheckpointCallback(...))
 
-    Environments must draw their randomness from ``np_random``, as Gymnasium asks of them.
+    Environments must take their randomness from ``np_random``, as Gymnasium requires.
 
     :param save_path: The file.
-    :param save_freq: Epochs from one checkpoint to the next.
-    :param verbose: 1: print each.
+    :param save_freq: Epochs between checkpoints.
+    :param verbose: 1: print each checkpoint.
     """
 
     def __init__(self, save_path: str | os.PathLike[str], save_freq: int = 10, verbose: int = 0) -> None:
@@ -216,12 +209,12 @@ class TrainingCheckpointCallback(TDPGCallback):
 
 
 class TDPGProgressBar(ProgressBarCallback):
-    """SB3's progress bar, with the epoch's cost and information, and where episodes can succeed the failures."""
+    """SB3's progress bar with the epoch's cost and information, and the failures where episodes report success."""
 
     _open: ClassVar[TDPGProgressBar | None] = None
 
     def _on_training_start(self) -> None:
-        # A training that was interrupted has left its bar open, and rich shows only one at a time.
+        # An interrupted training leaves its bar open, and rich shows only one at a time.
         if TDPGProgressBar._open is not None:
             TDPGProgressBar._open.pbar.close()
         super()._on_training_start()
@@ -232,9 +225,9 @@ class TDPGProgressBar(ProgressBarCallback):
         TDPGProgressBar._open = None
 
     def _on_rollout_end(self) -> None:
-        model = cast("TDPG", self.model)
+        model = cast(EpisodicAlgorithm, self.model)
         shown = f"cost {model.rollout_buffer.episode_costs.mean():.2f}"
-        if successes := model.ep_success_buffer:  # of the last 100 episodes, unless stats_window_size is another
+        if successes := model.ep_success_buffer:  # of the last stats_window_size episodes
             shown += f", {1 - sum(successes) / len(successes):.0%} failures"
         if model.information is not None:
             shown += f", {model.information.sum():.2f} nat"
@@ -242,7 +235,7 @@ class TDPGProgressBar(ProgressBarCallback):
 
 
 def _zip_path(path: str | os.PathLike[str]) -> Path:
-    """Append ``.zip`` unless it is there; a dot in the name (``beta_0.013``) is no suffix."""
+    """Append ``.zip`` unless the path has it; a dot in the name (``beta_0.013``) does not count as a suffix."""
     path = Path(path)
     return path if path.suffix == ".zip" else path.with_name(path.name + ".zip")
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import os
+import pkgutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run a command.
 
-    :param arguments: What stands behind the program's name; default: ``sys.argv``.
+    :param arguments: The arguments after the program's name; default: ``sys.argv``.
     :return: exit code: 0 done, 2 bad input, 130 interrupted
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -27,18 +28,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command(**options)
     except KeyboardInterrupt:
-        # A command that has a folder for its results can be resumed.
+        # Commands with a results folder can be resumed.
         out = options.get("out")
-        advice = "" if out is None else f"; {out} keeps what is done, and the same command goes on from there"
+        advice = "" if out is None else f"; the results so far are in {out}, and the same command continues from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
-    except (ValueError, ImportError, OSError) as e:  # a missing extra; a folder that cannot be written to
+    except (ValueError, ImportError, OSError) as e:  # bad input, a missing extra, a folder that is not writable
         print(f"error: {e}", file=sys.stderr)
         return 2
     return 0
 
 
-# The commands import what they need when they run: torch takes seconds, and --help should not.
+# Commands import their modules when they run: importing torch takes seconds, and --help should not.
 
 
 def _demo(out: Path, **options: Any) -> None:
@@ -47,34 +48,44 @@ def _demo(out: Path, **options: Any) -> None:
     print(f"\n{demo(out, **options)}\n\nresults are in {out}")
 
 
-def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
-    from sb3_tdpg.paper.ball import reproduce_ball
-    from sb3_tdpg.paper.baselines import reproduce_baselines
-    from sb3_tdpg.paper.grasp import reproduce_grasp
-    from sb3_tdpg.paper.lava import reproduce_lava
+class Experiment(NamedTuple):
+    """
+    A command ``reproduce``.
 
+    :param function: Its name, below ``sb3_tdpg.paper``.
+    :param folder: Default folder for the results.
+    :param arguments: Fixed arguments of the function.
+    :param flags: Flags that not all experiments have.
+    """
+
+    function: str
+    folder: str
+    arguments: dict[str, str] = {}
+    flags: tuple[str, ...] = ()
+
+
+EXPERIMENTS = {
+    "lava": Experiment("lava:reproduce_lava", "lava_reproduction", flags=("n_paper_seeds",)),
+    "ball": Experiment("ball:reproduce_ball", "ball_catch", flags=("n_paper_seeds", "controls")),
+    "ball-varying": Experiment(
+        "ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("n_paper_seeds", "controls")
+    ),
+    "grasp": Experiment("grasp:reproduce_grasp", "panda_grasp"),
+    "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
+    "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_ball_seeds", "n_grasp_seeds")),
+}
+
+
+def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
+    chosen = EXPERIMENTS[experiment]
     given = {name: value for name, value in options.items() if value is not None}
-    if "controls" in given and not experiment.startswith("ball"):
-        raise ValueError(f"--no-controls is for ball and ball-varying: {experiment} does not do without any")
-    for name in ("n_ball_seeds", "n_grasp_seeds"):
-        if name in given and experiment != "baselines":
-            raise ValueError(f"--{name.replace('_', '-')} is for baselines: {experiment} has --n-seeds alone")
-    if "n_paper_seeds" in given and experiment == "baselines":
-        raise ValueError("--n-paper-seeds is for lava and ball: the baselines are not the paper's")
-    if experiment == "baselines":
-        out = out or Path("results/baselines")
-        text = reproduce_baselines(out, **given)
-    elif experiment == "lava":
-        out = out or Path("results/lava_reproduction")
-        text = reproduce_lava(out, **given)
-    elif experiment.startswith("grasp"):
-        if "n_paper_seeds" in given:
-            raise ValueError("--n-paper-seeds is for lava and ball: the paper's own settings of grasp are not trained")
-        out = out or Path("results", experiment.replace("-", "_").replace("grasp", "panda_grasp"))
-        text = reproduce_grasp(out, camera="varying" if experiment == "grasp-camera" else "fixed", **given)
-    else:
-        out = out or Path("results", experiment.replace("-", "_").replace("ball", "ball_catch"))
-        text = reproduce_ball(out, launch="varying" if experiment == "ball-varying" else "fixed", **given)
+    for name in ("controls", "n_paper_seeds", "n_ball_seeds", "n_grasp_seeds"):
+        if name in given and name not in chosen.flags:
+            flag = "--no-controls" if name == "controls" else f"--{name.replace('_', '-')}"
+            others = " and ".join(other for other in EXPERIMENTS if name in EXPERIMENTS[other].flags)
+            raise ValueError(f"{flag} is for {others}, not for {experiment}")
+    out = out or Path("results", chosen.folder)
+    text = pkgutil.resolve_name(f"sb3_tdpg.paper.{chosen.function}")(out, **chosen.arguments, **given)
     print(f"\n{text}\n\nresults are in {out}")
 
 
@@ -109,7 +120,7 @@ def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: P
 
     if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
-            f"certify knows the shifts of Lava-v0 only, and not of {env}: declare them in Python, see "
+            f"certify has declared shifts for Lava-v0 only, not for {env}: declare your own in Python, see "
             "sb3_tdpg.certificates.shifts.TrainingEpisodes"
         )
     print(f"\n{certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)}\n\nresults are in {out}")
@@ -123,7 +134,7 @@ def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Pat
     out = out or Path("results", f"report-{env.rpartition(':')[2]}")
     options["jobs"] = options["jobs"] or usable_cores()
     robustness_report(parse_models(models, env), env, env_kwargs=parse_keywords(env_kwargs), out=out, **options)
-    print(f"the page is {out / 'report.html'}, and {out / 'report.md'} in Markdown")
+    print(f"the report is {out / 'report.html'} (Markdown: {out / 'report.md'})")
 
 
 def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_episodes: int) -> None:
@@ -147,17 +158,17 @@ def _pull(repo_id: str, to: Path) -> None:
     print(f"{repo_id} is in {pull_from_hub(repo_id, to)}")
 
 
-# rl-zoo3's programs read their flags themselves.
+# rl-zoo3's programs parse their own flags.
 ZOO_PROGRAMS = {
     "train": "train an agent from a block of hyperparameters",
     "tune": "tune hyperparameters with Optuna",
-    "record-video": "record a trained agent as a film",
-    "plot": "plot what trainings have logged",
+    "record-video": "record a video of a trained agent",
+    "plot": "plot training logs",
 }
 
 
 def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
-    """Whether a program of rl-zoo3 is asked for; its ``enjoy`` is the one that is given no file."""
+    """Whether to call a program of rl-zoo3; its ``enjoy`` takes no file."""
     if not arguments:
         return False
     return arguments[0] in ZOO_PROGRAMS or (arguments[0] == "enjoy" and not any(a.endswith(".zip") for a in arguments))
@@ -179,152 +190,121 @@ def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="sb3-tdpg", description="Task-Driven Policy Gradient for Stable-Baselines3")
     commands = parser.add_subparsers(dest="command", required=True)
 
-    demo = commands.add_parser("demo", help="train PG and TDPG on the lava problem and compare them")
-    demo.add_argument("--out", type=Path, default=Path("results/lava"), help="folder for the results")
-    demo.add_argument("--reading", choices=("table", "text"), default="table", help="which reading of the problem")
-    demo.add_argument("--seed", type=int, default=0)
-    _add_sizes(demo)
+    def command(name: str, text: str) -> Callable[..., Any]:
+        return commands.add_parser(name, help=text).add_argument
 
-    reproduce = commands.add_parser("reproduce", help="reproduce an experiment of the paper with many seeds")
-    reproduce.add_argument("experiment", choices=("lava", "ball", "ball-varying", "grasp", "grasp-camera", "baselines"))
-    reproduce.add_argument(
-        "--out", type=Path, default=None, help="folder for the results (default: one in results/ for each experiment)"
-    )
-    reproduce.add_argument("--publish", type=Path, default=None, help="copy all but the runs to this folder")
-    reproduce.add_argument(
-        "--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, others 5)"
-    )
-    reproduce.add_argument(
-        "--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)"
-    )
-    reproduce.add_argument(
-        "--n-ball-seeds", type=int, help="baselines: training seeds on ball catching, 0: none; --n-seeds: on lava"
-    )
-    reproduce.add_argument(
-        "--n-grasp-seeds", type=int, help="baselines: training seeds on grasping, 0: none (default: 1)"
-    )
-    reproduce.add_argument(
+    add = command("demo", "train PG and TDPG on the lava problem and compare them")
+    add("--out", type=Path, default=Path("results/lava"), help="folder for the results")
+    add("--reading", choices=("table", "text"), default="table", help="cost definition: of the paper's table or text")
+    add("--seed", type=int, default=0)
+    _add_sizes(add)
+
+    add = command("reproduce", "reproduce an experiment of the paper with many seeds")
+    add("experiment", choices=tuple(EXPERIMENTS))
+    add("--out", type=Path, help="folder for the results (default: one in results/ for each experiment)")
+    add("--publish", type=Path, help="copy everything except the runs to this folder")
+    add("--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, others 5)")
+    add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)")
+    add("--n-ball-seeds", type=int, help="baselines: training seeds on ball catching (0: none); --n-seeds: on lava")
+    add("--n-grasp-seeds", type=int, help="baselines: training seeds on grasping (0: none; default: 1)")
+    add(
         "--no-controls", action="store_false", dest="controls", default=None,
-        help="ball: only PG and TDPG; without it, a later call adds the controls",
+        help="ball: train PG and TDPG without the ablations; a later call without this flag adds them",
     )  # fmt: skip
-    reproduce.add_argument("--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores)")
-    _add_sizes(reproduce)
+    _add_jobs(add)
+    _add_sizes(add)
 
     for program, text in ZOO_PROGRAMS.items():
         commands.add_parser(program, help=f"rl-zoo3: {text}", add_help=False)
 
-    enjoy = commands.add_parser(
-        "enjoy",
-        help="run a saved model, print what its episodes cost, record them as a film; without a file: rl-zoo3's, of a "
-        "model that train has left",
+    add = command(
+        "enjoy", "run a saved model, print the cost of its episodes, record a video; without a file: rl-zoo3's enjoy"
     )
-    enjoy.add_argument("model", type=Path, help="the .zip file that model.save() wrote")
-    enjoy.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
-    enjoy.add_argument(
-        "--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
-        help="keywords of the environment, the values in YAML: texture=violet_dots robot_range=[-1,1]",
+    add("model", type=Path, help="the .zip file from model.save()")
+    _add_env(add)
+    add("--seed", type=int, default=0)
+    add("--n-episodes", type=_positive, default=1)
+    _add_deterministic(add)
+    add("--record", type=Path, help="write a video to this file, .gif or .mp4")
+
+    add = command(
+        "sweep", "train with several betas and seeds, select by the paper's rule, plot cost against information"
+    )
+    add("--env", required=True, help="id of the environment, for instance Lava-v0")
+    add("--betas", nargs="+", required=True, metavar="BETA", help="1/25 1/50 0.01 inf ...")
+    add("--seeds", type=_positive, default=5, help="training seeds of each beta")
+    add("--cost-limit", type=float, help="of the selection (default: minus the environment's reward_threshold)")
+    add("--block", help="block of hyperparameters (default: that of the environment)")
+    _add_keywords(add, "--set", "replace settings of the block: mi_estimator=logdet", dest="settings")
+    add("--out", type=Path, help="folder for the results (default: results/sweep-<block>)")
+    add("--storage", metavar="URL", help="share the sweep with other workers: postgresql://... or FILE.log")
+    add("--study-name", help="name of the study in the storage (default: sweep-<block>)")
+    add("--grace-period", type=float, default=120.0, help="seconds without a heartbeat until a worker counts as dead")
+    _add_jobs(add)
+    _add_sizes(add)
+
+    add = command("certify", "compute upper bounds on the cost of lava policies under shifts of sensor and start")
+    add("models", nargs="+", type=Path, help="the .zip files from model.save()")
+    _add_env(add)
+    add("--random-shifts", type=_positive, default=0, dest="n_random_shifts", help="in addition to the paper's shifts")
+    add("--n-episodes", type=_positive, default=1_000_000, help="training episodes to record")
+    add("--n-test-episodes", type=_positive, default=2000, help="episodes per random shift")
+    add("--confidence", type=float, default=0.95)
+    add("--cost-bound", type=float, help="clip the cost at this value (default: the cost of standing at the wall)")
+    add("--seed", type=int, default=0)
+    add("--out", type=Path, default=Path("results/certificate"), help="folder for the results")
+
+    add = command("report", "run models under every perturbation, report which method is more robust, and where")
+    add(
+        "models", nargs="+", metavar="[LABEL=]MODEL",
+        help="files from model.save(), or patterns: 'PG=runs/pg-seed*/model.zip'. The default label is the name of the "
+        "file or folder without the seed. All methods are compared with the first",
     )  # fmt: skip
-    enjoy.add_argument("--seed", type=int, default=0)
-    enjoy.add_argument("--n-episodes", type=_positive, default=1)
-    enjoy.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
-    enjoy.add_argument("--record", type=Path, default=None, help="write a film there, .gif or .mp4")
-    _add_sweep(commands)
-    _add_certify(commands)
-    _add_report(commands)
-    _add_hub(commands)
+    _add_env(add)
+    add("--perturbations", nargs="+", metavar="NAME", help="default: all that apply to the observation")
+    add("--severities", nargs="+", type=int, default=(1, 2, 3, 4, 5), metavar="N", help="1 to 5")
+    add(
+        "--episodes", dest="n_episodes", type=_positive,
+        help="per model and row (default: 100 for images, 500 for vectors)",
+    )  # fmt: skip
+    add("--seed", type=int, default=0)
+    _add_deterministic(add)
+    add("--out", type=Path, help="folder for the report (default: results/report-<env>)")
+    _add_jobs(add)
+
+    add = command("push", "publish a trained model and its card on the Hugging Face Hub")
+    add("folder", type=Path, help="a folder of a run, of train, or with a model card")
+    add("--repo-id", required=True, metavar="ORG/NAME", help="by convention ORG/tdpg-<environment>")
+    add("--card", type=Path, help="folder for the card (default: FOLDER-hub)")
+    add("--dry-run", action="store_true", help="write the card but upload nothing")
+    add("--film-episodes", type=int, default=0, help="episodes in replay.mp4")
+
+    add = command("pull", "download a model and its card from the Hugging Face Hub")
+    add("repo_id", metavar="ORG/NAME")
+    add("--to", type=Path, required=True, help="folder for the model")
     return parser
 
 
-def _add_sweep(commands: Any) -> None:
-    sweep = commands.add_parser(
-        "sweep", help="train with several betas and seeds, select by the paper's rule, draw cost against information"
-    )
-    sweep.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
-    sweep.add_argument("--betas", nargs="+", required=True, metavar="BETA", help="1/25 1/50 0.01 inf ...")
-    sweep.add_argument("--seeds", type=_positive, default=5, help="training seeds of each beta")
-    sweep.add_argument("--cost-limit", type=float, default=None, help="for the selection (default: the environment's)")
-    sweep.add_argument("--block", default=None, help="block of hyperparameters (default: that of the environment)")
-    sweep.add_argument(
-        "--set", dest="settings", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
-        help="settings in place of the block's, the values in YAML: mi_estimator=logdet",
-    )  # fmt: skip
-    sweep.add_argument("--out", type=Path, default=None, help="folder for the results (default: results/sweep-<block>)")
-    sweep.add_argument(
-        "--storage", default=None, metavar="URL",
-        help="work at a sweep that others work at, too: postgresql://..., sqlite:///FILE or FILE.log",
-    )  # fmt: skip
-    sweep.add_argument("--study-name", default=None, help="its name there (default: sweep-<block>)")
-    sweep.add_argument(
-        "--grace-period", type=float, default=120.0, help="seconds of silence after which a worker counts as dead"
-    )
-    sweep.add_argument(
-        "--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores; with --storage 1)"
-    )
-    _add_sizes(sweep)
+def _add_env(add: Callable[..., Any]) -> None:
+    add("--env", required=True, help="id of the environment, for instance Lava-v0")
+    _add_keywords(add, "--env-kwargs", "keywords of the environment: texture=violet_dots robot_range=[-1,1]")
 
 
-def _add_certify(commands: Any) -> None:
-    certify = commands.add_parser("certify", help="bound what saved lava policies cost when sensor and start change")
-    certify.add_argument("models", nargs="+", type=Path, help="the .zip files that model.save() wrote")
-    certify.add_argument("--env", required=True, help="id of the environment: Lava-v0")
-    certify.add_argument(
-        "--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
-        help="keywords of the training environment, the values in YAML",
-    )  # fmt: skip
-    certify.add_argument(
-        "--random-shifts", type=_positive, default=0, dest="n_random_shifts", help="beside the paper's shifts"
-    )
-    certify.add_argument("--n-episodes", type=_positive, default=1_000_000, help="recorded training episodes")
-    certify.add_argument("--n-test-episodes", type=_positive, default=2000, help="episodes in each random shift")
-    certify.add_argument("--confidence", type=float, default=0.95)
-    certify.add_argument(
-        "--cost-bound", type=float, default=None, help="clip the cost there (default: that of standing at the wall)"
-    )
-    certify.add_argument("--seed", type=int, default=0)
-    certify.add_argument("--out", type=Path, default=Path("results/certificate"), help="folder for the results")
+def _add_keywords(add: Callable[..., Any], flag: str, text: str, **kwargs: Any) -> None:
+    add(flag, nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=f"{text} (values in YAML)", **kwargs)
 
 
-def _add_report(commands: Any) -> None:
-    report = commands.add_parser(
-        "report", help="run models under every perturbation, and write a page on which method is more robust, and where"
-    )
-    report.add_argument(
-        "models", nargs="+", metavar="[LABEL=]MODEL",
-        help="files that model.save() wrote, or patterns: 'PG=runs/pg-seed*/model.zip'; without a label a method is "
-        "called as its file or folder, less the seed. The others are compared with the first",
-    )  # fmt: skip
-    report.add_argument("--env", required=True, help="id of the environment, for instance Lava-v0")
-    report.add_argument(
-        "--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
-        help="keywords of the environment, the values in YAML",
-    )  # fmt: skip
-    report.add_argument("--perturbations", nargs="+", default=None, metavar="NAME", help="default: all that apply")
-    report.add_argument("--severities", nargs="+", type=int, default=(1, 2, 3, 4, 5), metavar="N", help="1 to 5")
-    report.add_argument(
-        "--episodes", dest="n_episodes", type=_positive, default=None,
-        help="of each model in each row (default: 100 with images, 500 with vectors)",
-    )  # fmt: skip
-    report.add_argument("--seed", type=int, default=0)
-    report.add_argument("--deterministic", action="store_true", help="act without noise: this is another policy")
-    report.add_argument("--out", type=Path, default=None, help="folder for the report (default: results/report-<env>)")
-    report.add_argument("--jobs", type=_positive, default=None, help="processes (default: the number of cores)")
+def _add_deterministic(add: Callable[..., Any]) -> None:
+    add("--deterministic", action="store_true", help="use means instead of samples: not the policy that was trained")
 
 
-def _add_hub(commands: Any) -> None:
-    push = commands.add_parser("push", help="publish a trained model and its card on the Hugging Face Hub")
-    push.add_argument("folder", type=Path, help="a run's folder, one that train has left, or one with a model card")
-    push.add_argument("--repo-id", required=True, metavar="ORG/NAME", help="by convention ORG/tdpg-<environment>")
-    push.add_argument("--card", type=Path, default=None, help="where the card is written (default: FOLDER-hub)")
-    push.add_argument("--dry-run", action="store_true", help="write the card, and upload nothing")
-    push.add_argument("--film-episodes", type=int, default=0, help="episodes to show in replay.mp4")
-    pull = commands.add_parser("pull", help="download a model and its card from the Hugging Face Hub")
-    pull.add_argument("repo_id", metavar="ORG/NAME")
-    pull.add_argument("--to", type=Path, required=True, help="folder for it")
+def _add_jobs(add: Callable[..., Any]) -> None:
+    add("--jobs", type=_positive, help="processes (default: the number of cores)")
 
 
-def _add_sizes(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--n-timesteps", type=_positive, default=None, help="environment steps of each training")
-    parser.add_argument("--n-eval-episodes", type=_positive, default=1000, help="episodes of each row of the table")
+def _add_sizes(add: Callable[..., Any]) -> None:
+    add("--n-timesteps", type=_positive, help="environment steps of each training")
+    add("--n-eval-episodes", type=_positive, default=1000, help="episodes of each row of the table")
 
 
 def _positive(text: str) -> int:

@@ -1,4 +1,4 @@
-"""Feature extractors that stand in front of the encoder, and the kinds of observations that choose between them."""
+"""The CNN in front of the encoder, and the kinds of observations that need it."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-MIN_SIDE = 12  # pixels: what the two convolutions for depth images need
+MIN_SIDE = 12  # pixels, the minimum for the two convolutions for depth images
 
 
 def observation_kind(space: spaces.Space | None, *, normalize_images: bool = True) -> str:
     """
-    Tell what is observed, on which the defaults depend.
+    Classify the observation; the defaults depend on it.
 
     :param space: The observation space.
-    :param normalize_images: Whether bytes are divided by 255; if not, an image may also come in floats in [0, 1].
-    :return: ``"image"``: bytes, channels first or last; ``"depth"``: a ``Box`` of floats, ``(1, H, W)`` with at least
+    :param normalize_images: Whether bytes are divided by 255; if not, images of floats in [0, 1] are accepted, too.
+    :return: ``"image"``: uint8, channels first or last; ``"depth"``: a ``Box`` of floats, ``(1, H, W)`` with at least
         12 pixels a side; ``"vector"``: anything else
     """
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
@@ -34,9 +34,9 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
 
 class TRVCnn(BaseFeaturesExtractor):
     """
-    The paper's convolutional layers: two of 6 channels, stride 2, ELU, then flattened.
+    The paper's two convolutional layers: 6 channels, stride 2, ELU, then flattened.
 
-    Images of floats (depth in m, say) are first brought from the bounds of their space to [-1, 1], if these are finite.
+    Images of floats (depth in m, say) are first scaled from the bounds of their space to [-1, 1], if these are finite.
 
     :param observation_space: An image space with channels first.
     :param kernel_sizes: Kernel of each of the two layers (4 and 4 for ball catching, 6 and 4 for grasping).
@@ -55,7 +55,7 @@ class TRVCnn(BaseFeaturesExtractor):
         for kernel_size in kernel_sizes:
             layers += [nn.Conv2d(channels, n_channels, kernel_size, stride=2), nn.ELU(inplace=True)]
             channels = n_channels
-        # With so few channels the convolutions are faster with the channels innermost in memory.
+        # With so few channels, convolutions are faster in the channels_last layout.
         self.cnn = nn.Sequential(*layers, nn.Flatten()).to(memory_format=th.channels_last)  # type: ignore[call-overload]
         with th.no_grad():
             self._features_dim = self.cnn(th.zeros(1, *observation_space.shape)).shape[1]

@@ -1,7 +1,7 @@
 """
 The loss of TDPG as pure functions, one per equation.
 
-Dimension key: T horizon, N episodes. ``alive`` is 1 while an episode lasts and 0 after its end.
+Dimension key: T horizon, N episodes. ``alive`` is 1 while an episode runs and 0 after its end.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import torch as th
 
 def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor) -> th.Tensor:
     """
-    Surrogate whose gradient is that of the expected cost (equation 12, and equation 13).
+    Return a surrogate whose gradient is that of the expected cost (Equations 12 and 13).
 
-    The paper multiplies every log-probability with the whole episode's cost. Any ``advantages[t]`` with the same
-    conditional expectation up to a function of what precedes the sample at t gives the same expected gradient: the cost
-    to come, less a baseline of the state.
+    The paper multiplies every log-probability with the cost of the whole episode. Subtracting anything that does not
+    depend on the sample at t (past costs, a baseline of the state) leaves the expected gradient unchanged.
 
     :param log_prob: log-probabilities at the *stored* samples, ``(T, N)``
     :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
@@ -30,39 +29,58 @@ def clipped_policy_loss(
     log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor, clip_range: float
 ) -> th.Tensor:
     """
-    PPO's surrogate (Schulman et al., 2017) for costs: the larger of the plain and of the clipped one.
+    Return PPO's surrogate (Schulman et al., 2017) for costs: the maximum of the plain and the clipped one.
 
-    At ``log_prob == old_log_prob`` its gradient is that of :func:`policy_gradient_loss`. It may be descended several
-    times on the same rollouts: a sample whose ratio has left ``[1 - clip_range, 1 + clip_range]`` in the direction of
-    its advantage has no gradient any more.
+    At ``log_prob == old_log_prob`` its gradient is that of :func:`policy_gradient_loss`. It allows several updates on
+    the same rollouts: a sample has no gradient once its ratio has left ``[1 - clip_range, 1 + clip_range]`` in the
+    direction of its advantage.
 
-    :param log_prob: of the policy that is being trained, ``(T, N)``
-    :param old_log_prob: of the policy that made the rollouts, ``(T, N)``
+    :param log_prob: of the current policy, ``(T, N)``
+    :param old_log_prob: of the rollout policy, ``(T, N)``
     :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
     :param alive: ``(T, N)``
-    :param clip_range: How far the ratio of the probabilities may go from 1.
+    :param clip_range: Largest change of the probability ratio.
     :return: scalar
     """
     shapes = {log_prob.shape, old_log_prob.shape, advantages.shape, alive.shape}
     assert len(shapes) == 1, shapes
-    # What is stored after the end of an episode is no sample of the policy: its ratio may overflow, and 0 * inf is NaN.
+    # After the end of an episode the ratio may overflow, and 0 * inf is NaN.
     ratio = th.exp(th.where(alive > 0, log_prob - old_log_prob.detach(), 0.0))
     clipped = ratio.clamp(1.0 - clip_range, 1.0 + clip_range)
     cost = advantages.detach()
     return (alive * th.maximum(cost * ratio, cost * clipped)).sum(dim=0).mean()
 
 
+def policy_distance(
+    log_prob: th.Tensor, old_log_prob: th.Tensor, alive: th.Tensor, clip_range: float
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Measure how far the policy has moved from that of the rollouts, as SB3's PPO does.
+
+    :param log_prob: ``(T, N)``
+    :param old_log_prob: ``(T, N)``
+    :param alive: ``(T, N)``
+    :param clip_range: See :func:`clipped_policy_loss`.
+    :return: approximate Kullback-Leibler divergence (http://joschu.net/blog/kl-approx.html), and the share of clipped
+        samples; scalars
+    """
+    log_ratio = th.where(alive > 0, log_prob - old_log_prob, 0.0)
+    n = alive.sum()
+    kl = (th.exp(log_ratio) - 1.0 - log_ratio).sum() / n
+    return kl, ((th.exp(log_ratio) - 1.0).abs() > clip_range).sum() / n
+
+
 def normalized(
     advantages: th.Tensor, alive: th.Tensor, negligible: th.Tensor | float = 0.0
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    Bring advantages to mean 0 and variance 1 over all steps of living episodes.
+    Normalise advantages to mean 0 and variance 1 over all steps of running episodes.
 
     :param advantages: ``(T, N)``
     :param alive: ``(T, N)``
-    :param negligible: A standard deviation up to this is rounding: the advantages are not scaled up then.
-    :return: the advantages ``(T, N)``, and the standard deviation that they were divided by: what is added to their
-        loss must be divided by it, too, if its weight is to stay the same
+    :param negligible: Do not divide by a standard deviation up to this: it is rounding.
+    :return: the advantages ``(T, N)`` and the standard deviation that they were divided by; divide other terms of the
+        loss by it, too, to keep their weight
     """
     n = alive.sum()
     mean = (alive * advantages).sum() / n
@@ -73,10 +91,10 @@ def normalized(
 
 def information_loss(information: th.Tensor) -> th.Tensor:
     """
-    The penalty of equation 3: the sum over time of I[x_t; x~_t], none below zero.
+    Return the penalty of Equation 3: the sum over time of I[x_t; x~_t], each clamped at zero.
 
-    Mutual information is never negative, but the bound of a frozen critic is unbounded below. Without the clamp the
-    policy would descend there.
+    Mutual information is never negative, but the bound of a frozen critic is unbounded below, and the policy would
+    exploit that.
 
     :param information: estimates in nats, ``(T,)``
     :return: scalar
@@ -87,7 +105,7 @@ def information_loss(information: th.Tensor) -> th.Tensor:
 
 def cost_to_go(costs: th.Tensor, gamma: float = 1.0) -> th.Tensor:
     """
-    Discounted sum of the costs from each step to the end.
+    Sum the discounted costs from each step to the end.
 
     :param costs: ``(T, N)``, zero after the end of an episode
     :return: ``(T, N)``

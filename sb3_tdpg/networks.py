@@ -15,6 +15,9 @@ import torch as th
 from torch import nn
 from torch.nn.functional import elu
 
+# Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
+MAX_TIME_VARYING_HORIZON = 50
+
 
 class BatchedLinear(nn.Module):
     """

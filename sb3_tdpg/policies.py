@@ -15,45 +15,22 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution, make_proba_distribution
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_tdpg.buffers import EpisodeBatch
-from sb3_tdpg.features import TRVCnn, observation_kind
-from sb3_tdpg.networks import TimeMLP
+from sb3_tdpg.features import observation_kind
+from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
+from sb3_tdpg.settings import POLICY_DEFAULTS
 
-# Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
-MAX_TIME_VARYING_HORIZON = 50
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
 
 
-class PolicyDefaults(NamedTuple):
-    """Arguments of :class:`TRVPolicy` that depend on the kind of observation; where there is an image, the paper's."""
-
-    trv_dim: int
-    encoder: Sequence[int]
-    action_head: Sequence[int]
-    encoder_activation_fn: type[nn.Module]
-    action_head_activation_fn: type[nn.Module]
-    encoder_log_var_init: float
-    action_log_var_init: float
-    features_extractor_class: type[BaseFeaturesExtractor]
-    features_extractor_kwargs: dict[str, Any]
-
-
-# What an image shows gets lost in the noise of wide TRVs: with them training takes twice as long.
-POLICY_DEFAULTS = dict(
-    vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
-    image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, {}),
-    depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
-)
-
-
 class PolicyStep(NamedTuple):
-    """One control of N episodes."""
+    """Actions and TRVs of N episodes at one time step."""
 
     actions: th.Tensor  # (N, U), not clipped
     trvs: th.Tensor  # (N, Z)
@@ -74,14 +51,13 @@ class TRVPolicy(BasePolicy):
     r"""
     Encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head :math:`\pi^\psi(u_t | \tilde x_t)`.
 
-    Both are diagonal Gaussians (the head of a discrete action space is SB3's distribution for it). The action head sees
-    the TRVs and nothing else. At the first step of an episode the previous TRVs are zero.
+    Both are diagonal Gaussians; for a discrete action space the head is SB3's distribution. The action head sees only
+    the TRVs. At the first step of an episode the previous TRVs are zero.
 
-    The memory that ``predict`` takes and returns as ``state`` is ``(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the
-    index of the next time step, ``(n_envs,)``.
+    ``predict`` takes and returns the memory as ``state=(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the index of the
+    next time step, ``(n_envs,)``.
 
-    Defaults that differ are given for vectors, for images of bytes and for depth images (of floats), in this order; the
-    sizes of the networks are the paper's.
+    Three defaults are for vectors, images (uint8) and depth images (floats). The network sizes are the paper's.
 
     :param observation_space: A vector, or an image with channels first.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
@@ -90,26 +66,23 @@ class TRVPolicy(BasePolicy):
     :param trv_dim: Number of TRVs Z; default: 2, 8, 16.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
         ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``.
-    :param activation_fn: Nonlinearity of the hidden layers; default: ELU; for images of bytes tanh, for depth
-        images tanh in the encoder.
-    :param time_varying: One set of weights for each time step, or one for all; default: time-varying up to a horizon of
-        50. A convolutional feature extractor is always shared.
-    :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images:
-        then no observation, however unlike those in training, drives the TRVs to where the action head has never been.
-    :param squash_trv_log_var: Whether a tanh keeps the log-variance of the TRVs in [-1, 1], too, before
-        ``encoder_log_var_init`` is added. The paper's policies for images have it; it forces noise of at least 0.6 on
-        TRVs whose means are within 1, which costs more than it helps.
-    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0 without it; default:
-        0, -3, -3.
+    :param activation_fn: Nonlinearity of the hidden layers; default: ELU, tanh, tanh (encoder) and ELU (head).
+    :param time_varying: Whether each time step has its own weights; default: up to a horizon of 50. The feature
+        extractor is always shared.
+    :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
+        Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen.
+    :param squash_trv_log_var: Whether a tanh also keeps the log-variance in [-1, 1], before ``encoder_log_var_init`` is
+        added, as in the paper's policies for images. The standard deviation is then at least 0.6, which hurts.
+    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3.
     :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2.
-    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded.
+    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
     :param action_var_floor: Smallest variance of an action, likewise.
-    :param features_extractor_class: What stands in front of the encoder; default: nothing (flatten) for vectors, the
-        paper's two convolutional layers for images (:class:`~sb3_tdpg.features.TRVCnn`).
-    :param features_extractor_kwargs: Its keywords.
+    :param features_extractor_class: Network in front of the encoder; default: flatten for vectors, the paper's two
+        convolutional layers for images (:class:`~sb3_tdpg.features.TRVCnn`).
+    :param features_extractor_kwargs: Keywords of the feature extractor.
     :param normalize_images: Whether to divide uint8 images by 255.
     :param optimizer_class: Optimiser of the policy.
-    :param optimizer_kwargs: Its keywords beside the learning rate.
+    :param optimizer_kwargs: Keywords of the optimiser, except the learning rate.
     :param use_sde: Must be False.
     """
 
@@ -192,7 +165,7 @@ class TRVPolicy(BasePolicy):
         )
 
     def _n_action_parameters(self) -> int:
-        """Return how many numbers define the distribution of an action."""
+        """Return the number of outputs of the action head."""
         space = self.action_space
         if isinstance(space, spaces.Box):
             return 2 * int(np.prod(space.shape))  # mean and log-variance
@@ -228,7 +201,7 @@ class TRVPolicy(BasePolicy):
     # -- the two conditional distributions --------------------------------------------------------------------
 
     def _encoder_density(self, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Mean and standard deviation of q from the encoder's outputs: ``(..., 2 Z) -> 2 x (..., Z)``."""
+        """Return mean and standard deviation of q: ``(..., 2 Z) -> 2 x (..., Z)``."""
         mean, log_var = parameters.chunk(2, dim=-1)
         if self.squash_trv_mean:
             mean = th.tanh(mean)
@@ -238,7 +211,7 @@ class TRVPolicy(BasePolicy):
         return mean, variance.sqrt()
 
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
-        """Distribution of the action from the head's outputs, ``(n, ...)``: one dimension of samples only."""
+        """Return the distribution of the action from the head's outputs, ``(n, ...)`` with one batch dimension."""
         if isinstance(self.action_dist, DiagGaussianDistribution):
             mean, log_var = parameters.chunk(2, dim=-1)
             variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
@@ -246,8 +219,7 @@ class TRVPolicy(BasePolicy):
         return self.action_dist.proba_distribution(parameters)
 
     def _variance(self, log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
-        # exp(log_var), bounded: observations unlike any in training would drive it to inf, and a TRV that is all noise
-        # drowns the action head. Bounded softly: a clamp has no gradient to come back on.
+        # A bounded exp(log_var): unfamiliar observations would drive it to inf. A clamp would stop the gradient there.
         return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
     # -- one step, for rollouts and predict -------------------------------------------------------------------
@@ -261,7 +233,7 @@ class TRVPolicy(BasePolicy):
         :param observation: y_t, ``(N, *obs)``
         :param prev_trv: x~_{t-1}, ``(N, Z)``; zero at the start of an episode
         :param t: time step of each episode, ``(N,)``
-        :param deterministic: Means instead of samples, of the TRVs and of the action.
+        :param deterministic: Use the means of the TRVs and of the action instead of samples.
         """
         mean, std = self.encoder_density(observation, prev_trv, t)
         noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
@@ -284,7 +256,7 @@ class TRVPolicy(BasePolicy):
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
         """
-        Return pi(u_t | x~_t), SB3's distribution; the next call changes it.
+        Return pi(u_t | x~_t). The next call overwrites the returned distribution.
 
         :param trv: x~_t, ``(N, Z)``
         :param t: time step of each episode, ``(N,)``
@@ -293,7 +265,7 @@ class TRVPolicy(BasePolicy):
 
     @staticmethod
     def _at_times(network: TimeMLP, inputs: th.Tensor, t: np.ndarray) -> th.Tensor:
-        """Evaluate a network where every row may be at another time step: ``(N, I) -> (N, O)``."""
+        """Evaluate a network on rows at different time steps: ``(N, I) -> (N, O)``."""
         if not network.time_varying or (t == t[0]).all():
             return network.at(inputs, int(t[0]))
         rows = [np.flatnonzero(t == step) for step in np.unique(t)]
@@ -303,23 +275,23 @@ class TRVPolicy(BasePolicy):
     # -- whole episodes, for training -------------------------------------------------------------------------
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
-        """Features of every observation: ``(T, N, F)``."""
+        """Extract the features of every observation: ``(T, N, F)``."""
         observations = batch.observations.flatten(0, 1)
-        if observations.dim() == 4:  # the layout that the CNN computes in, while the pixels are still bytes
+        if observations.dim() == 4:  # change the layout while the pixels are still bytes: it is cheaper
             observations = observations.contiguous(memory_format=th.channels_last)
         features = self.extract_features(observations, self.features_extractor)
         return features.unflatten(0, batch.observations.shape[:2])
 
     @staticmethod
     def prev_trvs(trvs: th.Tensor) -> th.Tensor:
-        """x~_{t-1}, which is zero at t = 0: ``(T, N, Z) -> (T, N, Z)``."""
+        """Return x~_{t-1}, which is zero at t = 0: ``(T, N, Z) -> (T, N, Z)``."""
         return th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (equation 13).
+        Compute log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (Equation 13).
 
-        The stored TRVs are constants here: ``Normal.log_prob(rsample())`` without a detach has no gradient in the mean.
+        The stored TRVs are constants: ``Normal.log_prob(rsample())`` without a detach has zero gradient in the mean.
 
         :return: ``(T, N)``
         """
@@ -328,7 +300,7 @@ class TRVPolicy(BasePolicy):
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Log pi(u_t | x~_t) at the stored actions (equation 12).
+        Compute log pi(u_t | x~_t) at the stored actions (Equation 12).
 
         :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
         :return: ``(T, N)``
@@ -360,11 +332,11 @@ class TRVPolicy(BasePolicy):
         self, batch: EpisodeBatch, encoder_gradient: str, bptt_steps: int | None = None, rebuild: bool = False
     ) -> tuple[th.Tensor, RebuiltTRVs | None]:
         """
-        Compute the log-probability of what was sampled, as the chosen gradient of the encoder takes it.
+        Compute the log-probability whose gradient trains encoder and head.
 
         :param encoder_gradient: ``"score"`` or ``"pathwise"``, see :class:`~sb3_tdpg.TDPG`.
         :param bptt_steps: See :class:`~sb3_tdpg.TDPG`.
-        :param rebuild: Return the TRVs rebuilt from the noise also where the gradient does not need them.
+        :param rebuild: Also rebuild the TRVs from the noise when the gradient does not need them.
         :return: ``(T, N)``, and the rebuilt TRVs
         """
         features = self.episode_features(batch)
@@ -381,13 +353,13 @@ class TRVPolicy(BasePolicy):
 
     def rebuild_trvs_in_parts(self, features: th.Tensor, batch: EpisodeBatch, n_steps: int) -> RebuiltTRVs:
         """
-        Unroll equation 15, in parts of the horizon, as if each were an episode: truncated back-propagation.
+        Unroll Equation 15 in parts of the horizon: truncated back-propagation through time.
 
-        A part begins with the stored TRVs of the step before it, through which no gradient flows.
+        Each part starts from the stored TRVs of the step before it, without a gradient.
 
         :param features: ``(T, N, F)``
         :param batch: the rollouts, ``(T, N, ...)``
-        :param n_steps: Steps of a part. All steps must share their weights.
+        :param n_steps: Length of a part. All steps must share their weights.
         """
         assert not self.time_varying
         horizon, n_episodes = batch.noise.shape[:2]
@@ -423,11 +395,11 @@ class TRVPolicy(BasePolicy):
         """
         Choose actions, one step at a time.
 
-        :param observation: one observation, or one for each environment
-        :param state: what the last call returned; ``None`` at the start
-        :param episode_start: ``(n_envs,)`` bool: where an episode begins, the memory is cleared
-        :param deterministic: Use the means. This removes the channel noise that the information bottleneck acts
-            through; the paper's tables use ``False``.
+        :param observation: one observation, or one per environment
+        :param state: the memory that the last call returned; ``None`` at the start
+        :param episode_start: ``(n_envs,)`` bool; clears the memory where True
+        :param deterministic: Use means instead of samples. This removes the channel noise that the bottleneck acts
+            through, so it is not the policy that was trained; the paper's tables use ``False``.
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
         """

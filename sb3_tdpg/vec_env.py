@@ -22,19 +22,19 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_tdpg.common.processes import usable_cores
-from sb3_tdpg.defaults import defaults_for
-from sb3_tdpg.envs.base import BatchStep, POMDPEnv
+from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.settings import defaults_for
 
 
 class BatchedVecEnv(VecEnv):
     """
     An SB3 ``VecEnv`` that steps N episodes of one environment in a single NumPy call.
 
-    It calls the methods of the very environment that ``gymnasium.make`` gives, with a leading dimension of N in place
-    of 1, so that the dynamics cannot differ. All episodes run in step. As in every SB3 ``VecEnv`` a finished episode
-    is reset at once; like ``Monitor``, it reports ``info["episode"]``.
+    It calls the methods of the environment from ``gymnasium.make`` with a leading dimension of N instead of 1, so that
+    the dynamics cannot differ. All episodes run in lockstep. As in every SB3 ``VecEnv``, a finished episode is
+    reset at once; like ``Monitor``, it reports ``info["episode"]``.
 
-    :param env: The environment whose methods are used. It must not be wrapped.
+    :param env: The environment, without wrappers.
     :param n_envs: Number of episodes N.
     """
 
@@ -48,7 +48,7 @@ class BatchedVecEnv(VecEnv):
         self._start_time = time.time()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the one generator that all episodes share; it takes effect at the next ``reset``."""
+        """Seed the generator that all episodes share; takes effect at the next ``reset``."""
         self._seeds = [seed] * self.num_envs
         return self._seeds
 
@@ -56,8 +56,7 @@ class BatchedVecEnv(VecEnv):
         """Start N episodes: y_0, ``(N, *obs)``. The true states x_0 are in ``reset_infos``."""
         if any(self._options):
             raise ValueError(
-                f"{type(self.env).__name__} takes no reset options; variations are keywords of its constructor "
-                "(env_kwargs)"
+                f"{type(self.env).__name__} takes no reset options: pass variations to its constructor (env_kwargs)"
             )
         if self._seeds[0] is not None:
             gym.Env.reset(self.env, seed=self._seeds[0])
@@ -75,18 +74,12 @@ class BatchedVecEnv(VecEnv):
         """Store the actions, ``(N, U)``."""
         self._actions = actions
 
-    def advance(self, actions: np.ndarray) -> BatchStep:
-        """Step like ``step``, but without the infos; not for the last step of an episode."""
-        self._time += 1
-        step = self.env.step_batch(self._state, actions, is_last=self._time == self.env.horizon)
-        self._state = step.state
-        self._returns -= step.cost
-        return step
-
     def step_wait(self) -> VecEnvStepReturn:
         """Apply the stored actions; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
-        _, observation, cost, details = self.advance(self._actions)
+        self._time += 1
         is_last = self._time == self.env.horizon
+        self._state, observation, cost, details = self.env.step_batch(self._state, self._actions, is_last=is_last)
+        self._returns -= cost
         infos: list[dict[str, Any]] = [
             {"state": state, "cost": c} for state, c in zip(self._state.copy(), cost.tolist(), strict=True)
         ]
@@ -108,27 +101,27 @@ class BatchedVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return the attribute of the one environment, once for each index."""
+        """Return the attribute of the environment, once per index."""
         value = getattr(self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the one environment that all episodes share."""
+        """Set an attribute of the environment that all episodes share."""
         setattr(self.env, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the one environment; its result stands once for each index."""
+        """Call a method of the environment; return its result once per index."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Tell that nothing is wrapped, except that this class does what ``Monitor`` does."""
+        """Report no wrapper but ``Monitor``, whose work this class does."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Render every episode by its current state."""
+        """Render the current state of every episode."""
         images: list[Any] = []
         batch_state = self.env._state
         for state in self._state:
@@ -159,19 +152,19 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
 
 
 def _creator(env_id: str) -> Any:
-    """Return what makes an environment: its class, or a function."""
+    """Return the class or function that makes the environment."""
     spec = gym.spec(_bare_id(env_id))
     return spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
 
 
 def _draws(env_id: str) -> bool:
-    """Tell whether an environment may be asked for pictures: Gymnasium warns of each one that says it has none."""
+    """Whether the environment can render: Gymnasium warns when one that cannot is asked to."""
     creator = _creator(env_id)
     return not hasattr(creator, "metadata") or "rgb_array" in creator.metadata.get("render_modes", ())
 
 
 def default_n_envs(n_episodes: int) -> int:
-    """Return how many environments run that many episodes where they are no batch: the largest divisor up to 50."""
+    """Return the number of environments for unbatched episodes: the largest divisor up to 50."""
     return max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
 
 
@@ -185,17 +178,17 @@ def make_episodes_env(
     use_processes: bool = True,
 ) -> VecEnv:
     """
-    Vectorise a registered id in the fastest way that this plugin knows.
+    Vectorise a registered id in the fastest way available.
 
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, otherwise its largest
+    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, else its largest
         divisor up to 50.
-    :param n_episodes: Episodes that are to be run at a time; default: as many as TDPG runs in an epoch by default.
+    :param n_episodes: Episodes per epoch; default: TDPG's default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether an environment that simulates one episode after the other (PandaGrasp) shares this
-        among as many processes as there are cores. It gives the same numbers without them.
-    :return: a :class:`BatchedVecEnv` for an environment of this plugin, SB3's ``DummyVecEnv`` for any other
+    :param use_processes: Whether PandaGrasp, which simulates its episodes one by one, uses one process per core. The
+        numbers are the same without.
+    :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
@@ -215,6 +208,6 @@ def make_episodes_env(
             with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
                 n_episodes = defaults_for(probe.observation_space).n_episodes
         n_envs = default_n_envs(n_episodes)
-    # make_vec_env asks an id for pictures, and a function for nothing.
+    # make_vec_env requests rendering for an id, but not for a function.
     make = env_id if _draws(env_id) else functools.partial(gym.make, env_id)
     return make_vec_env(make, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)

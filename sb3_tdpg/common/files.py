@@ -1,4 +1,4 @@
-"""Files that are never half-written."""
+"""Write files atomically."""
 
 import os
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that at no time a half-written one is there."""
+    """Write a text file atomically: readers never see a partial file."""
     with replaced_atomically(path) as partial:
         partial.write_text(text)
 
@@ -16,11 +16,11 @@ def write_atomically(path: Path, text: str) -> None:
 @contextmanager
 def replaced_atomically(path: Path) -> Iterator[Path]:
     """
-    Give a file to write to, which takes the place of another one when it is whole.
+    Give a path to write to; it replaces the target when the block ends without an error.
 
-    :param path: The file that is replaced, also by several workers at once.
+    :param path: The target. Several processes may replace it at once.
     """
-    # In a folder of its own, since a compressed file tells its name: that must not differ from one time to the next.
+    # In a folder of its own: a compressed file contains its name, which must not vary.
     with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder:
         partial = Path(folder, path.name)
         yield partial

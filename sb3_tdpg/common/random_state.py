@@ -1,4 +1,4 @@
-"""What a checkpoint must know beside the model: random number generators and running statistics."""
+"""The state of all random number generators, for checkpoints."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 @dataclass(frozen=True)
 class RandomState:
     """
-    A snapshot of Python's, NumPy's, torch's and the environments' generators, and of what ``VecNormalize`` has learned.
+    A snapshot of all generators (Python, NumPy, torch, environments) and of the statistics of ``VecNormalize``.
 
     :param python: State of :mod:`random`.
     :param numpy: State of NumPy's global generator.
@@ -33,11 +33,11 @@ class RandomState:
 
     @classmethod
     def capture(cls, env: VecEnv) -> RandomState:
-        """Take the snapshot. What belongs to the environments is shared with them until it is pickled."""
+        """Take the snapshot. Until it is pickled, it shares the environments' generators."""
         normalize = unwrap_vec_normalize(env)
         return cls(
             random.getstate(),
-            np.random.get_state(legacy=False),  # noqa: NPY002  (environments of others may still use it)
+            np.random.get_state(legacy=False),  # noqa: NPY002  (third-party environments may still use it)
             th.get_rng_state(),
             th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
             env.get_attr("np_random"),
@@ -48,12 +48,12 @@ class RandomState:
         """
         Put all generators back.
 
-        :raises ValueError: if the number of environments is another one.
+        :raises ValueError: if the number of environments differs.
         """
         if len(self.env) != env.num_envs:
             raise ValueError(
                 f"the checkpoint was made with {len(self.env)} environments, the model now has {env.num_envs}: "
-                "resume with as many"
+                "resume with the same number"
             )
         random.setstate(self.python)
         np.random.set_state(self.numpy)  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""How many threads a block of code computes with."""
+"""Limit the threads of torch and of NumPy's linear algebra."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 
 def set_threads(n: int) -> None:
-    """Compute with this many threads from now on: those of torch, and those of NumPy's and SciPy's linear algebra."""
+    """Limit torch and the linear algebra of NumPy and SciPy to this many threads from now on."""
     th.set_num_threads(n)
     threadpool_limits(n, user_api="blas")
 
@@ -18,11 +18,10 @@ def set_threads(n: int) -> None:
 @contextmanager
 def threads(n: int | None) -> Iterator[None]:
     """
-    Run a block of code, or a function (``@threads(1)``), with this many threads; ``None``: with as many as there are.
+    Run a block of code, or a function (``@threads(1)``), with this many threads; ``None`` changes nothing.
 
-    For arrays as small as those of policies for vectors, one is best. A second gains a tenth where a core is free for
-    it; where other programs are at work, the two wait for each other at every step, and take up to a hundred times as
-    long.
+    One thread is best for small arrays. A second thread gains 10 % if a core is free. If other programs use the cores,
+    the two threads wait for each other at every step and can take a hundred times as long.
 
     :param n: threads of torch, and of NumPy's and SciPy's linear algebra
     """

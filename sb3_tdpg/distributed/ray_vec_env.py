@@ -17,9 +17,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_tdpg.checks import check_count
 from sb3_tdpg.distributed.ray_actor import Resets, Setting, Start, Steps, Taken, join
 from sb3_tdpg.distributed.ray_pool import ActorPool, Call, DeadActorError
+from sb3_tdpg.settings import check_count
 
 __all__ = ["DeadActorError", "RayVecEnv"]
 

@@ -1,0 +1,284 @@
+"""
+On-policy learning from whole episodes: rollouts, environments, saving and resuming.
+
+This is what :class:`~sb3_tdpg.TDPG` needs beside its own method, which is in :mod:`sb3_tdpg.tdpg`.
+
+Dimension key: T horizon, N episodes of an epoch, E environments, X state, Z task-relevant variables (TRVs).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from abc import abstractmethod
+from collections.abc import Iterable
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_tdpg.buffers import EpisodeBuffer
+from sb3_tdpg.common.files import replaced_atomically
+from sb3_tdpg.common.random_state import RandomState
+from sb3_tdpg.information import InformationEstimator
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.problem import Problem, read_problem
+from sb3_tdpg.settings import nearest_multiples
+
+# Checkpoints that were saved before the module moved name its old path.
+sys.modules.setdefault("sb3_tdpg.random_state", sys.modules[RandomState.__module__])
+
+
+class TrainingDivergedError(ValueError):
+    """A loss is NaN or infinite. The model keeps the last good parameters."""
+
+
+class EpisodicAlgorithm(OnPolicyAlgorithm):
+    """
+    An on-policy algorithm that rolls out N whole episodes of a :class:`~sb3_tdpg.TRVPolicy` per epoch.
+
+    A subclass sets ``n_episodes`` and the attributes below, and implements ``train``, :attr:`mi_coef` and
+    :attr:`needs_information`.
+    """
+
+    policy: TRVPolicy  # type: ignore[assignment]
+    rollout_buffer: EpisodeBuffer
+    estimator: InformationEstimator
+    n_episodes: int
+    # Plain numbers, so that a model that is loaded without an environment can rebuild its networks.
+    horizon: int = 0
+    state_dim: int = 0
+    epoch: int = 0
+    """Policy epochs completed."""
+    information: np.ndarray | None = None
+    """I[x_t; x~_t] of the last rollouts in nats, ``(T,)``; None without a penalty."""
+    _random_state: RandomState | None = None
+    _problem: Problem | None = None
+
+    @property
+    @abstractmethod
+    def mi_coef(self) -> float:
+        """Weight of the information in the loss, 1 / beta, in units of cost per nat."""
+
+    @property
+    @abstractmethod
+    def needs_information(self) -> bool:
+        """Whether the information of this epoch's rollouts is used."""
+
+    # -- the environment --------------------------------------------------------------------------------------
+
+    def _check_problem(self, env: VecEnv) -> Problem:
+        """
+        Read horizon and state from the environment.
+
+        :raises ValueError: if it does not fit the algorithm or what the model was made for.
+        """
+        normalize = unwrap_vec_normalize(env)
+        if normalize is not None and normalize.norm_reward:
+            raise ValueError(
+                "VecNormalize(norm_reward=True) rescales the cost and with it, silently, beta: use norm_reward=False"
+            )
+        if self.n_episodes % env.num_envs != 0:
+            raise ValueError(
+                f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), so "
+                f"that each environment runs the same number of episodes: use "
+                f"{nearest_multiples(self.n_episodes, env.num_envs)}"
+            )
+        problem = read_problem(env)
+        if self.horizon not in (0, problem.horizon) or self.state_dim not in (0, problem.state_dim):
+            raise ValueError(
+                f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, but the "
+                f"model was made for horizon={self.horizon} and {self.state_dim}: use an environment of the same shape"
+            )
+        return problem
+
+    def _set_problem(self, problem: Problem, env: VecEnv) -> None:
+        self._problem = problem
+        self.horizon, self.state_dim = problem.horizon, problem.state_dim
+        self.n_steps = self.horizon * (self.n_episodes // env.num_envs)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
+        wrapped = self._wrap_env(env, self.verbose)
+        problem = self._check_problem(wrapped)  # before the model's own environment is replaced
+        super().set_env(wrapped, force_reset)
+        self._set_problem(problem, wrapped)
+
+    # -- rollouts ---------------------------------------------------------------------------------------------
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: EpisodeBuffer,  # type: ignore[override]
+        n_rollout_steps: int,
+    ) -> bool:
+        """
+        Roll out N whole episodes with the current policy (line 2 of Algorithm 2).
+
+        Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
+        would favour short ones. All environments begin an epoch at t = 0.
+
+        :param env: The training environments.
+        :param callback: Called at each step, and at the beginning and the end.
+        :param rollout_buffer: Receives the episodes.
+        :param n_rollout_steps: Unused: an epoch is a number of episodes.
+        :return: False if a callback asked to stop.
+        """
+        assert self._problem is not None, "the model has no environment: set_env() first"
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+        if self._last_obs is None:
+            self._last_obs = env.reset()  # type: ignore[assignment]
+            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+
+        n_envs = env.num_envs
+        obs = cast(np.ndarray, self._last_obs)
+        states = self._problem.initial_states(env, obs)  # (E, X)
+        trvs = th.zeros(n_envs, self.policy.trv_dim, device=self.device)
+        t = np.zeros(n_envs, np.int64)
+        column = np.arange(n_envs)  # of the buffer, for the current episode of each environment
+        # An epoch that ends early cannot be continued: leave the environments to be reset.
+        self._last_obs = None
+
+        while (running := np.flatnonzero(column < self.n_episodes)).size > 0:
+            with th.no_grad():
+                step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(t, self.horizon - 1))
+            actions = step.actions.cpu().numpy()
+            env_actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+            if isinstance(self.action_space, spaces.Box):
+                env_actions = np.clip(env_actions, self.action_space.low, self.action_space.high)
+            new_obs, rewards, dones, infos = env.step(env_actions)
+
+            self.num_timesteps += n_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+
+            stored = {
+                "observations": obs.reshape(n_envs, *rollout_buffer.obs_shape),
+                "states": states,
+                "noise": step.noise.cpu().numpy(),
+                "trvs": step.trvs.cpu().numpy(),
+                "means": step.means.cpu().numpy(),
+                "stds": step.stds.cpu().numpy(),
+                "actions": actions.reshape(n_envs, -1),
+                "costs": -rewards,
+            }
+            rollout_buffer.add_step(t[running], column[running], **{k: v[running] for k, v in stored.items()})
+
+            states = self._problem.next_states(env, cast(np.ndarray, new_obs), dones, infos)
+            trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
+            t = np.where(dones, 0, t + 1)
+            column = np.where(dones, column + n_envs, column)
+            if (t[column < self.n_episodes] >= self.horizon).any():
+                raise ValueError(
+                    f"an episode did not end after horizon={self.horizon} steps: the environment must return "
+                    "terminated or truncated there (or declare its true horizon)"
+                )
+            obs = cast(np.ndarray, new_obs)
+
+        rollout_buffer.full = True
+        if (t == 0).all():
+            self._last_obs = obs
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Write the log; the mean cost comes from all episodes of the epoch."""
+        self.logger.record("rollout/ep_cost_mean", float(self.rollout_buffer.episode_costs.mean()))
+        super().dump_logs(iteration)
+
+    def _check_finite(self, name: str, value: th.Tensor) -> None:
+        """Stop while the parameters are still good."""
+        if bool(th.isfinite(value).all()):
+            return
+        self._last_obs = None
+        raise TrainingDivergedError(
+            f"the {name} of epoch {self.epoch} is NaN or infinite (after {self.num_timesteps} timesteps). The model "
+            "keeps the parameters from before this update. Check the environment's costs and observations; a smaller "
+            "learning_rate, max_grad_norm=1, or a larger encoder_var_floor in policy_kwargs help against exploding "
+            "log-probabilities"
+        )
+
+    # -- learn, save, resume ----------------------------------------------------------------------------------
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self.env is None:
+            raise ValueError("the model has no environment to learn in: set_env(...) first, or load(path, env=...)")
+        if reset_num_timesteps:
+            self.epoch = 0
+            self._current_progress_remaining = 1.0
+        random_state, self._random_state = self._random_state, None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if random_state is not None and not reset_num_timesteps:
+            # Last, since the set-up draws, too. The first rollout then resets the environments once more.
+            random_state.restore(self.env)
+            self._last_obs = None
+        return result
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last epoch may overshoot, and schedules are defined on [0, 1].
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """Timesteps that the last call of ``learn`` was asked for and did not reach."""
+        return max(0, self._total_timesteps - self.num_timesteps)
+
+    def save_checkpoint(self, path: str | os.PathLike[str]) -> None:
+        """
+        Save the model with the state of all random number generators, between two epochs.
+
+        The environments are reset, here and after loading, so that their generators are their whole state. See
+        :class:`~sb3_tdpg.TrainingCheckpointCallback`.
+        """
+        assert self.env is not None
+        self._last_obs = None
+        self._random_state = RandomState.capture(self.env)
+        try:
+            self.save(Path(path))
+        finally:
+            self._random_state = None
+
+    def save(
+        self,
+        path: str | os.PathLike[str] | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save to a zip file; an older file is replaced only when the new one is complete."""
+        if isinstance(path, io.IOBase):
+            super().save(path, exclude, include)
+            return
+        target = Path(path)
+        if target.suffix == "":
+            target = target.with_suffix(".zip")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with replaced_atomically(target) as partial, partial.open("wb") as file:
+            super().save(file, exclude, include)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_problem"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        # The estimator's state dict holds its optimiser, too.
+        return ["policy", "policy.optimizer", "estimator"], []

@@ -1,0 +1,236 @@
+"""Arguments of TDPG: the defaults for each kind of observation, and checks that say how to mend a bad value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import LinearSchedule
+from torch import nn
+
+from sb3_tdpg.advantages import get_baseline
+from sb3_tdpg.features import TRVCnn, observation_kind
+from sb3_tdpg.information import get_estimator_class
+
+ENCODER_GRADIENTS = ("score", "pathwise")
+SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
+
+class Defaults(NamedTuple):
+    """Arguments of :class:`~sb3_tdpg.tdpg.TDPG` that depend on the kind of observation, and the length of training."""
+
+    beta: float | str
+    learning_rate: Schedule
+    n_episodes: int
+    n_epochs: int
+    batch_size: int | None
+    clip_range: float
+    normalize_advantage: bool
+    encoder_gradient: str
+    mi_estimator: str
+    n_threads: int | None
+    total_epochs: int  # policy epochs
+
+
+# One update per epoch, as in the paper; the falling learning rate improves the last epochs.
+VECTOR = Defaults(
+    beta=1 / 75,
+    learning_rate=LinearSchedule(2e-3, 2e-5, 1.0),
+    n_episodes=500,
+    n_epochs=1,
+    batch_size=None,
+    clip_range=float("inf"),
+    normalize_advantage=False,
+    encoder_gradient="score",
+    mi_estimator="mine",
+    n_threads=1,
+    total_epochs=400,
+)
+
+# Images are expensive: PPO's passes over few episodes, and the gradient with the least variance.
+IMAGE = Defaults(
+    beta="auto",
+    learning_rate=LinearSchedule(1e-3, 5e-5, 1.0),
+    n_episodes=160,
+    n_epochs=4,
+    batch_size=80,
+    clip_range=0.2,
+    normalize_advantage=True,
+    encoder_gradient="pathwise",
+    mi_estimator="logdet",
+    n_threads=None,
+    total_epochs=50,
+)
+
+# Depth images come from environments that simulate each trial: even more expensive.
+DEPTH = IMAGE._replace(n_episodes=400, batch_size=200, total_epochs=100)
+
+
+class PolicyDefaults(NamedTuple):
+    """Arguments of :class:`~sb3_tdpg.TRVPolicy` that depend on the kind of observation; for images the paper's."""
+
+    trv_dim: int
+    encoder: Sequence[int]
+    action_head: Sequence[int]
+    encoder_activation_fn: type[nn.Module]
+    action_head_activation_fn: type[nn.Module]
+    encoder_log_var_init: float
+    action_log_var_init: float
+    features_extractor_class: type[BaseFeaturesExtractor]
+    features_extractor_kwargs: dict[str, Any]
+
+
+# Images start with narrow TRVs: training with wide ones takes twice as long.
+POLICY_DEFAULTS = dict(
+    vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
+    image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, {}),
+    depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
+)
+
+
+def defaults_for(observation_space: spaces.Space | None) -> Defaults:
+    """Return the defaults for the kind of an observation space (:func:`~sb3_tdpg.features.observation_kind`)."""
+    return dict(vector=VECTOR, image=IMAGE, depth=DEPTH)[observation_kind(observation_space)]
+
+
+def fill_in(given: Mapping[str, Any], observation_space: spaces.Space | None) -> dict[str, Any]:
+    """
+    Replace ``None`` by the defaults.
+
+    :param given: Arguments by name.
+    :param observation_space: The environment's.
+    """
+    defaults = defaults_for(observation_space)
+    settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
+    if given["batch_size"] is None and defaults.batch_size is not None:
+        # The default must fit any number of episodes.
+        settings["batch_size"] = min(defaults.batch_size, settings["n_episodes"])
+    return settings
+
+
+def check_arguments(settings: Mapping[str, Any]) -> None:
+    """
+    Check all arguments that do not depend on the environment.
+
+    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name; others are ignored.
+    :raises ValueError: for the first one that is out of range.
+    """
+    check_beta_argument(settings["beta"], settings["cost_limit"])
+    for rate in _values(settings["learning_rate"]):
+        check_learning_rate(rate)
+    get_estimator_class(settings["mi_estimator"])
+    get_baseline(settings["baseline"])
+    n_episodes, batch_size = settings["n_episodes"], settings["batch_size"]
+    for name in ("n_episodes", "n_epochs"):
+        check_count(name, settings[name])
+    for name in ("batch_size", "bptt_steps", "n_threads"):
+        if settings[name] is not None:
+            check_count(name, settings[name])
+    if n_episodes < 2:
+        raise ValueError(
+            f"n_episodes={n_episodes} must be at least 2: the baseline and the information are estimated from a batch"
+        )
+    if batch_size is not None and not 2 <= batch_size <= n_episodes:
+        raise ValueError(
+            f"batch_size={batch_size} must be between 2 and n_episodes={n_episodes}: it counts episodes, "
+            "because the memory of an episode cannot be cut"
+        )
+    for clip_range in _values(settings["clip_range"]):
+        # A schedule may fall to 0; rl-zoo3 loads models for evaluation with one that is always 0.
+        lowest_is_allowed = callable(settings["clip_range"])
+        is_number = isinstance(clip_range, (int, float, np.number))
+        if not (is_number and (clip_range > 0 or (clip_range == 0 and lowest_is_allowed))):
+            raise ValueError(
+                f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
+                "returns one; float('inf') turns the clipping off"
+            )
+    n_updates = settings["n_epochs"] * (1 if batch_size is None else math.ceil(n_episodes / batch_size))
+    if n_updates > 1 and not callable(settings["clip_range"]) and math.isinf(settings["clip_range"]):
+        raise ValueError(
+            f"n_epochs={settings['n_epochs']} and batch_size={batch_size} make {n_updates} updates on the same "
+            "rollouts, which needs clipping: give clip_range=0.2, as in PPO, or make one update"
+        )
+    encoder_gradient = settings["encoder_gradient"]
+    if encoder_gradient not in ENCODER_GRADIENTS:
+        raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
+    if not 0.0 < settings["gamma"] <= 1.0:
+        raise ValueError(f"gamma={settings['gamma']} must be in (0, 1]; the paper's problems have gamma=1")
+    if not 0.0 <= settings["gae_lambda"] <= 1.0:
+        raise ValueError(f"gae_lambda={settings['gae_lambda']} must be in [0, 1]; 1 leaves the gradient unbiased")
+    if not settings["max_grad_norm"] > 0:
+        raise ValueError(f"max_grad_norm={settings['max_grad_norm']} must be positive, or None for no clipping")
+
+
+def _values(number_or_schedule: Any) -> list[Any]:
+    """Return the number, or the first and last value of the schedule."""
+    if callable(number_or_schedule):
+        return [number_or_schedule(1.0), number_or_schedule(0.0)]
+    return [number_or_schedule]
+
+
+def check_beta_argument(beta: Any, cost_limit: Any) -> None:
+    """Raise a ``ValueError`` unless beta is a positive number, a schedule of such, or "auto" with a fitting limit."""
+    if beta != "auto":
+        for value in _values(beta):
+            check_beta(value)
+        if cost_limit is not None:
+            raise ValueError(
+                f"cost_limit={cost_limit} needs beta='auto', but beta={beta!r} is given: leave one of them out (to "
+                "select an epoch under a cost limit, use SelectionCallback)"
+            )
+        return
+    if cost_limit is not None and not (
+        isinstance(cost_limit, (int, float, np.number)) and math.isfinite(cost_limit) and cost_limit != 0
+    ):
+        raise ValueError(
+            f"cost_limit={cost_limit!r} must be a finite number other than 0 (the weight is adapted in fractions of it)"
+        )
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise a ``ValueError`` unless the value is an integer of at least 1."""
+    if not (isinstance(value, (int, np.integer)) and value >= 1):
+        raise ValueError(f"{name}={value!r} must be an integer of at least 1")
+
+
+def check_beta(beta: float) -> float:
+    """Return beta, or raise a ``ValueError`` if it is not a positive number."""
+    if not (isinstance(beta, (int, float, np.number)) and beta > 0):  # NaN compares false
+        raise ValueError(
+            f"beta={beta!r} must be a positive number (or a function of the remaining progress that returns one): the "
+            "weight of the cost against the information. float('inf') gives plain policy gradient, 'auto' adapts the "
+            "weight to cost_limit"
+        )
+    return float(beta)
+
+
+def check_learning_rate(rate: float) -> None:
+    """Raise a ``ValueError`` if the learning rate is negative or not a finite number."""
+    if not (isinstance(rate, (int, float, np.number)) and 0 <= rate < math.inf):
+        raise ValueError(
+            f"learning_rate={rate!r} must be a finite, non-negative number, or a function of the remaining "
+            "progress that returns one (in YAML write 1.0e-3: YAML reads 1e-3 as text)"
+        )
+
+
+def check_action_space(space: spaces.Space) -> None:
+    """Raise a ``ValueError`` if the policy has no distribution for this action space."""
+    if not isinstance(space, SUPPORTED_ACTION_SPACES):
+        names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
+        raise ValueError(f"the action space {space} is not supported: use one of {names}")
+    if isinstance(space, spaces.Box) and not np.isfinite([space.low, space.high]).all():
+        raise ValueError(
+            f"the action space {space} has infinite bounds: give it finite ones, for instance with "
+            "gymnasium.wrappers.RescaleAction or in the environment itself; actions beyond them are clipped"
+        )
+
+
+def nearest_multiples(n: int, divisor: int) -> str:
+    """Name the multiples of ``divisor`` next to ``n``."""
+    below = n // divisor * divisor
+    return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"
