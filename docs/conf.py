@@ -1,4 +1,4 @@
-"""Sphinx configuration: MyST Markdown, the Read the Docs theme, and docstrings of the code itself."""
+"""Configure Sphinx: MyST Markdown, the Read the Docs theme, and the docstrings of the code."""
 
 import re
 import unicodedata
@@ -21,16 +21,16 @@ copyright = f"2026, {author}"
 release = version = sb3_tdpg.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
-exclude_patterns = ["_build", "results/*/*"]  # what is in there is included by the pages beside it
-nitpicky = True  # a reference that leads nowhere is a warning, and with -W an error
-nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium|pathlib)\..*")]  # their pages are elsewhere
+exclude_patterns = ["_build", "results/*/*"]  # the pages beside these folders include their files
+nitpicky = True  # a broken reference is a warning, and with -W an error
+nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium|pathlib)\..*")]  # documented elsewhere
 
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
 suppress_warnings = ["myst.header"]  # the changelog's headings are SB3's
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # the signature is long enough without; the text says what is expected
+autodoc_typehints = "none"  # types would make the signatures too long; the text describes them
 autodoc_class_signature = "mixed"
 
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
@@ -43,13 +43,13 @@ html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 
 
-# Where a cell is not to break: before a unit, in an interval, in an exponent ("43.9 ms", "[8.20, 9.04]", "1e-3").
+# No line break before a unit, in an interval, or in an exponent ("43.9 ms", "[8.20, 9.04]", "1e-3").
 TOGETHER = re.compile(r"(?<=\d) (?=%|(?:[nµm]?s|min|nat)\b)|(?<=\d,) (?=[^\s\]]+\])")
 EXPONENT = re.compile(r"(?<=\de-)(?=\d)")
 
 
 def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
-    """Let the cells of tables break where a reader would."""
+    """Keep the browser from breaking lines within numbers in tables."""
     for entry in doctree.findall(nodes.entry):
         for text in list(entry.findall(nodes.Text)):
             if not isinstance(text.parent, nodes.literal):
@@ -57,23 +57,23 @@ def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
                 text.parent.replace(text, nodes.Text(kept))
 
 
-# Browsers take a letter's alphabet from the letter, and not from mathvariant, which the converter writes.
+# Browsers ignore the attribute mathvariant, which the converter writes: the letter itself must change.
 LETTER = re.compile(r'mathvariant="(double-struck|script|monospace)">([A-Za-z])(?=<)')
 
 
 def in_its_alphabet(match: re.Match[str]) -> str:
-    """Put the letter of an alphabet in the place of a plain letter that is marked as one of it."""
+    """Replace a plain letter with a mathvariant by the letter of that mathematical alphabet."""
     alphabet, letter = match[1].upper(), match[2]
     name = f"{alphabet} {'CAPITAL' if letter.isupper() else 'SMALL'} {letter.upper()}"
     return f">{unicodedata.lookup(f'MATHEMATICAL {name}')}"
 
 
 def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
-    """Write a formula as MathML, which browsers draw by themselves: no script, and nothing to be fetched."""
+    """Write a formula as MathML, which browsers draw without a script and without a network."""
     display = "block" if isinstance(node, nodes.math_block) else "inline"
     tex = node.astext().strip()
     if display == "block" and r"\\" in tex and r"\begin" not in tex:
-        tex = rf"\begin{{split}}{tex}\end{{split}}"  # lines that are aligned at their &, as Sphinx has it
+        tex = rf"\begin{{split}}{tex}\end{{split}}"  # lines aligned at &, as in Sphinx
     mathml = latex_to_mathml(tex, display=display)
     if unknown := re.findall(r"<m[io][^>]*>(\\.+?|&amp;|&#x00026;|&)</m[io]>", mathml):
         logger.warning("%s in a formula: %s", unknown, node.astext(), location=node)
@@ -83,15 +83,15 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
 
 
 class FigureIfMade(Figure):
-    """A figure, or, before the script that draws it has been run, the command to run."""
+    """Insert a figure, or a note while the script that draws it has not been run."""
 
     def run(self) -> list[nodes.Node]:
         if "alt" not in self.options:
-            raise self.error(f"{self.arguments[0]} needs an :alt: text, for those who cannot see it")
+            raise self.error(f"{self.arguments[0]} needs an :alt: text for readers who cannot see it")
         page = Path(self.state.document.current_source or "").parent
         if (page / self.arguments[0]).is_file():
             return super().run()
-        return [nodes.paragraph("", f"(figure {self.arguments[0]}: not made yet)")]
+        return [nodes.paragraph("", f"(figure {self.arguments[0]}: not drawn yet)")]
 
 
 def setup(app: Sphinx) -> None:

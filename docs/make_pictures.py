@@ -1,12 +1,10 @@
-"""Draw the pictures of the environments' pages: ``python docs/make_pictures.py``."""
+"""Draw the pictures of the environments and the perturbations: ``python docs/make_pictures.py``."""
 
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from PIL import Image
 
-from sb3_tdpg.certificates.lava import certificate_figure
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.ball_view import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
@@ -14,42 +12,41 @@ from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
-from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.robustness import perturbation_gallery
 
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
 OPEN_LOOP = (-5.0, 0.0, 1.5, 0.0, -1.5)
-MUG = (0.5, 0.02, 0.0, 0.6)  # m and rad, its handle towards the viewer
+MUG = (0.5, 0.02, 0.0, 0.6)  # m and rad; the handle points to the viewer
 
 
 def lava(path: Path) -> None:
-    """To the wall, and from there to the goal, whatever the sensor says: four start positions side by side."""
-    films = []
+    """Animate the open-loop strategy from four start positions: to the wall, and from there to the goal."""
+    rows_of_frames = []
     for start in STARTS:
         env = LavaEnv(render_mode="rgb_array")
         env.reset(seed=0)
         env._state = np.array([[start, 0.0]])
-        film = [env.render()]
+        pictures = [env.render()]
         for control in OPEN_LOOP:
             env.step(np.array([control]))
-            film.append(env.render())
-        films.append(film)
-    frames = [Image.fromarray(np.concatenate(rows)) for rows in zip(*films, strict=True)]
+            pictures.append(env.render())
+        rows_of_frames.append(pictures)
+    frames = [Image.fromarray(np.concatenate(rows)) for rows in zip(*rows_of_frames, strict=True)]
     durations = [900] * (len(frames) - 1) + [2500]  # ms
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
 def side_by_side(images: list[np.ndarray], gap: int = 6) -> np.ndarray:
-    """Images of one height ``(H, W, 3)`` in a row, on white."""
+    """Join images of the same height ``(H, W, 3)`` in a row, with white gaps."""
     space = np.full((images[0].shape[0], gap, 3), 255, np.uint8)
     return np.concatenate([part for image in images for part in (image, space)][:-1], axis=1)
 
 
 def fly(texture: str = TRAINING_TEXTURE) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
-    An episode of a policy that knows where the ball lands and drives there at an even speed.
+    Run an episode of a scripted oracle that drives to the landing point of the ball at a constant speed.
 
-    :return: what ``render`` drew and what the camera saw, 26 times each
+    :return: the 26 pictures of ``render`` and the 26 images of the camera
     """
     env = BallCatchEnv(render_mode="rgb_array", texture=texture, robot_range=(-1.7, -1.7))
     observation, info = env.reset(seed=0)
@@ -65,7 +62,7 @@ def fly(texture: str = TRAINING_TEXTURE) -> tuple[list[np.ndarray], list[np.ndar
 
 
 def ball_textures(path: Path) -> None:
-    """The eight textures, upright as on the wall, and under each what the camera makes of it."""
+    """Draw the eight textures, upright as on the wall, and below each the image of the camera."""
     columns = []
     for name in (TRAINING_TEXTURE, *TEST_TEXTURES):
         (observation, _) = BallCatchEnv(renderer="fast", texture=name, robot_range=(0, 0)).reset(seed=0)
@@ -76,20 +73,20 @@ def ball_textures(path: Path) -> None:
 
 
 def ball_camera(path: Path) -> None:
-    """What the camera sees early, in the middle and late in the ball's flight."""
+    """Draw three images of the camera: early, in the middle and late in the flight of the ball."""
     _, observations = fly()
     Image.fromarray(side_by_side([enlarge(observations[t], 4) for t in (1, 9, 18)])).save(path, optimize=True)
 
 
 def ball_catch(path: Path) -> None:
-    """The scene from the side and from the camera, at two thirds of the real speed."""
+    """Animate the scene from the side and the image of the camera, at two thirds of the real speed."""
     pictures, observations = fly()
     frames = []
     for picture, observation in zip(pictures, observations, strict=True):
         scene = Image.fromarray(picture[:, :512]).resize((320, 160), Image.Resampling.LANCZOS)
         seen = Image.fromarray(observation).resize((160, 160), Image.Resampling.NEAREST)
         frames.append(Image.fromarray(side_by_side([np.array(scene), np.array(seen)])))
-    # One palette for all, since a palette for each frame flickers. Ball and robot are small but keep their colours.
+    # One palette for all frames, because a palette per frame flickers. Extra patches keep the colours of small parts.
     rare = np.array([(0, 120, 0), (0, 155, 0), (0, 190, 0), (10, 30, 80), (15, 60, 130), (35, 35, 40)], np.uint8)
     patches = rare[None].repeat(81, axis=1)[:, : frames[0].width].repeat(600, axis=0)
     palette = Image.fromarray(np.concatenate([*frames[::6], patches])).quantize(64)
@@ -99,7 +96,7 @@ def ball_catch(path: Path) -> None:
 
 
 def grasp(motion: str) -> PandaGraspEnv:
-    """Grasp a mug by its rim as one does who knows where it stands."""
+    """Grasp a mug by its rim with a scripted oracle that knows its pose."""
     env = PandaGraspEnv(motion=motion, render_mode="rgb_array")
     env.reset(seed=0)
     env._state = np.array([MUG])
@@ -110,7 +107,7 @@ def grasp(motion: str) -> PandaGraspEnv:
 
 
 def panda_depth(path: Path) -> None:
-    """The scene before a grasp from a third person, and the depth image."""
+    """Draw the scene before a grasp from a third person's view, and the depth image."""
     env = grasp("fast")
     env._view.place(env._film[0])
     scene = env._view.scene_picture(768, 1152)
@@ -121,7 +118,7 @@ def panda_depth(path: Path) -> None:
 
 
 def panda_camera(path: Path) -> None:
-    """The same mug from the lowest and the highest camera of the training and of the test, and from the usual one."""
+    """Draw the same mug from five camera heights: the usual one, and the lowest and highest of training and test."""
     (test, train) = (PANDA_GRASP_CAMERA[i].env_kwargs["camera_range"] for i in (1, 0))
     env = PandaGraspEnv()
     heights = [test[0], train[0], 0.0, train[1], test[1]]
@@ -131,11 +128,11 @@ def panda_camera(path: Path) -> None:
 
 
 def panda_grasp(path: Path) -> None:
-    """The paper's slow motion, faster while it comes down: down, close, up."""
+    """Animate the paper's slow motion (down, close, up), with fewer frames while the hand comes down."""
     env = grasp("reference")
     pictures = list(env.film())
     env.close()
-    # Coming down and closing take more than half of the time; what is not to be missed is the lift.
+    # Moving down and closing take more than half of the time; the lift is what matters.
     shown = [*range(40, 126, 6), *range(126, 139, 2), *range(139, len(pictures), 3)]
     sample = Image.fromarray(np.concatenate([pictures[i] for i in shown[::8]]))
     palette = sample.quantize(208, Image.Quantize.MAXCOVERAGE, kmeans=1)
@@ -145,17 +142,11 @@ def panda_grasp(path: Path) -> None:
 
 
 def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
-    """One image under each perturbation in five severities."""
+    """Draw one image under each perturbation at five severities."""
     perturbation_gallery(env_id, env_kwargs=env_kwargs).savefig(path, dpi=80)
     with Image.open(path) as picture:
-        # Without a palette: it would put bands of colours into the blurs.
+        # No palette: it would turn the blurs into bands of colour.
         picture.convert("RGB").save(path, optimize=True)
-
-
-def certificate(folder: Path) -> None:
-    """The figure of ``sb3-tdpg certify``, from the numbers that it has left."""
-    frames = (pd.read_csv(folder / name) for name in ("random.csv.xz", "paper.csv"))
-    save_figure(certificate_figure(*frames, trivial=315.0), folder / "certificate.png")
 
 
 if __name__ == "__main__":
@@ -170,4 +161,3 @@ if __name__ == "__main__":
     guide = Path(__file__).parent / "guide"
     perturbations(guide / "perturbations_ball.png", "BallCatch-v0", renderer="fast")
     perturbations(guide / "perturbations_grasp.png", "PandaGrasp-v0")
-    certificate(guide.parent / "results" / "certificate")

@@ -1,4 +1,4 @@
-"""Tuned settings in rl-zoo3's YAML format; ``tdpg.yml`` has one block for each environment and variant."""
+"""Read tuned settings in the YAML format of rl-zoo3; ``tdpg.yml`` has a block for each environment and variant."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ def load_hyperparams(block: str, algo: str = "tdpg") -> dict[str, Any]:
     """
     Read a block of ``<algo>.yml``.
 
-    :param block: An environment id, for some with a suffix for a variant (``Lava-v0``, ``Lava-v0-pg``, ...).
+    :param block: An environment id, with a suffix for some variants (``Lava-v0``, ``Lava-v0-pg``, ...).
     :param algo: Name of the file.
-    :return: a fresh dictionary: the caller may change it
-    :raises KeyError: if there is no such block; the message lists those there are.
+    :return: a new dictionary, which the caller may change
+    :raises KeyError: if the file has no such block; the message lists its blocks.
     """
     blocks = yaml.safe_load(resources.files(__name__).joinpath(f"{algo}.yml").read_text(encoding="utf-8"))
     if block not in blocks:
