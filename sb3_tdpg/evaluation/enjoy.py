@@ -1,4 +1,4 @@
-"""Watch a saved policy: run some episodes, print what they cost, record them as a film."""
+"""Watch a saved policy: run some episodes, print their costs, record them as a video."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ def enjoy(
     record: str | os.PathLike[str] | None = None,
 ) -> list[Episode]:
     """
-    Run episodes of a saved model and print cost and final state of each.
+    Run episodes of a saved model and print the cost and the final state of each.
 
-    :param model_path: What ``model.save`` wrote.
+    :param model_path: File written by ``model.save``.
     :param env_id: A registered id, also in the ``module:id`` form.
     :param env_kwargs: Keywords of the environment's constructor.
     :param seed: Seed of the environment and of the policy's sampling.
-    :param n_episodes: How many.
-    :param deterministic: Act without noise, which is another policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param record: Also write a film there, ``.gif`` or ``.mp4``: what the environment draws, and the TRVs over time.
-        Where it has a method ``film``, that draws what happened in a step.
+    :param n_episodes: Number of episodes.
+    :param deterministic: Act without noise, which changes the policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
+    :param record: Write a video of the environment's pictures and the TRVs there, ``.gif`` or ``.mp4``. If the
+        environment has a method ``film``, it returns the pictures between two steps.
     :return: the episodes; without ``record`` they have no pictures
-    :raises ValueError: if there is no model, it does not fit the environment, or no film can be made.
+    :raises ValueError: if there is no model, it does not fit the environment, or a video cannot be made.
     """
     if record is not None:
         check_animation_path(record)
@@ -66,8 +66,10 @@ def enjoy(
             if step.finished[0]:
                 pictures, costs, between = step.infos[0]["recorded"]
                 episodes.append(Episode(pictures, np.stack(trvs), np.array(costs), between))
-                state = _described(step.infos[0].get("state"))
-                print(f"episode {len(episodes)}: cost {sum(costs):.2f}{state}", flush=True)
+                text = f"episode {len(episodes)}: cost {episodes[-1].costs.sum():.2f}"
+                if (state := step.infos[0].get("state")) is not None:
+                    text += f", final state {np.array2string(np.asarray(state), precision=3, suppress_small=True)}"
+                print(text, flush=True)
                 trvs = []
     if n_episodes > 1:
         print(f"mean cost {np.mean([episode.costs.sum() for episode in episodes]):.2f}")
@@ -78,7 +80,7 @@ def enjoy(
 
 
 class _Recorder(gym.Wrapper):
-    """Keep what a vectorised environment loses when it resets an episode: pictures, and costs in double precision."""
+    """Record pictures, and costs in double precision, which a vectorised environment drops at its automatic reset."""
 
     def __init__(self, env: gym.Env, with_pictures: bool) -> None:
         super().__init__(env)
@@ -113,16 +115,16 @@ class _Recorder(gym.Wrapper):
 
 def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
     """
-    Read keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
+    Parse keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
 
-    :param texts: Each ``key=value``, the value in YAML: a number, a text, true, false, null or a list of these.
-    :raises ValueError: if one is something else, or a key comes twice.
+    :param texts: ``key=value`` each, with a YAML value: a number, a text, true, false, null or a list of these.
+    :raises ValueError: if a text has another form, or a key occurs twice.
     """
     keywords: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not (equals and key.isidentifier()):
-            raise ValueError(f"{text!r} is no keyword of an environment: write key=value, for instance horizon=10")
+            raise ValueError(f"{text!r} is not a keyword of an environment: write key=value, for instance horizon=10")
         if key in keywords:
             raise ValueError(f"{text!r}: {key} is given twice")
         try:
@@ -135,7 +137,7 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Refuse what is neither a scalar nor a list, and read 1e-3 as a number, which PyYAML takes for a text."""
+    """Refuse anything but scalars and lists, and read 1e-3 as a number, which PyYAML reads as text."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     if isinstance(value, str):
@@ -151,9 +153,3 @@ def _load(path: str | os.PathLike[str]) -> TDPG:
         return TDPG.load(Path(path))
     except OSError as e:
         raise ValueError(f"{path} cannot be read ({e.strerror}): give the .zip file that model.save() wrote") from e
-
-
-def _described(state: np.ndarray | None) -> str:
-    if state is None:
-        return ""
-    return f", final state {np.array2string(np.asarray(state), precision=3, suppress_small=True)}"

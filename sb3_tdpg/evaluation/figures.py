@@ -17,25 +17,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, which readers with any colour vision can tell apart: vermillion, blue, green, ...
+# The palette of Okabe and Ito, safe for colour-blind readers: vermillion, blue, green, ...
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK = "#333333"
-# Of the bounds that the limits of an information interval come from: marker and name.
-LOWER_MARKERS = {
-    "critic": ("^", "frozen critic"),
-    "gaussian": ("o", "Gaussian critic"),
-    "zero": ("_", "never negative"),
+# Marker and name of the bounds that the limits of an information interval come from.
+BOUNDS = {
+    "lower": {"critic": ("^", "frozen critic"), "gaussian": ("o", "Gaussian critic"), "zero": ("_", "never negative")},
+    "upper": {"logdet": ("v", "log-det"), "loo": ("s", "leave-one-out"), "marginal": ("D", "fitted marginal")},
 }
-UPPER_MARKERS = {"logdet": ("v", "log-det"), "loo": ("s", "leave-one-out"), "marginal": ("D", "fitted marginal")}
 MAX_ANNOTATED_STEPS = 15
-WIDTH = 9.0  # inches: about as wide as a README is shown, so that 9 points stay readable
+WIDTH = 9.0  # inches: about the width of a README, so that text of 9 points stays readable
 
 
 def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
     """
-    Draw cost and information over the policy epochs; the cost on a logarithmic axis unless an epoch costs nothing.
+    Draw cost and information over the policy epochs; the cost axis is logarithmic if all costs are positive.
 
-    :param progress: By label, what SB3's CSV logger wrote: ``pandas.read_csv("progress.csv")``.
+    :param progress: Log of SB3's CSV logger by label: ``pandas.read_csv("progress.csv")``.
     """
     figure = _new_figure(WIDTH, 2.8)
     cost, information = (figure.add_subplot(1, 2, i) for i in (1, 2))
@@ -58,7 +56,7 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
 
 def information_timeline(frame: pd.DataFrame) -> Figure:
     """
-    Draw the interval that holds I[x_t; x~_t] over the time steps, with the bounds that its limits come from.
+    Draw the interval for I[x_t; x~_t] over the time steps, with the bounds that its limits come from.
 
     :param frame: From :func:`~sb3_tdpg.evaluation.interval_frame`.
     """
@@ -67,10 +65,10 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     _tidy(axes)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
     axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
-    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # the only ones there are
+    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # visible also with one step
     axes.plot(t, lower, color=PALETTE[1], linewidth=0.8)
     axes.plot(t, upper, color=PALETTE[1], linewidth=0.8)
-    for limit, markers in (("lower", LOWER_MARKERS), ("upper", UPPER_MARKERS)):
+    for limit, markers in BOUNDS.items():
         for name, (marker, label) in markers.items():
             rows = frame[frame[f"{limit}_name"] == name]
             if len(rows):
@@ -88,20 +86,19 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
 
 def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats") -> Figure:
     """
-    Draw what the TRVs know of each component of the state at each time step, as a heat map.
+    Draw the information in the TRVs about each component of the state at each time step, as a heat map.
 
-    Grey where a component is constant. A value in brackets is not distinguishable from nothing.
+    Constant components are grey. Values in brackets are not distinguishable from 0.
 
     :param frame: From :func:`~sb3_tdpg.evaluation.state_knowledge`.
-    :param quantity: What the colour shows.
+    :param quantity: The column to show.
     :raises ValueError: if the frame has no component.
     """
     if len(frame) == 0:
         raise ValueError("the frame has no component: every one is constant, or too few episodes are alive")
     components = frame["component"].unique()
-    table = {name: frame.pivot(index="component", columns="t", values=name).loc[components] for name in
-             (quantity, "nats_lower")}  # fmt: skip
-    values = table[quantity].to_numpy()  # (X, T)
+    table = frame.pivot(index="component", columns="t").loc[components]
+    values, lower = table[quantity].to_numpy(), table["nats_lower"].to_numpy()  # (X, T) each
     n_rows, n_columns = values.shape
     figure = _new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 10.0), 1.3 + 0.5 * n_rows)
     axes = figure.add_subplot()
@@ -111,9 +108,8 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
     for row, column in np.ndindex(values.shape) if n_columns <= MAX_ANNOTATED_STEPS else ():
         value = values[row, column]
         if np.isfinite(value):
-            is_known = table["nats_lower"].to_numpy()[row, column] > 0
             color = "white" if value < 0.6 * top else INK
-            text = f"{value:.2f}" if is_known else f"({value:.2f})"
+            text = f"{value:.2f}" if lower[row, column] > 0 else f"({value:.2f})"
             axes.text(column, row, text, color=color, fontsize=8, ha="center", va="center")
     axes.set_yticks(range(n_rows), components, fontsize=9)
     axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
@@ -127,24 +123,24 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
 
 
 def _short(row: str) -> str:
-    """Return what tells a row of a table from its neighbours: "Sensor noise 0.10" -> "0.10"."""
+    """Shorten the name of a row for a tick label: "Sensor noise 0.10" -> "0.10"."""
     last = row.rsplit(" ", 1)[-1]
     return last if last[0].isdigit() else "0" if row == "Training" else row
 
 
 def _legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    columns = -(-len(labels) // -(-len(labels) // 3))  # as few rows as hold them by three, evenly filled
+    columns = -(-len(labels) // -(-len(labels) // 3))  # as few rows as possible with up to three columns, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> None:
     """
-    Write a figure so that at no time a half-written file is there.
+    Save a figure; the file appears only when it is complete.
 
-    :param figure: A figure of this module.
-    :param path: The file; its ending tells the format. Folders are made.
-    :param dpi: Pixels an inch.
+    :param figure: A Matplotlib figure.
+    :param path: The file, whose extension sets the format. Folders are created.
+    :param dpi: Pixels per inch.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

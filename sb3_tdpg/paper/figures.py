@@ -22,7 +22,7 @@ from sb3_tdpg.evaluation.figures import (
     _short,
     _tidy,
 )  # fmt: skip
-from sb3_tdpg.evaluation.trajectories import rollout_states
+from sb3_tdpg.evaluation.records import rollout_states
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.defaults import DEPTH, IMAGE, VECTOR
-from sb3_tdpg.evaluation.knowledge import state_knowledge
+from sb3_tdpg.evaluation.information import state_knowledge
 from sb3_tdpg.measurement import estimate_information, information_interval, trust_checks
 
 
