@@ -117,7 +117,7 @@ def run_episodes(
                 info = step.infos[i]
                 of_monitor = info["episode"] if monitored else {}
                 cost, length = -of_monitor.get("r", returns[i]), of_monitor.get("l", step.t[i] + 1)
-                ended[step.episode[i], i] = dict(cost=cost, length=length, **_final_columns(info))
+                ended[int(step.episode[i]), int(i)] = dict(cost=cost, length=length, **_final_columns(info))
                 if at_end is not None:
                     at_end()
             returns[step.dones] = 0
@@ -152,7 +152,8 @@ def rollout_states(
     env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
     with contextlib.closing(env):
         problem = read_problem(env)
-        states, costs = [], np.zeros(n_episodes)
+        states: list[Any] = []
+        costs = np.zeros(n_episodes)
         steps = rollout(model, env, seeds=evaluation_seeds(seed), deterministic=deterministic, problem=problem)
         for step in islice(steps, problem.horizon):
             if step.dones.any() and len(states) < problem.horizon - 1:

@@ -65,7 +65,7 @@ def rollout(
     :param n_episodes: Number of episodes of all environments together; ``None``: run until the caller stops.
     :param seeds: Seeds of the environments and of the policy's sampling; ``None``: take the generators as they are.
     :param deterministic: Act without noise; see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param problem: From :func:`~sb3_tdpg.problem.read_problem(env)`: also yield the true states.
+    :param problem: From ``read_problem(env)``: also yield the true states.
     :param encode: Also yield the TRVs with their densities. For TDPG models, with a stochastic policy.
     :param observe: Changes the observations before the policy sees them, for instance ``normalize_obs``.
     """

@@ -43,22 +43,11 @@ def aggregate_seeds(
         (point,), (low,), (high,) = _bootstrap(
             lambda x: np.array([iqm(x)]), means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed
         )
+        seeds = dict(n_seeds=len(means), iqm=point, low=low, high=high, min=means.min(), max=means.max())
+        how = {name: one_or_all(group[name]) for name in ("seed", "deterministic")}
+        std = iqm(group["std"].to_numpy())
         rows.append(
-            dict(
-                model=model,
-                scenario=scenario,
-                n_seeds=len(means),
-                iqm=point,
-                low=low,
-                high=high,
-                min=means.min(),
-                max=means.max(),
-                episode_std=iqm(group["std"].to_numpy()),
-                level=level,
-                n=group["n"].iloc[0],
-                seed=one_or_all(group["seed"]),
-                deterministic=one_or_all(group["deterministic"]),
-            )
+            dict(model=model, scenario=scenario, **seeds, episode_std=std, level=level, n=group["n"].iloc[0], **how)
         )
     return pd.DataFrame(rows)
 

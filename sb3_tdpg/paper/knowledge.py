@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple, cast
 
@@ -61,7 +62,7 @@ def trv_knowledge(
                 env,
                 seeds=of_wall,
                 problem=read_problem(env),
-                observe=lambda images, factor=factor: np.rint(images * factor).astype(np.uint8),
+                observe=partial(_darkened, factor=factor),
             )
             known, states = zip(*((step.memory[0], step.states) for step in islice(steps, model.horizon)), strict=True)
         trvs.append(np.stack(known))
@@ -73,6 +74,10 @@ def trv_knowledge(
     for name, values in (("brightness", factors), ("wall", colors)):  # constant over time
         targets[name] = np.broadcast_to(np.concatenate(values), (len(all_trvs), all_trvs.shape[1], values[0].shape[1]))
     return {name: _r2(all_trvs, target) for name, target in targets.items()}
+
+
+def _darkened(images: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    return np.rint(images * factor).astype(np.uint8)
 
 
 class Mugs(NamedTuple):

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find
 from sb3_tdpg.robustness.scenes import scene_perturbations
-from sb3_tdpg.robustness.sensor import Sensor, kind_of
+from sb3_tdpg.robustness.sensor import Sensor, horizon_of, kind_of
 from sb3_tdpg.vec_env import make_episodes_env
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def perturbation_gallery(
             return stack.enter_context(contextlib.closing(own))
 
         plain = made({})
-        space, horizon, frames = plain.observation_space, _horizon(plain), _frames(plain, n_steps, seed)
+        space, horizon, frames = plain.observation_space, horizon_of(plain), _frames(plain, n_steps, seed)
         if not isinstance(space, spaces.Box) or kind_of(space) != "image":
             raise ValueError(f"a gallery shows images, and the observation space is {space}")
         rows: dict[str, list[np.ndarray]] = {}
@@ -72,15 +72,11 @@ def perturbation_gallery(
     return _draw(frames[-1], rows, Sensor(space))
 
 
-def _horizon(env: VecEnv) -> int | None:
-    return env.get_attr("horizon", [0])[0] if env.has_attr("horizon") else None
-
-
 def _frames(env: VecEnv, n_steps: int, seed: int) -> list[np.ndarray]:
     """Return the images of an episode of the first environment, up to the one that is drawn."""
     env.seed(seed)
     frames = [np.asarray(env.reset())[0]]
-    horizon = _horizon(env)
+    horizon = horizon_of(env)
     actions = np.zeros((env.num_envs, *(env.action_space.shape or ())), env.action_space.dtype)
     for _ in range(n_steps if horizon is None else min(n_steps, horizon - 1)):
         observations, _, dones, _ = env.step(actions)

@@ -1,6 +1,4 @@
-"""
-Perturbations of the scene, such as another texture or camera pose, which are keywords of the environment.
-"""
+"""Perturbations of the scene, such as another texture or camera pose, which are keywords of the environment."""
 
 from __future__ import annotations
 

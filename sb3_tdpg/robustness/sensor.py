@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 VAST = 1e6
 """Bounds further apart count as infinite: some environments use the largest float for "unbounded"."""
@@ -33,6 +35,13 @@ def kind_of(space: spaces.Space) -> str | None:
         return None
     has_pixels = len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)
     return "image" if has_pixels and np.isfinite(finite_range(space)).all() else "vector"
+
+
+def horizon_of(env: gym.Env | VecEnv) -> int | None:
+    """Return the attribute ``horizon`` of an environment, if it has one."""
+    if isinstance(env, VecEnv):
+        return env.get_attr("horizon", [0])[0] if env.has_attr("horizon") else None
+    return env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
 
 
 @dataclass(frozen=True, eq=False)

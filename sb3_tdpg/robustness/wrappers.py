@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import find
 from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.sensor import horizon_of
 
 Scale = float | np.ndarray | None
 
@@ -44,8 +45,7 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
             raise ValueError(f"{type(env).__name__} holds several environments: use PerturbedVecEnv")
         RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
         gym.ObservationWrapper.__init__(self, env)
-        horizon = env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
-        self._perturber = _perturber(perturbation, severity, env, 1, seed, scale, horizon)
+        self._perturber = _perturber(perturbation, severity, env, 1, seed, scale)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and perturb its first observation."""
@@ -85,8 +85,7 @@ class PerturbedVecEnv(VecEnvWrapper):
                 "not the other way round"
             )
         super().__init__(venv)
-        horizon = venv.get_attr("horizon", [0])[0] if venv.has_attr("horizon") else None
-        self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale, horizon)
+        self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale)
 
     def reset(self) -> np.ndarray:
         """Start N episodes, and perturb their first observations."""
@@ -122,12 +121,12 @@ class PerturbedVecEnv(VecEnvWrapper):
 
 
 def _perturber(
-    name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale, horizon: int | None
+    name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale
 ) -> Perturber:
     perturbation, space = find(name), env.observation_space
     perturbation.value(severity)
     # Checked before the calibration, which takes time.
-    if (objection := perturbation.objection(space, horizon)) is not None:
+    if (objection := perturbation.objection(space, horizon_of(env))) is not None:
         raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
     if seed is not None and (isinstance(seed, bool) or seed < 0):
         raise ValueError(f"seed={seed} must be None or an integer of at least 0")
