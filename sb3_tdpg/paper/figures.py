@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_bins: int = 40) -> Figure:
     """
-    Draw how often each model incurs which cost, as in the paper's Fig. 3: one panel for each scenario.
+    Draw histograms of the episode cost, as in the paper's Fig. 3: one panel for each scenario.
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
     :param scenarios: The panels from left to right.
-    :param n_bins: Bins, the same in all panels. They are equal on a logarithmic axis, since costs range over two
-        decades, unless a cost is zero or negative.
+    :param n_bins: Number of bins, the same in all panels. They are equal on a logarithmic axis, since costs range over
+        two decades, unless a cost is zero or negative.
     """
     names = [scenario.name for scenario in scenarios]
     shown = records[records["scenario"].isin(names)]
@@ -47,7 +47,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
     low, high = shown["cost"].min(), shown["cost"].max()
     is_positive = low > 0
     if is_positive:
-        low = max(low, high / 1e3)  # a few costs next to 0 must not stretch the axis; they go into the first bin
+        low = max(low, high / 1e3)  # a few costs near 0 must not stretch the axis: they go into the first bin
         bins = np.geomspace(low, high * 1.001, n_bins + 1)
     else:
         bins = np.histogram_bin_edges(shown["cost"], n_bins)
@@ -77,11 +77,11 @@ def lava_trajectories(
     deterministic: bool = False,
 ) -> Figure:
     """
-    Draw where the robot of the lava problem is over time: one column for each model, one row for each noise level.
+    Draw the position of the robot of the lava problem over time: one column per model, one row per noise level.
 
     :param models: SB3 models by their label.
-    :param env_kwargs: Keywords of the environment beside its noise.
-    :param n_episodes: Episodes in a panel; the same start positions in all.
+    :param env_kwargs: Keywords of the environment other than its noise.
+    :param n_episodes: Number of episodes in a panel; all panels have the same start positions.
     :param seed: Seed of the episodes.
     :param noise_variances: sigma^2 of the sensor in each row.
     :param deterministic: Act without noise.
@@ -117,8 +117,8 @@ def robustness_curves(
     Draw each method's mean cost over the rows of a table: a line for the median seed, a dot for each seed.
 
     :param records: With a column ``train_seed``.
-    :param noise_rows: Scenarios that are ordered; they follow the reference in the left panel.
-    :param other_rows: Scenarios without an order, for the right panel.
+    :param noise_rows: Ordered scenarios, which follow the reference in the left panel.
+    :param other_rows: Unordered scenarios for the right panel.
     :param reference: The scenario of the training.
     """
     figure = _new_figure(WIDTH, 3.6)
@@ -144,7 +144,7 @@ def robustness_curves(
 
 def diagnosis_bars(records: pd.DataFrame) -> Figure:
     """
-    Draw the final distance of each method in each scenario of a diagnosis: a bar for the median seed, a dot for each.
+    Draw the final distance of each method in each scenario of a diagnosis: a bar for the median, a dot for each seed.
 
     :param records: With the columns ``train_seed`` and ``distance`` (m).
     """
@@ -168,10 +168,10 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
 
 def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
     """
-    Draw the share of failed grasps over the mug's yaw, in polar coordinates: it shows where the handle matters.
+    Draw the share of failed grasps over the mug's yaw in polar coordinates, which shows the effect of the handle.
 
     :param records: Episodes with the columns ``model``, ``yaw`` (rad) and ``cost`` (1 for a failure).
-    :param n_bins: Sectors of the circle.
+    :param n_bins: Number of sectors.
     """
     figure = _new_figure(5.2, 5.2)
     axes = figure.add_subplot(projection="polar")
@@ -190,10 +190,10 @@ def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
 
 def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
     """
-    Draw the share of failed grasps over how much higher than usual the camera was.
+    Draw the share of failed grasps over the height of the camera above its usual place.
 
     :param records: Episodes with the columns ``model``, ``camera`` (m) and ``cost`` (1 for a failure).
-    :param n_bins: Parts of the range of heights.
+    :param n_bins: Number of intervals of the height.
     """
     figure = _new_figure(WIDTH * 0.7, 3.2)
     axes = figure.add_subplot()

@@ -34,16 +34,16 @@ def trv_knowledge(
     model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_walls: int = 64, n_episodes: int = 10, seed: int = 0
 ) -> dict[str, float]:
     """
-    Tell how much of the robot's position, of the brightness and of the wall's colour can be read from the TRVs.
+    Regress the robot's position, the brightness and the wall's colour on the TRVs of a ball-catching policy.
 
-    Episodes run in front of random walls, every one with all its images darkened by a factor of its own. At each time
-    step each quantity is regressed linearly on the TRVs before half of the walls, and R^2 taken before the other half:
-    on the same walls a regression could learn by heart which wall has which colour.
+    Episodes run in front of random walls, with all images of an episode darkened by the same random factor. At each
+    time step a linear regression is fitted on half of the walls, and R^2 is computed on the other half: on the same
+    walls it could memorise the colours.
 
     :param model: A model of ``BallCatch-v0``.
-    :param env_kwargs: Keywords of the environment, such as those of a launch that varies.
-    :param n_walls: Random walls, an even number.
-    :param n_episodes: Episodes in front of each.
+    :param env_kwargs: Keywords of the environment, for instance of a varying launch.
+    :param n_walls: Number of random walls, even.
+    :param n_episodes: Number of episodes in front of each wall.
     :param seed: Seed of the episodes and of the darkening.
     :return: R^2, averaged over time and not below 0, of ``"position"`` (d_t), ``"brightness"`` (the factor) and
         ``"wall"`` (its mean colour, averaged over red, green and blue)
@@ -81,7 +81,7 @@ def _darkened(images: np.ndarray, factor: np.ndarray) -> np.ndarray:
 
 
 class Mugs(NamedTuple):
-    """N mugs of the grasping problem, and what the camera shows of them."""
+    """N mugs of the grasping problem, with their camera images."""
 
     states: np.ndarray  # (N, 4): x, y, z, yaw; (N, 5) with the camera's height where it varies
     images: np.ndarray  # (N, 1, 128, 128)
@@ -89,11 +89,11 @@ class Mugs(NamedTuple):
 
 def draw_mugs(env_kwargs: Mapping[str, Any] | None = None, *, n_mugs: int = 10_000, seed: int = 0) -> Mugs:
     """
-    Draw mugs; nothing is grasped.
+    Draw mugs and their images, without grasping.
 
     :param env_kwargs: Keywords of ``PandaGrasp-v0``.
-    :param n_mugs: N
-    :param seed: Seed of their poses.
+    :param n_mugs: Number of mugs N.
+    :param seed: Seed of the poses.
     """
     env = make_episodes_env("PandaGrasp-v0", n_episodes=n_mugs, env_kwargs=env_kwargs, use_processes=False)
     env.seed(evaluation_seeds(seed).env)
@@ -105,12 +105,12 @@ def draw_mugs(env_kwargs: Mapping[str, Any] | None = None, *, n_mugs: int = 10_0
 
 def encode_mugs(model: Any, mugs: Mugs, *, seed: int = 0) -> InformationBatch:
     """
-    Show mugs to a policy of the grasping problem.
+    Encode the images of mugs with a policy of the grasping problem.
 
     :param model: A model of ``PandaGrasp-v0``.
-    :param mugs: N of them.
+    :param mugs: N mugs.
     :param seed: Seed of the policy's sampling.
-    :return: what is in :class:`Mugs` as states, ``(1, N, 4 or 5)``; TRVs, means and standard deviations ``(1, N, Z)``
+    :return: the states of :class:`Mugs`, ``(1, N, 4 or 5)``; TRVs, means and standard deviations ``(1, N, Z)``
     """
     steps = []
     with isolated_randomness(evaluation_seeds(seed).policy, model):
@@ -123,10 +123,10 @@ def encode_mugs(model: Any, mugs: Mugs, *, seed: int = 0) -> InformationBatch:
 
 def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     """
-    Probe how much of the mug's pose can be read from the TRVs of the grasping problem.
+    Regress the mug's pose on the TRVs of a grasping policy.
 
-    Each is regressed on the TRVs and their squares and products for half of the mugs; R^2 is that for the other half.
-    It is too low by about the number of these (152 for 16 TRVs) over half the number of mugs.
+    Each quantity is regressed on the TRVs and their squares and products for half of the mugs; R^2 is computed on the
+    other half. It is too low by about the number of regressors (152 for 16 TRVs) over half the number of mugs.
 
     :param batch: From :func:`encode_mugs`, with an even number of mugs.
     :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (of its sine and cosine together), and of the
@@ -144,9 +144,9 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
 
 def _r2(trvs: np.ndarray, targets: np.ndarray, *, pooled: bool = False) -> float:
     """
-    R^2 on the second half of the episodes of a linear regression on the first, averaged over time and components.
+    Fit a linear regression to the first half of the episodes, and average its R^2 on the second half over time.
 
-    :param pooled: Components count by their variance, and not alike.
+    :param pooled: Weight the components by their variance, not equally.
     """
     half = trvs.shape[1] // 2
     x = np.concatenate([trvs, np.ones_like(trvs[..., :1])], axis=-1)
