@@ -46,8 +46,8 @@ def test_each_environment_runs_its_quota_however_short_its_episodes_are():
 
 def test_time_and_memory_start_again_with_each_episode():
     env = countdown()
-    for step in rollout(Still(env), env, 6):
-        running = step.episode < 2
+    for step in rollout(Still(env), env, 7):
+        running = step.episode < np.array([2, 2, 3])
         np.testing.assert_array_equal(step.memory[0][running], step.t[running] + 1)
         assert (step.memory[0][~running] == 1).all(), "through its quota: the memory is cleared at every step"
 
@@ -110,6 +110,18 @@ def test_the_states_and_the_densities_belong_to_their_observations_also_after_an
         rebuilt = step.encoded.means + step.encoded.stds * step.encoded.noise
         np.testing.assert_allclose(step.encoded.trvs, rebuilt, atol=1e-6)
     assert (steps[problem.horizon].t == 0).all()
+
+
+def test_encoding_acts_as_predict_does_also_in_environments_that_are_through_their_quota():
+    def env():
+        return DummyVecEnv([lambda: CountdownEnv(0, (2,)), lambda: CountdownEnv(1, (4,))])
+
+    model = tiny_tdpg(env(), n_episodes=4)
+    assert model.policy.time_varying
+    encoded, plain = (list(rollout(model, env(), 2, seeds=EvaluationSeeds(1, 2), encode=e)) for e in (True, False))
+    assert len(encoded) == 4
+    for ours, theirs in zip(encoded, plain, strict=True):
+        np.testing.assert_allclose(ours.actions, theirs.actions, rtol=1e-6)
 
 
 def test_the_policy_sees_what_observe_makes_of_the_observations():
