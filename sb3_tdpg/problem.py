@@ -1,5 +1,5 @@
 """
-What TDPG must know of an environment beside its spaces: the horizon, and the true state in training.
+The properties of an environment that TDPG needs in addition to its spaces: the horizon and the true state.
 
 Dimension key: E environments, X state.
 """
@@ -24,10 +24,10 @@ class Problem:
     """
     A finite-horizon problem as the algorithm sees it.
 
-    :param horizon: Controls in an episode, T.
-    :param state_dim: X
-    :param state_is_observation: The environment tells no state, and the observation stands in for it.
-    :param state_names: Of the X components: the environment's ``state_names``, or ``x0``, ``x1``, ...
+    :param horizon: Number of controls T in an episode.
+    :param state_dim: Dimension X of the state.
+    :param state_is_observation: The environment does not report its state, and the observation is used instead.
+    :param state_names: Names of the X components: the environment's ``state_names``, or ``x0``, ``x1``, ...
     """
 
     horizon: int
@@ -36,12 +36,12 @@ class Problem:
     state_names: tuple[str, ...]
 
     def initial_states(self, env: VecEnv, obs: np.ndarray) -> np.ndarray:
-        """x_0 after a reset or an auto-reset of all environments: ``(E, X)``."""
+        """Return x_0 after a reset or an automatic reset of all environments: ``(E, X)``."""
         # The wrappers' own reset_infos stay empty.
         return self._states(env.unwrapped.reset_infos, obs)
 
     def next_states(self, env: VecEnv, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
-        """x_{t+1} after a step, or x_0 of the next episode where one has ended: ``(E, X)``."""
+        """Return x_{t+1} after a step, or x_0 of the next episode where one has ended: ``(E, X)``."""
         if dones.any():
             reset_infos = env.unwrapped.reset_infos
             infos = [reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
@@ -61,9 +61,9 @@ class Problem:
 
 def read_problem(env: VecEnv) -> Problem:
     """
-    Learn the horizon and the state of an environment, without a step.
+    Read the horizon and the state of an environment, without a step.
 
-    :raises ValueError: if it has no finite horizon, an unsuitable observation space, no state where it needs one, or
+    :raises ValueError: if it has no finite horizon, an unsuitable observation space, no state although it needs one, or
         names that do not fit the state.
     """
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
@@ -73,7 +73,7 @@ def read_problem(env: VecEnv) -> Problem:
     horizon = _attribute(env, "horizon")
     if horizon is None:
         spec = _attribute(env, "spec")
-        # A TimeLimit put around by hand is not in the spec.
+        # A TimeLimit that the user wrapped around it is not in the spec.
         horizon = _attribute(env, "_max_episode_steps") if spec is None else spec.max_episode_steps
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(
@@ -87,21 +87,21 @@ def read_problem(env: VecEnv) -> Problem:
     observation_shape = env.observation_space.shape
     if observation_shape is None or len(observation_shape) > 1:
         raise ValueError(
-            f"the mutual information is that of the true state, and an observation of shape {observation_shape} "
-            f"cannot stand in for it: {BRING_THE_STATE}"
+            f"the mutual information needs the true state, and an observation of shape {observation_shape} cannot "
+            f"stand in for it: {BRING_THE_STATE}"
         )
     state_dim = max(1, int(np.prod(observation_shape)))
     return Problem(int(horizon), state_dim, state_is_observation=True, state_names=_state_names(env, state_dim))
 
 
 def reward_threshold(env: VecEnv) -> float | None:
-    """Return the return at which the environment counts as solved, if it was registered with one."""
+    """Get the return at which the environment counts as solved, if it was registered with one."""
     spec = _attribute(env, "spec")
     return None if spec is None else spec.reward_threshold
 
 
 def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
-    """Read the names of the components of the state; an environment need not have any."""
+    """Read the names of the components of the state, which are optional."""
     names = _attribute(env, "state_names")
     if names is None:
         return tuple(f"x{k}" for k in range(state_dim))

@@ -1,5 +1,5 @@
 r"""
-An upper bound on the expected cost under every distribution that is close to the training distribution.
+An upper bound on the expected cost under every distribution close to the training distribution.
 
 The Donsker-Varadhan formula gives, for every :math:`\beta > 0`,
 
@@ -7,7 +7,8 @@ The Donsker-Varadhan formula gives, for every :math:`\beta > 0`,
     \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
     \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c},
 
-and the right side is known from costs under p alone. It corrects the paper's Theorem II.1; the derivation is in ``docs/guide/certificate.md``.
+and the right side needs costs under p only. It corrects the paper's Theorem II.1; the derivation is in
+``docs/guide/certificate.md``.
 
 Dimension key: N episodes, M points of a distribution.
 """
@@ -25,7 +26,7 @@ try:
 except ImportError as e:
     raise ImportError("certificates need scipy: pip install sb3_tdpg[plots]") from e
 
-# All of the highest costs, then steps of this factor in the rank: of a million costs 400 remain.
+# All of the highest costs, then ranks that grow by this factor: 400 of a million costs remain.
 _HIGHEST = 50
 _RANK_FACTOR = 1.04
 
@@ -33,33 +34,25 @@ _RANK_FACTOR = 1.04
 class CostDistribution(NamedTuple):
     """A distribution on M values that lies, with some confidence, stochastically above that of a cost."""
 
-    values: np.ndarray
-    """``(M,)``, ascending."""
-    probabilities: np.ndarray
-    """``(M,)``: of the values."""
-    confidence: float | None
-    """With which it lies above; None: no allowance for the sampling error was made."""
+    values: np.ndarray  #: (M,), ascending
+    probabilities: np.ndarray  #: (M,)
+    confidence: float | None  #: None: without allowance for the sampling error
 
     def with_largest(self, probability: float) -> CostDistribution:
-        """
-        Raise the cost to the largest value in an event of this probability, of which nothing else is known.
-
-        At worst the event is where the cost is lowest.
-
-        :param probability: Of the event.
-        """
+        """Raise the cost to the largest value in any event of this probability; at worst where the cost is lowest."""
         below = np.clip(np.cumsum(self.probabilities) - probability, 0.0, 1.0)
         below[-1] = 1.0
         return self._replace(probabilities=np.diff(below, prepend=0.0))
 
     def capped(self, level: float) -> tuple[CostDistribution, float]:
         """
-        Cut off the upper tail: move it to the least value of the sample that a cost exceeds with at most ``level``.
+        Cap the cost at the lowest value of the sample that it exceeds with a probability of at most ``level``.
 
-        :param level: A probability. Where the sample is too small for it, its largest value is the cap.
+        If the sample is too small for the level, the cap is its largest value.
+
         :return: the distribution of the capped cost, and the probability of a cost above the cap
         """
-        n = len(self.values) - (self.confidence is not None)  # the last value is then no cost of the sample
+        n = len(self.values) - (self.confidence is not None)  # then the last value is not from the sample
         below = np.cumsum(self.probabilities)[:n]
         last = min(int(np.searchsorted(below, 1 - level)), n - 1)
         kept = np.append(self.probabilities[:last], 1 - (below[last - 1] if last else 0.0))
@@ -67,29 +60,22 @@ class CostDistribution(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """A bound on an expected cost, and what it is made of: ``bound = risk + kl / beta``."""
+    """An upper bound on an expected cost, and its parts: ``bound = risk + kl / beta``."""
 
-    bound: float
-    """On the expected cost."""
-    beta: float
-    """The best one, or the one given. inf: the bound is the largest cost; 0: it is the mean."""
-    risk: float
-    """The entropic risk at beta, with the allowance for the sampling error."""
-    kl: float
-    """The divergence in nats that the bound is for."""
-    confidence: float | None
-    """With which the bound holds; None: no allowance for the sampling error was made."""
+    bound: float  #: on the expected cost
+    beta: float  #: the best or the given one; inf: the bound is the largest cost, 0: it is the mean
+    risk: float  #: entropic risk at beta, with the allowance for the sampling error
+    kl: float  #: divergence of the shift in nats
+    confidence: float | None  #: None: without allowance for the sampling error
 
 
 def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:
     r"""
-    Entropic risk :math:`\rho_\beta[c] = \frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
-
-    It is equation 4.
+    Compute the entropic risk (Equation 4), :math:`\frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
 
     :param costs: ``(N,)``
     :param beta: At least 0; 0 gives the limit, the mean.
-    :param probabilities: Of the costs, ``(N,)``; default: 1 / N each.
+    :param probabilities: Probabilities of the costs, ``(N,)``; default: 1 / N each.
     :raises ValueError: if a cost is not finite, or beta is negative or not finite.
     """
     costs = _checked_costs(costs)
@@ -103,11 +89,11 @@ def _risk(values: np.ndarray, weights: np.ndarray, beta: float) -> float:
     mean = float(weights @ values)
     if beta == 0:
         return mean
-    # Around the mean, since the difference from it is of the order of beta; the largest exponent is taken out before
-    # the exponential. This is scipy's logsumexp without its checks, which take ten times as long as the sum.
+    # Relative to the mean, since the difference from it is of the order of beta. The rest is scipy's logsumexp without
+    # its checks, which take ten times as long as the sum.
     exponents = beta * (values - mean)
     largest = float(exponents.max())
-    if largest < 1:  # so small a difference from 1 would be lost
+    if largest < 1:  # expm1: a small difference from 1 would be rounded away
         return mean + math.log1p(float(weights @ np.expm1(exponents))) / beta
     return mean + (largest + math.log(float(weights @ np.exp(exponents - largest)))) / beta
 
@@ -116,20 +102,20 @@ def cost_distribution(
     costs: np.ndarray, cost_bound: float | None = None, confidence: float | None = 0.95
 ) -> CostDistribution:
     r"""
-    Turn a sample of costs into a distribution above that of the cost, by a confidence band.
+    Bound the distribution of the cost from above by a confidence band around a sample of costs.
 
-    The i-th lowest of N costs has :math:`F(c_{(i)})` above a Beta(i, N + 1 - i) variable. Its lower quantiles at
-    ``1 - confidence``, divided by the number of ranks i that are used, hold at once (Bonferroni), and the step function
-    through them is a lower bound on F. What F lacks at the highest cost, about ``log(400 / (1 - confidence)) / N``, is
-    put at ``cost_bound``. So *every* mean of an increasing function is bounded at once: the entropic risk for all beta,
-    and optimising over beta costs nothing (Anderson's bound, 1969, with a band that is narrow in the tail, where
-    Dvoretzky, Kiefer and Wolfowitz's is wide: :math:`N^{-1}` against :math:`N^{-1/2}`).
+    The i-th lowest of N costs has :math:`F(c_{(i)})` above a Beta(i, N + 1 - i) variable. The lower quantiles at
+    ``1 - confidence``, divided by the number of ranks i that are used, hold simultaneously (Bonferroni), and the step
+    function through them is a lower bound on F. The missing probability at the highest cost, about
+    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. This bounds the mean of every increasing function
+    simultaneously, so the entropic risk may be optimised over beta. (It is Anderson's bound of 1969 with a band whose
+    width in the tail is :math:`N^{-1}`, not :math:`N^{-1/2}` as that of Dvoretzky, Kiefer and Wolfowitz.)
 
     :param costs: Independent and identically distributed, ``(N,)``.
-    :param cost_bound: What the cost of no episode can exceed.
+    :param cost_bound: Upper bound on the episode cost.
     :param confidence: Probability with which the band holds; ``None``: the distribution of the sample itself, on the
-        same ranks, without any allowance for the sampling error.
-    :raises ValueError: if a cost is not finite or exceeds the bound, or a confidence is asked for without a bound.
+        same ranks, without allowance for the sampling error.
+    :raises ValueError: if a cost is not finite or exceeds the bound, or a confidence is given without a bound.
     """
     costs = np.sort(_checked_costs(costs))
     n = len(costs)
@@ -150,31 +136,30 @@ def cost_distribution(
 
 
 def check_allowance(confidence: float | None, cost_bound: float | None) -> None:
-    """Raise a ``ValueError`` if a confidence is none, or is asked for without a bound on the cost."""
+    """Raise a ``ValueError`` if the confidence is not a probability, or there is no finite cost bound for it."""
     if confidence is None:
         return
     if not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, or be None for no allowance")
     if cost_bound is None or not np.isfinite(cost_bound):
         raise ValueError(
-            f"cost_bound={cost_bound} must be finite for a confidence of {confidence}: without it one rare episode "
-            "could cost anything; give the largest cost that an episode can have, or confidence=None for an "
-            "estimate without allowance for the sampling error"
+            f"cost_bound={cost_bound} must be finite for a confidence of {confidence}, because a rare episode could "
+            "cost anything: give an upper bound on the episode cost, or confidence=None for an estimate without "
+            "allowance for the sampling error"
         )
 
 
 def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = None) -> Certificate:
     r"""
-    Bound the mean under any distribution within ``kl`` nats: the least of ``risk + kl / beta`` over beta.
+    Bound the mean under any distribution within ``kl`` nats: the minimum of ``risk + kl / beta`` over beta.
 
     With :math:`s = 1 / \beta` the function is :math:`s \log \mathbb E\, e^{c / s} + s\, \mathbb D`: the perspective of
-    a convex function plus a linear one, hence convex in s, hence quasi-convex in beta and in log beta, and a local
-    search finds the least value. Any beta gives a valid bound. The least is also the largest mean that a distribution
-    within ``kl`` nats has, so nothing better can be said from the distribution and ``kl`` alone.
+    a convex function plus a linear one. It is convex in s and quasi-convex in log beta, so a local search finds the
+    minimum. Every beta gives a valid bound. The minimum is tight: some distribution within ``kl`` nats attains it.
 
     :param distribution: From :func:`cost_distribution`.
-    :param kl: D[shifted || training] in nats, or more; inf gives the largest cost.
-    :param beta: Fix it instead of searching.
+    :param kl: D[shifted || training] in nats, or an upper bound on it; inf gives the largest cost.
+    :param beta: Use this value instead of searching.
     """
     if not kl >= 0:
         raise ValueError(f"kl={kl} must be at least 0")
@@ -189,7 +174,7 @@ def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = N
     if kl == 0 or width == 0:
         mean = float(weights @ values)
         return Certificate(mean, 0.0, mean, kl, confidence)
-    # The distribution that has all its weight on the largest value is this far away.
+    # The divergence of the distribution with all its weight on the largest value.
     if kl >= -math.log(max(float(weights[values == largest].sum()), 1e-300)):
         return Certificate(largest, math.inf, largest, kl, confidence)
 
@@ -212,21 +197,21 @@ def certificate(
     beta: float | None = None,
 ) -> Certificate:
     """
-    Bound the expected cost under a shift from costs in training (equation 6, corrected).
+    Bound the expected cost under a shift, from costs in training (Equation 6, corrected).
 
-    :param costs: Of independent episodes in training, ``(N,)``.
+    :param costs: Costs of independent episodes in training, ``(N,)``.
     :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.
-    :param cost_bound: What the cost of no episode can exceed. Costs that may be larger can be clipped:
-        ``np.minimum(costs, cost_bound)``; the certificate is then one of the clipped cost.
-    :param confidence: Of the allowance for the sampling error; ``None``: no allowance, an estimate and no bound.
-    :param beta: Fix it instead of taking the best.
+    :param cost_bound: Upper bound on the episode cost. Costs that may be larger can be clipped,
+        ``np.minimum(costs, cost_bound)``, to certify the clipped cost.
+    :param confidence: Confidence of the bound; ``None``: an estimate without allowance for the sampling error.
+    :param beta: Use this value instead of the best one.
     :raises ValueError: see :func:`cost_distribution` and :func:`worst_mean`.
     """
     return worst_mean(cost_distribution(costs, cost_bound, confidence), kl, beta)
 
 
 def _ranks(n: int) -> np.ndarray:
-    """Ranks from 1 to n: all of the highest, then fewer and fewer, and at even steps below the middle."""
+    """Choose ranks from 1 to n: all of the highest, then fewer and fewer, and even steps below the middle."""
     from_top: list[np.ndarray] = [np.arange(min(_HIGHEST, n))]
     if n > _HIGHEST:
         n_steps = math.ceil(math.log(n / (2 * _HIGHEST) + 1) / math.log(_RANK_FACTOR))
@@ -238,5 +223,5 @@ def _ranks(n: int) -> np.ndarray:
 def _checked_costs(costs: np.ndarray) -> np.ndarray:
     costs = np.asarray(costs, dtype=np.float64)
     if costs.ndim != 1 or len(costs) == 0 or not np.isfinite(costs).all():
-        raise ValueError(f"costs must be a vector of finite numbers, one for each episode, and not {costs!r}")
+        raise ValueError(f"costs must be a vector of finite numbers, one for each episode, not {costs!r}")
     return costs

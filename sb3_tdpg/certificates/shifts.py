@@ -1,9 +1,9 @@
 r"""
 Declared shifts of sensor and start, and how far they move the distribution over episodes, in nats.
 
-What the actions depend on passes through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. A shift of the sensor
-therefore moves states and actions by no more than it moves the TRVs, and the encoder's density is known. The derivation
-is in ``docs/guide/certificate.md``.
+The actions depend on the observations only through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. A shift of
+the sensor therefore moves states and actions by no more than it moves the TRVs, and the encoder's density is known. The
+derivation is in ``docs/guide/certificate.md``.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from scipy.special import betaln, digamma
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.distributions import Normal, kl_divergence
@@ -34,32 +33,28 @@ from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
+from sb3_tdpg.evaluation.rollout import act
 from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.vec_env import BatchedVecEnv
 
-EPISODES_AT_A_TIME = 100_000
-"""Episodes run side by side; a constant, because results depend on it."""
-
-INFORMATION_EPISODES = 4_000
-"""Episodes for the bound on the information."""
-
-# Streams of random numbers.
-_START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)
-
+EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
+INFORMATION_EPISODES = 4_000  # for the bound on the information
 EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Shares of the episodes whose divergence is not counted in full; the best one is taken, after the fact."""
+"""Shares of the episodes whose divergence is capped; the best level is chosen afterwards."""
+
+_START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
 
 
 @dataclass(frozen=True)
 class Shift:
     """
-    A declared change of the sensor and of the distribution of the start; the dynamics and the cost stay.
+    A declared change of the sensor and of the start distribution; dynamics and cost stay the same.
 
-    :param name: For tables.
-    :param env_kwargs: Keywords of the shifted environment beside those of the training.
+    :param name: Name for tables.
+    :param env_kwargs: Keywords of the shifted environment in addition to those of the training.
     :param start_kl: D[shifted start || start in training] in nats.
-    :param sensor_kl: The largest D[shifted sensor || sensor in training] of one observation, over all states; inf if it
-        is not known.
+    :param sensor_kl: Largest D[shifted sensor || sensor in training] of one observation over all states; inf if it is
+        not known.
     """
 
     name: str
@@ -71,27 +66,19 @@ class Shift:
 class Budget(NamedTuple):
     """How far a shift moves the TRVs; see :meth:`TrainingEpisodes.budgets`."""
 
-    kl: float
-    """Nats."""
-    exceedance: float
-    """Probability, in training, of episodes whose divergence is not counted in full."""
+    kl: float  #: in nats
+    exceedance: float  #: probability, in training, of episodes whose divergence is capped
 
 
 class ShiftCertificate(NamedTuple):
-    """What is certified for one shift."""
+    """Upper bounds on the expected cost under one shift."""
 
-    bound: float
-    """The least of the following three."""
-    through_trvs: float
-    """By the divergence of the TRVs."""
-    through_sensor: float
-    """By that of the sensor, which does not know the policy."""
-    trivial: float
-    """What no episode can cost more than."""
-    budget: Budget
-    """The divergence of the TRVs that ``through_trvs`` is for."""
-    sensor_kl: float
-    """Divergence of the sensor over the whole episode, with the start's, in nats."""
+    bound: float  #: the lowest of the following three
+    through_trvs: float  #: from the divergence of the TRVs
+    through_sensor: float  #: from the divergence of the sensor, which holds for every policy
+    trivial: float  #: upper bound on the episode cost
+    budget: Budget  #: divergence of the TRVs for ``through_trvs``
+    sensor_kl: float  #: divergence of sensor and start over the whole episode in nats
 
 
 class RecordedEpisodes(NamedTuple):
@@ -106,18 +93,13 @@ class RecordedEpisodes(NamedTuple):
 
     def first(self, n: int | None) -> RecordedEpisodes:
         """Return the first n of them."""
-        return RecordedEpisodes(
-            self.costs[:n],
-            self.states[:, :n],
-            self.prev_trvs[:, :n],
-            self.last_trv_noise[:n],
-            [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities],
-            self.seed,
-        )
+        costs, states, prev_trvs, noise, densities, seed = self
+        first = [Normal(density.mean[:n], density.stddev[:n]) for density in densities]
+        return RecordedEpisodes(costs[:n], states[:, :n], prev_trvs[:, :n], noise[:n], first, seed)
 
 
 def gaussian_kl(bias: np.ndarray, std: float, training_std: float) -> float:
-    """D[N(bias, std^2 I) || N(0, training_std^2 I)] in nats; inf if one of the two has no noise."""
+    """Compute D[N(bias, std^2 I) || N(0, training_std^2 I)] in nats; inf if only one of them has noise."""
     if std == training_std and not bias.any():
         return 0.0
     if std == 0 or training_std == 0:
@@ -127,7 +109,7 @@ def gaussian_kl(bias: np.ndarray, std: float, training_std: float) -> float:
 
 
 def beta_kl(a: float, b: float) -> float:
-    """D[Beta(a, b) || uniform] in nats."""
+    """Compute D[Beta(a, b) || uniform] in nats."""
     return float(-betaln(a, b) + (a - 1) * digamma(a) + (b - 1) * digamma(b) - (a + b - 2) * digamma(a + b))
 
 
@@ -142,9 +124,7 @@ def lava_shift(
     """
     Declare a shift of the lava problem; see :class:`~sb3_tdpg.envs.lava.LavaEnv` for the keywords.
 
-    In training the sensor must have no bias, and the start must be uniform: the divergences are from there.
-
-    :param training_noise_std: The sensor noise in training.
+    The divergences are from a training with a uniform start, no bias, and ``training_noise_std`` as sensor noise.
     """
     noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
     bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
@@ -159,14 +139,10 @@ def lava_shift(
 
 def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.01) -> list[Shift]:
     """
-    Draw shifts of the lava problem: noise, bias and start, each changed with probability 1/2, at least one of them.
+    Draw n shifts of the lava problem: noise, bias and start, each changed with probability 1/2, at least one of them.
 
-    The noise's variance is log-uniform in [1e-6, 1], the bias has any direction and a length that is log-uniform in
-    [0.001, 1], the start is Beta(a, b) with a and b log-uniform in [1/2, 2].
-
-    :param n: How many.
-    :param seed: Of the draws.
-    :param training_noise_std: The sensor noise in training.
+    The noise's variance is log-uniform in [1e-6, 1], the bias has a random direction and a length that is log-uniform
+    in [0.001, 1], the start is Beta(a, b) with a and b log-uniform in [1/2, 2].
     """
     random = np.random.default_rng(seed)
     shifts: list[Shift] = []
@@ -189,21 +165,21 @@ def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.0
 
 class TrainingEpisodes:
     """
-    What a certificate is made from: recorded episodes in training, and the encoder.
+    Recorded training episodes of a policy, from which certificates are computed.
 
-    Nothing is ever run in a shifted environment; only its sensor is asked what it would have shown of recorded states.
+    A certificate runs no episode in the shifted environment: its sensor only observes the recorded states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
-    :param scenario: The training environment, one of this plugin's.
-    :param cost_bound: What the cost of no episode can exceed. The cost is clipped there: with less than the true bound
+    :param scenario: The training environment, one of this plugin.
+    :param cost_bound: Upper bound on the episode cost. The cost is clipped there: with less than the true bound
         (:attr:`LavaEnv.cost_bound <sb3_tdpg.envs.lava.LavaEnv.cost_bound>`) the clipped cost is certified.
-    :param n_episodes: For the distribution of the cost.
-    :param n_budget_episodes: The first of them, for the divergence of the TRVs.
-    :param confidence: With which all certificates of this object hold, each; ``None``: without allowance for the
-        sampling error. Half of the error probability goes to the cost's distribution, half to the divergence.
-    :param seed: Of the episodes.
-    :raises ValueError: if the environment is none of this plugin's, the model's own environment normalises, or a number
-        does not fit; no episode has been run by then.
+    :param n_episodes: Number of episodes for the distribution of the cost.
+    :param n_budget_episodes: Number of the first episodes that are used for the divergence of the TRVs.
+    :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
+        error probability is spent on the distribution of the cost, half on the divergence.
+    :param seed: Seed of the episodes.
+    :raises ValueError: if the environment is not of this plugin, the model's environment normalises, or a number is
+        invalid; no episode has been run by then.
     """
 
     def __init__(
@@ -237,19 +213,14 @@ class TrainingEpisodes:
         self._allow(confidence, cost_bound)
 
     def allowing(self, confidence: float | None, cost_bound: float | None = None) -> TrainingEpisodes:
-        """
-        Return the same episodes with another allowance for the sampling error, or another bound on the cost.
-
-        :param confidence: See the class.
-        :param cost_bound: See the class; default: as it is.
-        """
+        """Return the same episodes with another confidence and, if given, another bound on the cost."""
         other = copy.copy(self)
         other._allow(confidence, self.cost_bound if cost_bound is None else cost_bound)
         return other
 
     @property
     def true_cost_bound(self) -> float:
-        """What the environment says that no episode can exceed (its attribute ``cost_bound``), or inf."""
+        """The environment's own upper bound on the episode cost (its attribute ``cost_bound``), or inf."""
         return float(getattr(self._env, "cost_bound", math.inf))
 
     def _allow(self, confidence: float | None, cost_bound: float) -> None:
@@ -259,12 +230,12 @@ class TrainingEpisodes:
 
     def divergences(self, shift: Shift, n_episodes: int | None = None) -> np.ndarray:
         """
-        Divergences at each step of each recorded episode, given the noise that couples the two sensors.
+        Compute the divergence at each step of each recorded episode, given the noise that couples the two sensors.
 
-        :param shift: Of the sensor.
-        :param n_episodes: Use the first of them; default: all.
-        :return: at each step that of the TRVs, D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] in nats, and in
-            a last row that of the last step's actions: ``(T + 1, N)``
+        :param shift: A shift of the sensor.
+        :param n_episodes: Number of the first recorded episodes to use; default: all.
+        :return: ``(T + 1, N)``: for each step D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] of the TRVs in
+            nats, and in the last row the divergence of the last actions
         """
         recorded = self.recorded.first(n_episodes)
         shifted = encode(self.model, _pomdp(self.model, self._shifted(shift)), recorded)
@@ -274,13 +245,13 @@ class TrainingEpisodes:
         """
         Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
 
-        Step by step: the mean of a step's divergence under the *shifted* distribution is at most its worst mean within
-        the divergence of the steps before. A step's divergence is counted up to a cap. The shift is taken to be undone
-        in a step where it is larger, and the episode to cost all that it can.
+        The mean of a step's divergence under the *shifted* distribution is at most its worst mean within the divergence
+        of the steps before. The divergence of a step is capped: where it is larger, the bound assumes that the step is
+        not shifted and that the episode has the largest cost.
 
-        :param shift: Of sensor and start.
-        :param n_episodes: Use the first of the recorded episodes; default: all.
-        :return: for each cap of ``EXCEEDANCE_LEVELS``; all hold at once
+        :param shift: A shift of sensor and start.
+        :param n_episodes: Number of the first recorded episodes to use; default: all.
+        :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
         divergences = self.divergences(shift, n_episodes)
         share = None if self.confidence is None else 1 - (1 - self.confidence) / (2 * len(divergences))
@@ -291,10 +262,10 @@ class TrainingEpisodes:
         """
         Bound the expected cost under a shift, clipped at ``cost_bound``.
 
-        The certificates through the TRVs and the one through the sensor hold at once, so that the lowest counts.
+        The certificates through the TRVs and through the sensor hold simultaneously, so the lowest is valid.
 
-        :param shift: Of sensor and start.
-        :param n_episodes: Use the first of the recorded episodes for the divergence of the TRVs; default: all.
+        :param shift: A shift of sensor and start.
+        :param n_episodes: Number of the first recorded episodes to use for the divergence of the TRVs; default: all.
         """
         trivial = self.cost_bound
         candidates = [
@@ -309,19 +280,18 @@ class TrainingEpisodes:
 
     def fixed_beta(self, beta: float, information: float) -> Certificate:
         """
-        Return the corrected theorem as the paper words it: the budget is ``beta * information``.
+        Apply the corrected Theorem II.1 at a fixed beta, with the budget ``beta * information``.
 
-        :param beta: The theorem's.
-        :param information: Nats; for the theorem an upper bound on the sum over t of I[x_t; x~_t].
+        :param information: Upper bound on the sum over t of I[x_t; x~_t] in nats.
         """
         return worst_mean(self.distribution, beta * information, beta)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
         """
-        Run the shifted environment, to hold a certificate against it.
+        Run the shifted environment, to compare a certificate with it.
 
-        :return: the costs of the episodes, ``(N,)``, and the mean divergence of the TRVs (with the start's) along them:
-            what the budget bounds
+        :return: the costs of the episodes, ``(N,)``, and the mean divergence of TRVs and start along them, which the
+            budget bounds
         """
         shifted = record_episodes(self.model, _pomdp(self.model, self._shifted(shift)), n_episodes, (seed, _TEST))
         by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
@@ -333,41 +303,34 @@ class TrainingEpisodes:
 
 def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
     """
-    Run N episodes whose sensor draws random numbers that :func:`encode` can draw again.
+    Run n episodes with sensor noise that :func:`encode` can draw again.
 
-    :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
-    :param env: The environment itself.
-    :param n: N
-    :param seed: Of the start, the dynamics, the sensor and the policy.
+    A loop of its own over the methods of the POMDP: start, sensor, dynamics and policy have separate random streams.
     """
-    policy, device, box = model.policy, model.device, env.action_space
-    assert isinstance(box, spaces.Box)  # of every environment of this plugin
-    policy.set_training_mode(False)
     env.np_random = np.random.default_rng([*seed, _START])
     state, costs = env._initial_state(n), np.zeros(n)
-    trv = th.zeros(n, policy.trv_dim, device=device)
+    trv = th.zeros(n, model.policy.trv_dim, device=model.device)
     states, prev_trvs, densities = [], [], []
     policy_seed = int(np.random.SeedSequence([*seed, _POLICY]).generate_state(1)[0])
     with isolated_randomness(policy_seed, model), th.no_grad():
         for t in range(env.horizon):
             env.np_random = np.random.default_rng([*seed, _SENSOR, t])
-            step = policy.step(obs_as_tensor(env._sensor(state), device), trv, np.full(n, t))
+            step, action = act(model, env._sensor(state), trv, np.full(n, t))
             states.append(state)
             prev_trvs.append(trv)
             densities.append(Normal(step.means, step.stds))
             trv = step.trvs
-            action = np.clip(step.actions.cpu().numpy().reshape((n, *box.shape)), box.low, box.high)
             costs += env._cost(state, action)
             env.np_random = np.random.default_rng([*seed, _DYNAMICS, t])
             state = env._dynamics(state, action)
-        last = _action_density(policy, trv)
+        last = _action_density(model.policy, trv)
     costs += env._terminal_cost(state)
     return RecordedEpisodes(costs, np.stack(states), th.stack(prev_trvs), step.noise, [*densities, last], seed)
 
 
 def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal]:
     """
-    Encode what the sensor of another environment would have shown in recorded episodes.
+    Encode the recorded states as the sensor of another environment observes them.
 
     The sensor draws the same random numbers as in the episodes, which couples the observations; the noise of the last
     TRVs is the same, too.
@@ -387,13 +350,12 @@ def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal
 
 
 def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
-    """Return the density of the last actions."""
     density = policy.action_density(trvs, np.full(len(trvs), policy.horizon - 1)).distribution
     return Normal(density.mean, density.stddev)
 
 
 def _information(recorded: RecordedEpisodes) -> float:
-    """Bound the sum over t of I[x_t; x~_t] from above, by the log-det bound."""
+    """Compute the log-det bound, an upper bound on the sum over t of I[x_t; x~_t]."""
     n_episodes, trv_dim = recorded.last_trv_noise.shape
     if n_episodes < trv_dim + 2:
         raise ValueError(
@@ -409,16 +371,15 @@ def _information(recorded: RecordedEpisodes) -> float:
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
     # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
-    pairs = ((_double(p), _double(q)) for p, q in zip(shifted, training, strict=True))
+    def double(density: Normal) -> Normal:
+        return Normal(density.mean.double(), density.stddev.double())
+
+    pairs = ((double(p), double(q)) for p, q in zip(shifted, training, strict=True))
     return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in pairs])
 
 
-def _double(density: Normal) -> Normal:
-    return Normal(density.mean.double(), density.stddev.double())
-
-
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
-    """Add up the divergences of the steps; what follows the last TRVs is only an action, so the lower counts there."""
+    """Sum the divergences of the steps; only an action follows the last TRVs, so the lower of the two counts there."""
 
     def add(budget: Budget, step: CostDistribution) -> Budget:
         capped, exceedance = step.capped(level)
@@ -431,13 +392,13 @@ def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) ->
 
 
 def _pomdp(model: Any, scenario: Scenario) -> POMDPEnv:
-    """Return the environment of a scenario itself, whose sensor can be asked about any state."""
+    """Make the unwrapped environment of a scenario, whose sensor can observe any state."""
     if model.get_vec_normalize_env() is not None:
         raise ValueError("the model's environment normalises observations (VecNormalize), which is not supported here")
     env = scenario_env(scenario, model, n_episodes=1, n_envs=1).unwrapped
     if not isinstance(env, BatchedVecEnv):
         raise ValueError(
-            f"{scenario.env_id} is no environment of this plugin: a certificate needs the methods of a POMDPEnv, "
-            "to ask the shifted sensor about recorded states"
+            f"{scenario.env_id} is not an environment of this plugin: a certificate needs the methods of a POMDPEnv, "
+            "to observe recorded states with the shifted sensor"
         )
     return env.env

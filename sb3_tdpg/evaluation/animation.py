@@ -1,5 +1,5 @@
 """
-Films of a policy: what the environment draws, and below it the task-relevant variables (TRVs) over time.
+Videos of a policy: the environment's pictures, and below them the task-relevant variables (TRVs) over time.
 
 Dimension key: T time steps of an episode, Z TRVs.
 """
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 100
-MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, or else the writing would not fit below them
-PANEL_HEIGHT = 190  # pixels, of the TRVs
+MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below
+PANEL_HEIGHT = 190  # pixels of the plot of the TRVs
 LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # pixels around the axes; the legend is at the right
-HOLD = 1.0  # s for which the last frame of an episode stays
+HOLD = 1.0  # s: how long the last frame of an episode stays
 LINE_STYLES = ("-", (0, (4, 1.5)), (0, (1, 1)))
 
 
 class Episode(NamedTuple):
-    """One episode that can be shown."""
+    """One episode to show."""
 
     pictures: Sequence[np.ndarray]  # T + 1 of (H, W, 3) uint8, of x_0 ... x_T
     trvs: np.ndarray  # (T, Z)
     costs: np.ndarray  # (T,), the last one with the terminal cost
-    between: Sequence[Sequence[np.ndarray]] = ()  # T times what is seen on the way from x_t to x_{t+1}, or nothing
+    between: Sequence[Sequence[np.ndarray]] = ()  # pictures between x_t and x_{t+1} for each step, or nothing
 
     def film(self) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield what is seen, with its time in steps."""
+        """Yield all pictures with their times in steps."""
         for t, picture in enumerate(self.pictures):
             yield float(t), picture
             between = self.between[t] if t < len(self.between) else ()
@@ -49,26 +49,26 @@ class Episode(NamedTuple):
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
     """
-    Tell whether an animation can be written there, before any episode is run.
+    Check that a video can be written to a path, before any episode is run.
 
-    :raises ValueError: if the ending is unknown, or what writes such a file is not installed.
+    :raises ValueError: if the file extension is unknown, or matplotlib or ffmpeg is missing.
     """
     ending = Path(path).suffix
     if ending not in (".gif", ".mp4"):
-        raise ValueError(f"{path}: the ending {ending!r} is no format of an animation: use .gif or .mp4")
+        raise ValueError(f"{path}: the extension {ending!r} is not a video format: use .gif or .mp4")
     try:
         import matplotlib.animation  # noqa: F401
     except ImportError as e:
-        raise ValueError("an animation needs matplotlib: pip install sb3_tdpg[plots]") from e
+        raise ValueError("a video needs matplotlib: pip install sb3_tdpg[plots]") from e
     if ending == ".mp4" and _ffmpeg() is None:
         raise ValueError(
-            f"{path}: an .mp4 is written by ffmpeg, and there is none: install it, or pip install imageio-ffmpeg, or "
-            "use .gif"
+            f"{path}: writing an .mp4 needs ffmpeg, which is not installed: install it, pip install imageio-ffmpeg, "
+            "or use .gif"
         )
 
 
 def _ffmpeg() -> str | None:
-    """Return the ffmpeg of Matplotlib's settings (by default, on the PATH), or else that of imageio-ffmpeg."""
+    """Find ffmpeg: the one in Matplotlib's settings (by default, on the PATH), or else the one of imageio-ffmpeg."""
     import matplotlib as mpl
 
     if (found := shutil.which(mpl.rcParams["animation.ffmpeg_path"])) is not None:
@@ -83,27 +83,27 @@ def _ffmpeg() -> str | None:
 
 def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float) -> None:
     """
-    Write episodes as a film, one after the other.
+    Write episodes as a video, one after the other.
 
-    The axis of time always goes to the horizon, and all episodes share the limits of the TRVs, so that nothing but the
-    lines moves. The last frame of each episode stays for about a second.
+    The time axis always reaches to the horizon, and all episodes share the limits of the TRVs, so only the lines move.
+    The last frame of each episode stays for about a second.
 
-    :param episodes: What is shown; their pictures have one size.
-    :param path: ``.gif`` or ``.mp4``. Folders are made, and at no time a half-written file is there.
-    :param horizon: Controls in an episode T.
-    :param fps: Frames a second. A GIF counts in hundredths of a second.
-    :raises ValueError: if the film cannot be written there, see ``check_animation_path``.
+    :param episodes: Episodes with pictures of the same size.
+    :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
+    :param horizon: Number of controls T in an episode.
+    :param fps: Frames per second; a GIF is timed in hundredths of a second.
+    :raises ValueError: if the video cannot be written there, see ``check_animation_path``.
     """
     check_animation_path(path)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    film = _Film(episodes, horizon)
+    video = _Video(episodes, horizon)
     with replaced_atomically(path) as partial:
-        (_write_gif if path.suffix == ".gif" else _write_mp4)(film, partial, fps)
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(video, partial, fps)
 
 
-class _Film:
-    """A figure, and what changes in it from frame to frame."""
+class _Video:
+    """The figure of a video, and the parts of it that change from frame to frame."""
 
     def __init__(self, episodes: Sequence[Episode], horizon: int) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -151,7 +151,7 @@ class _Film:
         )  # fmt: skip
 
     def frames(self) -> Iterator[bool]:
-        """Set the figure to one frame after the other; tell whether it is the last one of its episode."""
+        """Set the figure to one frame after the other; yield whether it is the last one of its episode."""
         for number, episode in enumerate(self.episodes, start=1):
             cost_so_far = np.concatenate([[0.0], episode.costs.cumsum()])
             for time, picture in episode.film():
@@ -166,7 +166,7 @@ class _Film:
                 yield time == len(episode.costs)
 
     def image(self) -> Image.Image:
-        """Draw the figure as it is set."""
+        """Draw the present frame."""
         self.canvas.draw()
         return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3])
 
@@ -174,26 +174,26 @@ class _Film:
         return picture.repeat(self._factor, axis=0).repeat(self._factor, axis=1)
 
 
-def _write_gif(film: _Film, path: Path, fps: float) -> None:
+def _write_gif(video: _Video, path: Path, fps: float) -> None:
     images, durations = [], []
-    for is_last in film.frames():
-        images.append(film.image())
-        # In ms; players slow down what is faster than 20 ms a frame.
+    for is_last in video.frames():
+        images.append(video.image())
+        # In ms; players show frames of less than 20 ms more slowly.
         durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))
-    # One palette for all, since a palette for each frame flickers. By the range of the colours and not by how often
-    # they occur: what is small keeps its colour. The step of k-means then brings what is large to its own.
+    # One palette for all frames, because a palette for each frame flickers. MAXCOVERAGE keeps the colours of small
+    # objects; the k-means step then moves the palette towards the colours of large ones.
     sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
     palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
 
 
-def _write_mp4(film: _Film, path: Path, fps: float) -> None:
+def _write_mp4(video: _Video, path: Path, fps: float) -> None:
     import matplotlib as mpl
     from matplotlib.animation import FFMpegWriter
 
     writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]  # ffmpeg takes fractions, too
-    with mpl.rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(film.figure, str(path), DPI):
-        for is_last in film.frames():
+    with mpl.rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(video.figure, str(path), DPI):
+        for is_last in video.frames():
             for _ in range(max(1, round(HOLD * fps)) if is_last else 1):
                 writer.grab_frame()

@@ -1,7 +1,8 @@
-"""The environment of a scenario, made for a model: the checks that they fit, and the model's own wrappers."""
+"""The environment of a scenario, wrapped for a model, and the checks that the two fit together."""
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -24,14 +25,14 @@ def scenario_env(
     sensor: Callable[[VecEnv], VecEnv] | None = None,
 ) -> VecEnv:
     """
-    Make a fresh environment of a scenario, wrapped as the model needs it.
+    Make a new environment of a scenario, wrapped as the model needs it.
 
-    :param scenario: The row.
-    :param model: An SB3 model. If its own environment normalises observations (``VecNormalize``), this one does so with
-        the same statistics, frozen.
-    :param n_episodes: Episodes that are to be run at a time.
+    :param scenario: Id and keywords of the environment.
+    :param model: An SB3 model. If its own environment normalises observations (``VecNormalize``), the new one does so
+        with the same statistics, frozen.
+    :param n_episodes: Number of episodes to run at a time.
     :param n_envs: Number of environments; default: see :func:`~sb3_tdpg.vec_env.make_episodes_env`.
-    :param sensor: Wraps the environment inside the model's own wrappers: perturbs what is observed, say.
+    :param sensor: A wrapper to put inside the model's own wrappers, for instance a perturbation.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
@@ -53,27 +54,26 @@ def scenario_env(
 
 def check_models_fit(models: Mapping[str, Any], scenarios: Sequence[Scenario]) -> None:
     """
-    Make one environment of each scenario and compare it with every model, before any episode is run.
+    Check every model against an environment of each scenario, before any episode is run.
 
-    :raises ValueError: if a scenario's environment cannot be made, or a space or the horizon differ from the model's.
+    :raises ValueError: if an environment cannot be made, or its spaces or horizon differ from the model's.
     """
     for scenario in scenarios:
+        name = f"scenario {scenario.name!r} ({scenario.env_id})"
         for label, model in models.items():
             try:
                 env = scenario_env(scenario, model, n_episodes=1, n_envs=1)
             except Exception as e:
-                raise ValueError(f"scenario {scenario.name!r} ({scenario.env_id}) cannot be made: {e}") from e
-            try:
-                check_env_fits(model, env, f"model {label!r}", f"scenario {scenario.name!r} ({scenario.env_id})")
-            finally:
-                env.close()
+                raise ValueError(f"{name} cannot be made: {e}") from e
+            with contextlib.closing(env):
+                check_env_fits(model, env, f"model {label!r}", name)
 
 
 def check_env_fits(model: Any, env: VecEnv, model_name: str = "the model", env_name: str = "the environment") -> None:
     """
-    Compare spaces and horizon of an environment with those that a model was trained with.
+    Check that an environment has the spaces and the horizon that a model was trained with.
 
-    :raises ValueError: if they differ.
+    :raises ValueError: if it has not.
     """
     where = f"{model_name} does not fit {env_name}"
     for name in ("observation_space", "action_space"):

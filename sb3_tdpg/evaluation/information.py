@@ -1,5 +1,5 @@
 """
-The information in a policy's TRVs, measured alike for every policy: on fresh episodes, and with no fitted critic.
+The information in the TRVs of any policy, measured on fresh episodes and independently of its training.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
@@ -10,23 +10,26 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
-from sb3_tdpg.evaluation.knowledge import state_knowledge
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.information.loo import log_density_matrix
 from sb3_tdpg.measurement import InformationInterval, TrustBadge, information_interval, trust_checks
+from sb3_tdpg.measurement.density_critic import Regression
+from sb3_tdpg.measurement.interval import component_estimates
+from sb3_tdpg.measurement.interval_bounds import MAX_TRAINING
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import read_problem
 
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
 
 TINY = 1e-30
 ESTIMATES = ("interval", "knowledge", "checks")
-"""Of :func:`information_report`, in this order."""
+"""The three parts of :func:`information_report`, in this order."""
 
 
 class EncodedEpisodes(NamedTuple):
@@ -48,23 +51,22 @@ class EncodedEpisodes(NamedTuple):
 class InformationBounds(NamedTuple):
     """Sums over the time steps of an episode, in nats."""
 
-    upper: float  # on I[x_t; x~_t]: the log-det bound
-    lower: float  # on what the encoder's input tells of x~_t, which is I[x_t; x~_t] without memory and sensor noise
+    upper: float  # upper bound on I[x_t; x~_t]: the log-det bound
+    lower: float  # on I[encoder input; x~_t], which is I[x_t; x~_t] without memory and sensor noise
 
 
 @dataclass(frozen=True)
 class InformationReport:
-    """What the TRVs of a policy know, and how far the numbers can be trusted."""
+    """The information in the TRVs of a policy, and checks of the estimates."""
 
     interval: InformationInterval
-    """Of I[x_t; x~_t], for each time step."""
+    """Interval for I[x_t; x~_t] at each time step."""
     knowledge: pd.DataFrame
-    """What the TRVs know of each component of the state: see
-    :func:`~sb3_tdpg.evaluation.knowledge.state_knowledge`."""
+    """Information about each component of the state: see :func:`~sb3_tdpg.evaluation.state_knowledge`."""
     badge: TrustBadge
     """Checks of the interval."""
     costs: np.ndarray
-    """``(N,)``: of the episodes."""
+    """Costs of the episodes, ``(N,)``."""
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -72,7 +74,7 @@ class InformationReport:
         return interval_frame(self.interval)
 
     def figures(self) -> dict[str, Figure]:
-        """Draw ``"timeline"``, the interval over time, and ``"knowledge"``, the map of the components."""
+        """Draw the interval over time (``"timeline"``) and the map of the components (``"knowledge"``)."""
         return dict(timeline=information_timeline(self.frame), knowledge=knowledge_map(self.knowledge))
 
     def __str__(self) -> str:
@@ -95,19 +97,19 @@ def information_report(
     at_end: Callable[[], Any] | None = None,
 ) -> InformationReport:
     """
-    Run fresh episodes, and tell what the policy's TRVs know of the state, when, and how sure that is.
+    Run fresh episodes and estimate what the policy's TRVs know about the state at each time step.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
     :param env: Any number of environments.
-    :param n_episodes: N; with fewer environments they are run in rounds.
-    :param seed: Of the episodes, the policy's sampling and the estimates.
-    :param names: Of the components of the state; default: the environment's ``state_names``, or ``x0``, ``x1``, ...
+    :param n_episodes: Number of episodes N; with fewer environments they are run in rounds.
+    :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
+    :param names: Names of the components of the state; default: the environment's ``state_names``, or ``x0``, ...
     :param at_end: Called at the end of each of the three ``ESTIMATES``.
     :raises ValueError: if model and environment do not fit, there are too few episodes for an interval at any time
         step, or the names do not fit.
     """
     if not isinstance(model.policy, TRVPolicy):
-        raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: give one of TDPG")
+        raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: pass a TDPG model")
     check_env_fits(model, env)
     names = read_problem(env).state_names if names is None else names
     batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
@@ -121,29 +123,62 @@ def information_report(
     return InformationReport(interval, known, badge, costs)
 
 
-def interval_frame(interval: InformationInterval) -> pd.DataFrame:
+@threads(1)
+def state_knowledge(
+    batch: InformationBatch, names: Sequence[str] | None = None, *, confidence: float = 0.95, seed: int = 0
+) -> pd.DataFrame:
     """
-    Make a frame with a row for each time step.
+    Estimate what the TRVs know about each component of the state at each time step.
 
-    Its columns are ``t``, the limits ``lower`` and ``upper`` in nats and the bounds ``lower_name`` and ``upper_name``
-    that they come from, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``, ``marginal``) and
-    ``n_episodes``.
+    Components may share information, so their sum is not the information about the whole state.
+
+    :param batch: Rollouts ``(T, N, ...)``, for instance of :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
+    :param names: Names of the X components; default: ``x0``, ``x1``, ...
+    :param confidence: Confidence of the lower limit, which is one-sided.
+    :param seed: Seed of the division into halves and of the encoder's noise.
+    :return: A row for each time step and component, with the columns ``t``, ``component``, ``nats`` (a lower bound on
+        I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit, clipped at 0) and ``r2`` (of a
+        leave-one-out regression of the component on the TRVs, clipped at 0). NaN where a component is constant and
+        where too few episodes are alive. Components that are constant at all time steps are left out.
+    :raises ValueError: if the number of names is wrong, or the batch is unfit for an interval.
     """
+    horizon, _, n_components = batch.states.shape
+    names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
+    if len(names) != n_components:
+        raise ValueError(f"names={names} must have a name for each of the {n_components} components of the state")
+    nats, limits = component_estimates(batch, confidence=confidence, seed=seed)
+    r2 = np.full_like(nats, np.nan)
+    for t in range(horizon):
+        known = np.isfinite(nats[t])
+        if known.any():
+            at_t = batch.at(t)
+            trvs, states = (x[0, :MAX_TRAINING].cpu().numpy().astype(np.float64) for x in (at_t.trvs, at_t.states))
+            targets = states[:, known] - states[:, known].mean(axis=0)
+            residuals = Regression(trvs, targets).residuals
+            r2[t, known] = 1 - np.square(residuals).sum(axis=0) / np.square(targets).sum(axis=0)
+    shown = np.flatnonzero(np.isfinite(nats).any(axis=0))
+    values = {name: x[:, shown].clip(min=0).ravel() for name, x in (("nats", nats), ("nats_lower", limits), ("r2", r2))}
     return pd.DataFrame(
-        dict(
-            t=np.arange(len(interval.lower)),
-            lower=interval.lower,
-            upper=interval.upper,
-            lower_name=interval.lower_name,
-            upper_name=interval.upper_name,
-            **interval.estimates,
-            n_episodes=interval.n_episodes,
-        )
+        dict(t=np.repeat(np.arange(horizon), len(shown)), component=[names[k] for k in shown] * horizon, **values)
     )
 
 
+def interval_frame(interval: InformationInterval) -> pd.DataFrame:
+    """
+    Convert an interval to a frame with a row for each time step.
+
+    The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the bounds ``lower_name`` and ``upper_name`` that
+    they come from, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``, ``marginal``) and
+    ``n_episodes``.
+    """
+    limits = dict(lower=interval.lower, upper=interval.upper)
+    names = dict(lower_name=interval.lower_name, upper_name=interval.upper_name)
+    t = np.arange(len(interval.lower))
+    return pd.DataFrame(dict(t=t, **limits, **names, **interval.estimates, n_episodes=interval.n_episodes))
+
+
 def _encode_in_rounds(model: Any, env: VecEnv, n_episodes: int, seed: int) -> EncodedEpisodes:
-    """Run :func:`encode_episodes` until there are enough episodes, each round with a seed of its own."""
+    """Run :func:`encode_episodes` until there are enough episodes, with another seed in each round."""
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes} must be at least 1")
     n_rounds = -(-n_episodes // env.num_envs)
@@ -159,44 +194,23 @@ def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisode
     Run one episode in each environment, and keep the true states and the TRVs with their densities.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
-    :param env: N environments, of which one episode each counts.
+    :param env: N environments.
     :param seed: Seed of the environments and of the policy's sampling.
     """
-    seeds, n = evaluation_seeds(seed), env.num_envs
-    policy, device, action_space = model.policy, model.device, model.action_space
-    policy.set_training_mode(False)
-    steps: list[tuple[th.Tensor, ...]] = []
-    with isolated_randomness(seeds.policy, model), th.no_grad():
-        env.seed(seeds.env)
-        problem = read_problem(env)
-        observations: Any = env.reset()
-        states = problem.initial_states(env, observations)
-        trvs = th.zeros(n, policy.trv_dim, device=device)
-        alive, costs = np.ones(n, dtype=bool), np.zeros(n)
-        for t in range(problem.horizon):
-            step = policy.step(obs_as_tensor(observations, device), trvs, np.full(n, t))
-            trvs = step.trvs
-            here = (th.as_tensor(states, dtype=th.float32), trvs.cpu(), step.means.cpu(), step.stds.cpu())
-            steps.append((*here, th.as_tensor(alive)))
-            actions = step.actions.cpu().numpy().reshape((-1, *action_space.shape))
-            if isinstance(action_space, spaces.Box):
-                actions = np.clip(actions, action_space.low, action_space.high)
-            observations, rewards, dones, infos = env.step(actions)
-            states = problem.next_states(env, observations, dones, infos)
-            costs -= rewards * alive
-            alive = alive & ~dones  # what follows is another episode
+    problem = read_problem(env)
+    steps, costs = [], np.zeros(env.num_envs)
+    episodes = rollout(model, env, seeds=evaluation_seeds(seed), problem=problem, encode=True)
+    for step in islice(episodes, problem.horizon):
+        assert step.encoded is not None
+        alive = step.episode == 0  # what follows is another episode
+        encoded = (x.cpu() for x in (step.encoded.trvs, step.encoded.means, step.encoded.stds))
+        steps.append((th.as_tensor(step.states, dtype=th.float32), *encoded, th.as_tensor(alive)))
+        costs -= step.rewards * alive
     return EncodedEpisodes(InformationBatch(*(th.stack(parts) for parts in zip(*steps, strict=True))), costs)
 
 
 def rollout_information(model: Any, scenario: Scenario, n_episodes: int = 1000, *, seed: int = 0) -> InformationBatch:
-    """
-    Run :func:`encode_episodes` where a scenario says.
-
-    :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
-    :param scenario: Where.
-    :param n_episodes: N, side by side.
-    :param seed: Seed of the environment and of the policy's sampling.
-    """
+    """Run :func:`encode_episodes` in the environment of a scenario, with ``n_episodes`` episodes side by side."""
     with contextlib.closing(scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)) as env:
         return encode_episodes(model, env, seed=seed).batch
 
@@ -205,12 +219,12 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     """
     Bound the information of a batch, summed over time.
 
-    A step at which too few episodes live on for an estimate counts as much as the last one with enough: counted as
-    nothing, it would make policies with many TRVs, which need more episodes, look as if they knew less.
+    A step with too few live episodes for an estimate counts as much as the last step with enough. If it counted as 0,
+    policies with many TRVs, which need more episodes, would seem to know less.
 
-    Both are estimates from the same episodes, and the one from below is never above the other: what the TRVs tell of
-    which of these N encoder's inputs they were drawn from is not more than the log-det bound of these inputs. Only the
-    estimate could be, since the TRVs are a sample, too: it is made precise where the bounds are close, and cut there.
+    Both bounds are estimated from the same episodes. The information between the TRVs and the inputs of these N
+    encoders is at most the log-det bound of the inputs; only its estimate can exceed the bound, because the TRVs are
+    sampled. A control variate makes the estimate precise where the two are close, and it is clipped at the upper bound.
 
     :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
     :raises ValueError: if there are too few episodes from the start.
@@ -236,11 +250,11 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
 
 def _lower_bound(at_t: InformationBatch) -> float:
     r"""
-    Estimate what :func:`~sb3_tdpg.information.own_sample_bound` estimates, with less of the TRVs' sampling noise.
+    Estimate the same bound as :func:`~sb3_tdpg.information.own_sample_bound`, with less noise from sampling the TRVs.
 
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
     :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0
-    given the encoder's inputs. It serves as a control variate: were the mixture Gaussian, it would be all of the noise.
+    given the encoder's inputs. It is the control variate: for a Gaussian mixture it would remove all of the noise.
 
     :param at_t: One step, ``(1, N, ...)``.
     """

@@ -1,4 +1,4 @@
-"""Random numbers that depend on one seed, without a trace in the rest of the program."""
+"""Random numbers that depend on one seed, and leave the rest of the program as it was."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-_DOMAIN = 0x7D96  # Any constant: an evaluation with seed 0 must not replay the episodes of a training with seed 0.
+_DOMAIN = 0x7D96  # any constant: an evaluation with seed 0 must not replay the episodes of a training with seed 0
 
 
 class EvaluationSeeds(NamedTuple):
-    """What one seed of an evaluation is turned into."""
+    """The seeds that an evaluation derives from the seed that the user gives."""
 
     env: int
     policy: int
 
 
 def evaluation_seeds(seed: int) -> EvaluationSeeds:
-    """Derive the seeds of the environment and of the policy's sampling from the one that the user gave."""
+    """Derive the seeds of the environments and of the policy's sampling from the seed that the user gives."""
     if seed < 0:
         raise ValueError(f"seed={seed} must not be negative")
     env_seed, policy_seed = np.random.SeedSequence([seed, _DOMAIN]).generate_state(2)
@@ -33,10 +33,10 @@ def evaluation_seeds(seed: int) -> EvaluationSeeds:
 @contextlib.contextmanager
 def isolated_randomness(seed: int, model: Any) -> Iterator[None]:
     """
-    Seed everything that ``model.predict`` may sample from, and put all of it back afterwards.
+    Seed every generator that ``model.predict`` may sample from, and restore all of them afterwards.
 
-    :param seed: For the global generators of torch, NumPy and Python, and for the model's action space, which DQN
-        explores with.
+    :param seed: Seed of the global generators of torch, NumPy and Python, and of the model's action space, from which
+        DQN explores.
     :param model: An SB3 model.
     """
     numpy_state, python_state, action_space = np.random.get_state(), random.getstate(), model.action_space  # noqa: NPY002

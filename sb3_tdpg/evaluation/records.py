@@ -1,25 +1,32 @@
-"""From scenarios to records: one row for each episode that a model ran."""
+"""
+From scenarios to records: one row for each episode of a model, or its true states.
+
+Dimension key: T horizon, N episodes, X state.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import is_monitored, rollout
+from sb3_tdpg.problem import read_problem
 
 MAX_PARALLEL_EPISODES = 1_000
-"""Episodes run side by side; a constant, because results depend on it."""
+"""Number of episodes run side by side; a constant, because results depend on it."""
 
 MAX_FINAL_COMPONENTS = 32
-"""Longer arrays in the last info (images, say) are not recorded."""
+"""Longer arrays in the last info, such as images, are not recorded."""
 
 COLUMNS = ("model", "scenario", "env_id", "episode", "cost", "length", "seed", "deterministic")
 """The columns of every frame of records."""
@@ -44,21 +51,21 @@ def evaluate_scenarios(
     The frame has one row for each model, scenario and episode, in this order, with the columns ``model``, ``scenario``,
     ``env_id``, ``episode``, ``cost`` (the negative return), ``length`` (steps), ``final_*`` (every number in the last
     ``info``; the components of an array are ``final_state_0``, ...), ``seed`` and ``deterministic``. If the
-    environment reports ``info["is_success"]``, there is a column ``failure``, too.
+    environment reports ``info["is_success"]``, there is also a column ``failure``.
 
-    The same seed gives the same frame. In a scenario all models start from the same initial states and, as far as the
-    environment draws as often whatever the actions, meet the same noise; so do all scenarios of one environment.
-    The global random number generators are left as they were.
+    The same seed gives the same frame. In a scenario all models start from the same initial states, and they meet the
+    same noise if the environment draws the same number of random numbers whatever the actions. The same holds for all
+    scenarios of one environment. The global random generators are restored.
 
     :param model: One SB3 model, or several by their label.
-    :param scenarios: The rows of the table to be.
-    :param n_episodes: Episodes of each model in each scenario.
+    :param scenarios: The rows of the table to make.
+    :param n_episodes: Number of episodes of each model in each scenario.
     :param seed: Seed of the environments and of the policies' sampling.
-    :param deterministic: Act without noise. The paper's tables use the stochastic policy, and so does the default here.
-    :param env_kwargs: Keywords for the environments of all scenarios; a scenario's own win.
+    :param deterministic: Act without noise. The default is the stochastic policy, which the paper's tables use.
+    :param env_kwargs: Keywords for the environments of all scenarios; a scenario's own keywords take precedence.
     :param labels: Constant columns to put in front, for instance ``dict(train_seed=3)``.
     :param progress_bar: Show a progress bar.
-    :raises ValueError: if something does not fit; no episode has been run by then.
+    :raises ValueError: if an argument does not fit; no episode has been run by then.
     """
     models = _named_models(model)
     rows = [scenario.with_kwargs(**(env_kwargs or {})) for scenario in scenarios]
@@ -92,54 +99,72 @@ def run_episodes(
     at_end: Callable[[], Any] | None = None,
 ) -> pd.DataFrame:
     """
-    Run one model in one scenario that it fits, see :func:`evaluate_scenarios`.
+    Run one model in one scenario that it fits; see :func:`evaluate_scenarios`.
 
-    :param model: An SB3 model.
-    :param scenario: Where.
-    :param n_episodes: How many.
-    :param seed: Of the environments and of the policy's sampling.
-    :param deterministic: Act without noise.
-    :param sensor: Wraps the environments inside the model's own wrappers.
+    :param sensor: A wrapper to put inside the model's own wrappers, for instance a perturbation.
     :param at_end: Called at the end of each episode.
-    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``; the
-        first episodes of all environments, then the second ones, and so on, whichever ended first
+    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``:
+        first the first episodes of all environments, then the second ones, and so on
     """
-    final_infos: list[dict[str, float]] = []
-    begun: list[tuple[int, int]] = []  # of each: how many this environment had ended before, and which one it is
-
-    def at_step(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
-        # evaluate_policy appends an episode's return under the very same condition, right after this call.
-        info = local_variables["info"]
-        if local_variables["done"] and ("episode" in info or not local_variables["is_monitor_wrapped"]):
-            final_infos.append(_final_columns(info))
-            begun.append((int(local_variables["episode_counts"][local_variables["i"]]), local_variables["i"]))
-            if at_end is not None:
-                at_end()
-
-    seeds = evaluation_seeds(seed)
     env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES), sensor=sensor)
-    try:
-        with isolated_randomness(seeds.policy, model):
-            env.seed(seeds.env)
-            returns, lengths = evaluate_policy(
-                model,
-                env,
-                n_episodes,
-                deterministic=deterministic,
-                callback=at_step,
-                return_episode_rewards=True,
-                warn=False,
-            )
-    finally:
-        env.close()
-    # In the order of their ends, a number would stand for another start with every model and perturbation.
-    order = sorted(range(n_episodes), key=begun.__getitem__)
-    ended = pd.concat(
-        [pd.DataFrame(dict(cost=-np.asarray(returns), length=lengths)), pd.DataFrame(final_infos)], axis=1
-    )
-    records = ended.iloc[order].reset_index(drop=True)
+    returns, monitored = np.zeros(env.num_envs), is_monitored(env)
+    ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and environment
+    with contextlib.closing(env):
+        steps = rollout(model, env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic)
+        for step in steps:
+            returns += step.rewards
+            for i in np.flatnonzero(step.finished):
+                info = step.infos[i]
+                of_monitor = info["episode"] if monitored else {}
+                cost, length = -of_monitor.get("r", returns[i]), of_monitor.get("l", step.t[i] + 1)
+                ended[int(step.episode[i]), int(i)] = dict(cost=cost, length=length, **_final_columns(info))
+                if at_end is not None:
+                    at_end()
+            returns[step.dones] = 0
+    # If they were numbered as they end, a number would mean another start for each model and perturbation.
+    order = sorted(range(n_episodes), key=list(ended).__getitem__)
+    records = pd.DataFrame(list(ended.values())).iloc[order].reset_index(drop=True)
     records.insert(0, "episode", np.arange(n_episodes))
     return records
+
+
+class Trajectories(NamedTuple):
+    """N episodes of one model in one scenario."""
+
+    states: np.ndarray  # (T + 1, N, X)
+    costs: np.ndarray  # (N,), of the whole episode
+
+
+def rollout_states(
+    model: Any, scenario: Scenario, n_episodes: int = 60, *, seed: int = 0, deterministic: bool = False
+) -> Trajectories:
+    """
+    Run episodes of a fixed horizon side by side and keep the true states ``info["state"]``.
+
+    :param model: An SB3 model.
+    :param scenario: A scenario whose environment has a horizon and reports its state.
+    :param n_episodes: Number of episodes N.
+    :param seed: Seed of the environment and of the policy's sampling.
+    :param deterministic: Act without noise.
+    :raises ValueError: if the model does not fit, or an episode ends before the horizon.
+    """
+    check_models_fit({type(model).__name__: model}, [scenario])
+    env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
+    with contextlib.closing(env):
+        problem = read_problem(env)
+        states: list[Any] = []
+        costs = np.zeros(n_episodes)
+        steps = rollout(model, env, seeds=evaluation_seeds(seed), deterministic=deterministic, problem=problem)
+        for step in islice(steps, problem.horizon):
+            if step.dones.any() and len(states) < problem.horizon - 1:
+                raise ValueError(
+                    f"an episode ended after {len(states) + 1} of {problem.horizon} steps: rollout_states needs "
+                    "episodes of equal length"
+                )
+            states.append(step.states)
+            costs -= step.rewards
+        states.append(np.stack([info["state"] for info in step.infos]))
+    return Trajectories(np.stack(states), costs)
 
 
 def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:
@@ -163,10 +188,10 @@ def _named_models(model: Any) -> dict[str, Any]:
     if not models:
         raise ValueError("model is an empty mapping: give at least one model, for instance {'TDPG': model}")
     for label, each in models.items():
-        if isinstance(each, type) or not hasattr(each, "predict") or not hasattr(each, "get_vec_normalize_env"):
-            raise ValueError(f"model {label!r} is {each!r}, expected a Stable-Baselines3 model (TDPG.load(...), say)")
-        if getattr(each, "policy", None) is None:
-            raise ValueError(f"model {label!r} has no policy yet: make it with an environment, or load it")
+        if isinstance(each, type) or getattr(each, "policy", None) is None:
+            raise ValueError(
+                f"model {label!r} is {each!r}, expected a Stable-Baselines3 model with a policy, as from TDPG.load(...)"
+            )
     return models
 
 
@@ -176,10 +201,10 @@ def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, seed: int, 
     names = [scenario.name for scenario in scenarios]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(
-            f"scenario names must differ, and {twice} occur more than once: a table could not tell them apart"
+            f"scenario names must differ, but {twice} occur more than once: a table could not distinguish them"
         )
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes in each scenario")
+        raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes per scenario")
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed={seed!r} must be an integer of at least 0")
     taken = [name for name in labels if name in {*COLUMNS, "failure"} or name.startswith("final_")]

@@ -1,6 +1,7 @@
 """
-Statistics over training seeds, as Agarwal et al. (2021, "Deep reinforcement learning at the edge of the statistical
-precipice") recommend for few runs; computed by their library rliable.
+Statistics over training seeds for few runs, computed by rliable.
+
+They follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
 """
 
 from __future__ import annotations
@@ -18,197 +19,156 @@ def aggregate_seeds(
     records_by_seed: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
 ) -> pd.DataFrame:
     """
-    Summarise over training seeds: how good is the method, not one policy of it.
+    Summarise each model in each scenario over its training seeds: the quality of the method, not of one policy.
 
-    The number is the interquartile mean over the seeds' mean costs, with the percentile bootstrap interval from
-    resampling seeds.
+    The summary is the interquartile mean of the seeds' mean costs, with a percentile bootstrap interval over seeds.
 
     :param records_by_seed: Records with a column ``train_seed``
         (``evaluate_scenarios(..., labels=dict(train_seed=3))``).
     :param level: Coverage of the interval.
-    :param n_bootstrap: Resamples.
+    :param n_bootstrap: Number of resamples.
     :param seed: Seed of the resampling.
     :return: one row for each model and scenario: ``n_seeds``, ``iqm``, ``low``, ``high``, ``min``, ``max``,
         ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
-        seed), and how it was made: ``level``, ``seed``, ``deterministic``
+        seed), ``level``, ``seed`` and ``deterministic``
     :raises ImportError: without rliable (``pip install sb3_tdpg[plots]``).
     """
     require_columns(records_by_seed, ["train_seed"])
     if not 0 < level < 1:
         raise ValueError(f"level={level} must lie between 0 and 1")
-    rliable, metrics = _import_rliable()
+    iqm = _import_rliable()[1].aggregate_iqm
     rows = []
     for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
         means = group["mean"].to_numpy()
-        (iqm,), (low, high) = _interval(
-            rliable, means[:, None], lambda x: np.array([metrics.aggregate_iqm(x)]), level, n_bootstrap, seed
+        (point,), (low,), (high,) = _bootstrap(
+            lambda x: np.array([iqm(x)]), means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed
         )
+        seeds = dict(n_seeds=len(means), iqm=point, low=low, high=high, min=means.min(), max=means.max())
+        how = {name: one_or_all(group[name]) for name in ("seed", "deterministic")}
+        std = iqm(group["std"].to_numpy())
         rows.append(
-            dict(
-                model=model,
-                scenario=scenario,
-                n_seeds=len(means),
-                iqm=iqm,
-                low=low,
-                high=high,
-                min=means.min(),
-                max=means.max(),
-                episode_std=metrics.aggregate_iqm(group["std"].to_numpy()),
-                level=level,
-                n=group["n"].iloc[0],
-                seed=one_or_all(group["seed"]),
-                deterministic=one_or_all(group["deterministic"]),
-            )
+            dict(model=model, scenario=scenario, **seeds, episode_std=std, level=level, n=group["n"].iloc[0], **how)
         )
     return pd.DataFrame(rows)
 
 
 def probability_of_improvement(
-    records_by_seed: pd.DataFrame,
-    model: str,
-    control: str,
-    *,
-    level: float = 0.95,
-    n_bootstrap: int = 2000,
-    seed: int = 0,
+    records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
 ) -> tuple[float, float, float]:
     """
-    How likely a seed of one method has a lower mean cost, over all episodes given, than a seed of another.
+    Estimate the probability that a seed of one method has a lower mean cost than a seed of another method.
 
-    A seed's scenarios are one number, not several: it is the same policy that meets them, and they must be resampled
-    together.
+    The mean is over all given scenarios: the same policy runs in all of them, so they are resampled together.
 
-    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to take the mean over.
+    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
     :param model: Label of the method.
-    :param control: Label of the method that it is compared with.
-    :param level: Coverage of the interval.
-    :param n_bootstrap: Resamples of the seeds.
-    :param seed: Seed of the resampling.
-    :return: the probability, and the interval's ends; 0.5 is no difference
+    :param control: Label of the method to compare with.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
+    :return: the probability, 0.5 for no difference, and the ends of its interval
     """
-    rliable, metrics = _import_rliable()
-    means = records_by_seed.groupby(["model", "train_seed"])["cost"].mean()
-    # rliable takes scores, of which more is better: (seeds, 1).
-    scores = {label: -means[label].to_numpy()[:, None] for label in (model, control)}
-    (value,), (low, high) = _interval(
-        rliable,
-        (scores[model], scores[control]),
-        lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-        level,
-        n_bootstrap,
-        seed,
+    means = _seed_means(records_by_seed)
+    estimates = probabilities_of_improvement(
+        means[model].to_numpy()[:, None], means[control].to_numpy()[:, None], **bootstrap
     )
-    return float(value), float(low), float(high)
+    value, low, high = (float(estimate[0]) for estimate in estimates)
+    return value, low, high
 
 
 def paired_difference(
-    records_by_seed: pd.DataFrame,
-    model: str,
-    control: str,
-    *,
-    level: float = 0.95,
-    n_bootstrap: int = 2000,
-    seed: int = 0,
+    records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
 ) -> tuple[float, float, float]:
     """
-    By how much the mean cost of a method exceeds that of another, seed by seed.
+    Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
 
-    Where the two of a seed have the same start and meet the same episodes, what the start is worth cancels.
+    Pairing removes the differences between seeds where both methods start from the same policy and meet the same
+    episodes.
 
-    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to take the mean over.
+    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
     :param model: Label of the method.
-    :param control: Label of the method that it is compared with; it must have the same seeds.
-    :param level: Coverage of the interval.
-    :param n_bootstrap: Resamples of the seeds.
-    :param seed: Seed of the resampling.
-    :return: the mean over seeds of the difference, and the interval's ends; below 0 the method is better
+    :param control: Label of the method to compare with; it must have the same seeds.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
+    :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
     :raises ValueError: if the seeds are not the same.
     """
-    rliable, _ = _import_rliable()
-    means = records_by_seed.groupby(["model", "train_seed"])["cost"].mean()
+    means = _seed_means(records_by_seed)
     if sorted(means[model].index) != sorted(means[control].index):
         raise ValueError(
             f"the seeds of {model!r} are {sorted(means[model].index)}, those of {control!r} "
             f"{sorted(means[control].index)}: a paired difference needs the same of both"
         )
     differences = (means[model] - means[control]).to_numpy()
-    (value,), (low, high) = _interval(
-        rliable, differences[:, None], lambda x: np.array([x.mean()]), level, n_bootstrap, seed
-    )
-    return float(value), float(low), float(high)
+    estimates = _bootstrap(lambda x: np.array([x.mean()]), differences[:, None], **bootstrap)
+    value, low, high = (float(estimate[0]) for estimate in estimates)
+    return value, low, high
 
 
-def interquartile_means(
-    scores: np.ndarray, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return the interquartile mean over seeds of each of many rows.
-
-    It is what :func:`~sb3_tdpg.evaluation.aggregate_seeds` tells, of many rows at once.
+    Compute the interquartile mean over seeds for many rows at once; see :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
 
     :param scores: ``(seeds, rows)``
-    :param level: Coverage of the intervals; each row is resampled by itself.
-    :param n_bootstrap: Resamples.
-    :param seed: Seed of the resampling.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`; each row is resampled on
+        its own.
     :return: the means and the ends of their intervals, each ``(rows,)``
     """
-    rliable, _ = _import_rliable()
     cut = len(scores) // 4
 
-    def means(x: np.ndarray) -> np.ndarray:  # scipy.stats.trim_mean, at a tenth of the time
+    def means(x: np.ndarray) -> np.ndarray:  # scipy.stats.trim_mean, in a tenth of the time
         return np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0)
 
-    points, (low, high) = _intervals(rliable, scores, means, level, n_bootstrap, seed)
-    return points, low, high
+    return _bootstrap(means, scores, **bootstrap)
 
 
 def probabilities_of_improvement(
-    costs: np.ndarray, of_control: np.ndarray, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
+    costs: np.ndarray, of_control: np.ndarray, **bootstrap: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return how likely a seed has a lower cost than a seed of the control, row by row; ties count half.
-
-    It is what :func:`~sb3_tdpg.evaluation.probability_of_improvement` tells, of many rows at once.
+    Estimate, row by row, the probability that a seed has a lower cost than a seed of the control; ties count half.
 
     :param costs: ``(seeds, rows)``
     :param of_control: ``(seeds of the control, rows)``
-    :param level: Coverage of the intervals; each row is resampled by itself.
-    :param n_bootstrap: Resamples.
-    :param seed: Seed of the resampling.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`; each row is resampled on
+        its own.
     :return: the probabilities and the ends of their intervals, each ``(rows,)``
     """
-    rliable, _ = _import_rliable()
 
     def share(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         x, y = x[:, None], y[None]
         return ((x < y) + 0.5 * (x == y)).mean(axis=(0, 1))
 
-    points, (low, high) = _intervals(rliable, (costs, of_control), share, level, n_bootstrap, seed)
-    return points, low, high
+    return _bootstrap(share, costs, of_control, **bootstrap)
 
 
-def _interval(
-    rliable: Any, scores: Any, statistic: Callable[..., np.ndarray], level: float, n_bootstrap: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Point estimate and percentile interval of a statistic of one number under resampled seeds."""
-    points, intervals = _intervals(rliable, scores, statistic, level, n_bootstrap, seed)
-    return points, intervals[:, 0]
+def _seed_means(records_by_seed: pd.DataFrame) -> pd.Series:
+    return records_by_seed.groupby(["model", "train_seed"])["cost"].mean()
 
 
-def _intervals(
-    rliable: Any, scores: Any, statistic: Callable[..., np.ndarray], level: float, n_bootstrap: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Point estimates ``(k,)`` and percentile intervals ``(2, k)`` of a statistic under resampled seeds."""
+def _bootstrap(
+    statistic: Callable[..., np.ndarray],
+    *scores: np.ndarray,
+    level: float = 0.95,
+    n_bootstrap: int = 2000,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Resample the seeds, and return a statistic with the ends of its percentile interval, each ``(rows,)``.
+
+    :param scores: One array ``(seeds, rows)``, or two.
+    """
+    library, _ = _import_rliable()
     # rliable draws from NumPy's global generator, whatever random_state it is given.
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
-        points, intervals = rliable.get_interval_estimates(
-            {"scores": scores}, statistic, reps=n_bootstrap, confidence_interval_size=level
+        points, intervals = library.get_interval_estimates(
+            {"scores": scores if len(scores) > 1 else scores[0]},
+            statistic,
+            reps=n_bootstrap,
+            confidence_interval_size=level,
         )
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    return points["scores"], intervals["scores"]
+    return points["scores"], *intervals["scores"]
 
 
 def _import_rliable() -> tuple[Any, Any]:

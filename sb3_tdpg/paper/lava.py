@@ -17,8 +17,6 @@ from sb3_tdpg.evaluation import (
     add_ratio,
     aggregate_seeds,
     comparison_markdown,
-    cost_histograms,
-    lava_trajectories,
     save_figure,
     summary_table,
     training_curves,
@@ -32,6 +30,7 @@ from sb3_tdpg.paper.common import (
     met,
     publish_files,
 )
+from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
 READINGS = ("table", "text")

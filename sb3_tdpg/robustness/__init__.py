@@ -1,9 +1,10 @@
 """
-Robustness: perturbations of what a policy observes, in five severities, for any environment.
+Robustness: perturbations of any environment's observations, in five severities, to evaluate policies.
 
-They are for the evaluation of policies; :mod:`sb3_tdpg.robustness.training` has what images go through in training.
+:mod:`sb3_tdpg.robustness.training` perturbs the images of a training.
 """
 
+from sb3_tdpg.robustness import effects as effects  # fills the registry
 from sb3_tdpg.robustness.gallery import perturbation_gallery
 from sb3_tdpg.robustness.registry import PERTURBATIONS, Perturbation, applicable, register, severity_table
 from sb3_tdpg.robustness.scale import observation_scale

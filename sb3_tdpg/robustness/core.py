@@ -1,5 +1,5 @@
 """
-A perturbation at work on the episodes of N environments: one core behind both wrappers.
+The application of a perturbation to the episodes of N environments, for both wrappers.
 
 Dimension key: N environments, n of them at a time.
 """
@@ -14,22 +14,22 @@ from gymnasium import spaces
 from sb3_tdpg.robustness.registry import Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
-CHUNK = 64  # images that are perturbed at once: bounds the memory
+CHUNK = 64  # images perturbed at once: bounds the memory
 _DOMAIN = 0x50E7  # any constant: a perturbation must not draw what the environment with the same seed draws
 
 
 class Perturber:
     """
-    Apply a perturbation to whole batches, and remember what belongs to each episode.
+    Apply a perturbation to whole batches, and remember what was drawn for each episode.
 
-    It has a generator of its own, so that the environment draws what it would without it.
+    The perturbation has its own random generator, so the random numbers of the environment do not change.
 
-    :param perturbation: What is done; it must apply to the space.
+    :param perturbation: A perturbation that applies to the space.
     :param severity: 1 to 5.
     :param space: The observation space.
-    :param n_envs: N
-    :param seed: Of the generator; ``None``: another one every time.
-    :param scale: Of the components of a vector, in the space's shape. Images need none.
+    :param n_envs: Number of environments N.
+    :param seed: Seed of the generator; ``None``: a random one.
+    :param scale: Scales of the components of a vector, in the space's shape; unused for images.
     :raises ValueError: if the severity is unknown.
     """
 
@@ -47,22 +47,18 @@ class Perturber:
         self.value = perturbation.value(severity)
         self.sensor = Sensor(space, scale)
         self.n_envs = n_envs
-        # Two perturbations, one around the other, must not draw the same either.
+        # The name is part of the seed: nested perturbations must not draw the same numbers.
         self._entropy = [_DOMAIN, zlib.crc32(perturbation.name.encode()), *([] if seed is None else [seed])]
         self._rng = np.random.default_rng(None if seed is None else self._entropy)
         self._episode: dict[str, np.ndarray] = {}
         self.begin(np.arange(n_envs))
 
     def reseed(self, env_seed: int) -> None:
-        """Begin the random numbers anew, as the environments do that have been given a seed; both seeds count."""
+        """Restart the random generator from the seeds of the environments and of the perturbation."""
         self._rng = np.random.default_rng([*self._entropy, env_seed])
 
     def begin(self, which: np.ndarray) -> None:
-        """
-        Begin new episodes: draw what is constant in them, and forget the last ones.
-
-        :param which: Indices of their environments, ``(n,)``.
-        """
+        """Begin episodes in the environments with the indices ``which``, ``(n,)``: draw what is constant in them."""
         drawn = {"t": np.zeros(len(which), dtype=np.int64)}
         if self.perturbation.draw is not None:
             drawn |= self.perturbation.draw(self._rng, len(which), self.value, self.sensor)
@@ -76,21 +72,21 @@ class Perturber:
         """
         Perturb the next observation of each episode.
 
-        :param observations: ``(n, *obs)``; they are left alone.
+        :param observations: ``(n, *obs)``; they are not changed.
         :param which: Indices of their environments, ``(n,)``; ``None``: all.
         :return: a new array in the observation space, ``(n, *obs)``
         """
         index = slice(None) if which is None else which
         episode = {name: values[index] for name, values in self._episode.items()}
-        perturbed = self._raw(observations, episode) if self.perturbation.raw else self._in_units(observations, episode)
+        if self.perturbation.raw:
+            perturbed = self.perturbation.apply(observations, self.value, episode, self._rng)
+        else:
+            perturbed = self._in_units(observations, episode)
         if which is not None and self.perturbation.raw:  # the memory was a copy
             for name, values in episode.items():
                 self._episode[name][which] = values
         self._episode["t"][index] += 1
         return perturbed
-
-    def _raw(self, observations: np.ndarray, episode: dict[str, np.ndarray]) -> np.ndarray:
-        return self.perturbation.apply(observations, self.value, episode, self._rng)
 
     def _in_units(self, observations: np.ndarray, episode: dict[str, np.ndarray]) -> np.ndarray:
         result = np.empty((len(observations), *self.sensor.space.shape), self.sensor.space.dtype)

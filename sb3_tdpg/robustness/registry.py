@@ -1,21 +1,21 @@
-"""Every perturbation of observations, as data: a row of the table is a :class:`Perturbation`."""
+"""The registry of perturbations: each row is a :class:`Perturbation`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from gymnasium import spaces
 
-from sb3_tdpg.robustness import history, images, vectors
-from sb3_tdpg.robustness.images import Episode
 from sb3_tdpg.robustness.sensor import Sensor, kind_of
 
 KINDS = ("image", "vector")
 N_SEVERITIES = 5
 
+Episode = Mapping[str, np.ndarray]  # what was drawn for the episodes of a batch, and their time
 Draw = Callable[[np.random.Generator, int, float, Sensor], dict[str, np.ndarray]]
 Apply = Callable[[np.ndarray, float, Episode, np.random.Generator], np.ndarray]
 
@@ -23,25 +23,25 @@ Apply = Callable[[np.ndarray, float, Episode, np.random.Generator], np.ndarray]
 @dataclass(frozen=True)
 class Perturbation:
     """
-    A change to what is observed, in five severities.
+    A change to the observations, in five severities.
 
-    Both functions see a batch of n episodes and the value of the severity. ``apply(observations, value, episode, rng)``
-    returns the perturbed batch, a new array. It gets images as ``(n, C, H, W)`` float32 in [0, 1] and vectors as
-    ``(n, D)`` float64 in multiples of their scale, and need not respect any bounds. What ``draw(rng, n, value,
-    sensor)`` returns is kept for an episode: arrays with a leading dimension of n, drawn anew where an episode begins.
-    ``apply`` finds them in ``episode``, beside the time ``episode["t"]``, ``(n,)``, 0 at the first observation.
+    Both functions get a batch of n episodes and the value of the severity. ``apply(observations, value, episode, rng)``
+    returns the perturbed batch as a new array. It gets images as ``(n, C, H, W)`` float32 in [0, 1] and vectors as
+    ``(n, D)`` float64 in multiples of their scale, and may exceed the bounds. ``draw(rng, n, value, sensor)`` is called
+    where an episode begins and returns arrays with a leading dimension of n. ``apply`` finds them in ``episode``,
+    beside the time ``episode["t"]``, ``(n,)``, which is 0 at the first observation.
 
-    :param name: What it is called by.
+    :param name: Name of the perturbation.
     :param kind: ``"image"`` or ``"vector"``.
-    :param parameter: What the severities are values of, with its unit.
+    :param parameter: The quantity that the severities are values of, with its unit.
     :param severities: Five values, from the mildest to the strongest.
     :param apply: See above.
     :param draw: See above; ``None``: nothing is drawn for an episode.
-    :param summary: What happens, in a few words.
-    :param channels: The numbers of channels that an image must have; ``None``: any.
+    :param summary: The effect in a few words.
+    :param channels: Permitted numbers of image channels; ``None``: any.
     :param on_depth: Whether it makes sense on depth images: floats of one channel.
-    :param later_only: Whether the first observation of an episode stays what it is.
-    :param raw: ``apply`` gets observations ``(n, *obs)`` as they are, and must return such.
+    :param later_only: Whether it leaves the first observation of an episode unchanged.
+    :param raw: ``apply`` gets and returns observations ``(n, *obs)`` in the units of their space.
     :raises ValueError: if the kind is unknown, or there are not five severities.
     """
 
@@ -68,9 +68,9 @@ class Perturbation:
 
     def value(self, severity: int) -> float:
         """
-        Return the parameter at a severity.
+        Return the value of the parameter at a severity.
 
-        :raises ValueError: if the severity is no integer from 1 to 5.
+        :raises ValueError: if the severity is not an integer from 1 to 5.
         """
         is_whole = isinstance(severity, (int, np.integer)) and not isinstance(severity, bool)
         if not (is_whole and 1 <= severity <= N_SEVERITIES):
@@ -79,14 +79,13 @@ class Perturbation:
 
     def objection(self, space: spaces.Space, horizon: int | None = None) -> str | None:
         """
-        Say why this perturbation does not apply to an observation space; ``None``: it does.
+        Explain why this perturbation does not apply to an observation space; ``None`` if it applies.
 
-        :param space: The observation space.
-        :param horizon: Controls in an episode, where it is known.
+        :param horizon: Number of controls in an episode, if known.
         """
         kind = kind_of(space)
         if kind is None or not isinstance(space, spaces.Box):
-            return f"the observation space {space} is no Box: use gymnasium.wrappers.FlattenObservation first"
+            return f"the observation space {space} is not a Box: use gymnasium.wrappers.FlattenObservation first"
         if kind != self.kind:
             needs = "images: a Box of three dimensions with finite bounds" if self.kind == "image" else "vectors"
             return f"it is for {needs}, and the observation space is {space}"
@@ -97,92 +96,16 @@ class Perturbation:
         if sensor.is_depth and not self.on_depth:
             return "it changes colours, and in a depth image (floats of one channel) there are none"
         if self.later_only and horizon == 1:
-            return "it leaves the first observation of an episode alone, and with a horizon of 1 there is no other"
+            return "it leaves the first observation of an episode unchanged, and with a horizon of 1 there is no other"
         return None
 
     def applies_to(self, space: spaces.Space, horizon: int | None = None) -> bool:
-        """Tell whether this perturbation applies to an observation space; see :meth:`objection`."""
+        """Check whether this perturbation applies to an observation space; see :meth:`objection`."""
         return self.objection(space, horizon) is None
 
 
-PERTURBATIONS: dict[str, Perturbation] = {
-    row.name: row
-    for row in (
-        Perturbation(
-            "noise", "image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25), images.noise,
-            summary="noise on every pixel, clipped to the bounds",
-        ),
-        Perturbation(
-            "noise_minmax", "image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25),
-            images.noise_minmax, summary="noise on every pixel, then each image rescaled to the bounds (the paper's)",
-        ),
-        Perturbation(
-            "brightness", "image", "offset, share of the range", (0.05, 0.10, 0.20, 0.30, 0.40), images.brightness,
-            images.draw_sign, summary="brighter or darker, constant in an episode; an offset on depth images",
-        ),
-        Perturbation(
-            "contrast", "image", "factor", (0.8, 0.6, 0.45, 0.3, 0.15), images.contrast,
-            summary="contrast reduced towards the image's mean",
-        ),
-        Perturbation(
-            "hue", "image", "angle, degrees", (20.0, 45.0, 80.0, 120.0, 180.0), images.hue, images.draw_turn,
-            summary="hues rotated in either direction, constant in an episode",
-            channels=(3,), on_depth=False,
-        ),
-        Perturbation(
-            "blur", "image", "standard deviation, share of the height", (0.008, 0.016, 0.025, 0.04, 0.06), images.blur,
-            summary="Gaussian blur",
-        ),
-        Perturbation(
-            "occlusion", "image", "side, share of the image's", (0.2, 0.3, 0.4, 0.5, 0.6), images.occlusion,
-            images.draw_square, summary="a rectangle of one colour at a random place, constant in an episode",
-        ),
-        Perturbation(
-            "dropped_pixels", "image", "share of the pixels", (0.01, 0.05, 0.1, 0.2, 0.4), images.dropped_pixels,
-            summary="random pixels set to the lowest value, drawn anew in every frame",
-        ),
-        Perturbation(
-            "dropped_frames", "image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), history.dropped_frames,
-            history.draw_frames, summary="lost frames replaced by the last frame that arrived",
-            later_only=True, raw=True,
-        ),
-        Perturbation(
-            "delay", "image", "steps", (1, 2, 3, 4, 5), history.delay, history.draw_delay,
-            summary="frames arrive late; the first frame is repeated until then", later_only=True, raw=True,
-        ),
-        Perturbation(
-            "texture_overlay", "image", "opacity", (0.1, 0.2, 0.35, 0.5, 0.7), images.texture_overlay,
-            images.draw_texture, summary="one of 16 textures overlaid on the image, constant in an episode",
-            channels=(1, 3), on_depth=False,
-        ),
-        Perturbation(
-            "camera_shift", "image", "distance, share of the height", (0.02, 0.04, 0.07, 0.10, 0.15),
-            images.camera_shift, images.draw_shift,
-            summary="image shifted in a random direction, as by a rotated camera, constant in an episode",
-        ),
-        Perturbation(
-            "vector_noise", "vector", "standard deviation, scales", (0.05, 0.1, 0.2, 0.4, 0.8), vectors.noise,
-            summary="noise on every component",
-        ),
-        Perturbation(
-            "vector_bias", "vector", "offset, scales", (0.05, 0.1, 0.2, 0.4, 0.8), vectors.bias, vectors.draw_signs,
-            summary="an offset on every component, constant in an episode",
-        ),
-        Perturbation(
-            "vector_scale", "vector", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), vectors.scale, vectors.draw_signs,
-            summary="every component multiplied or divided, constant in an episode",
-        ),
-        Perturbation(
-            "vector_dropout", "vector", "share of the readings", (0.1, 0.2, 0.35, 0.5, 0.7), vectors.dropout,
-            vectors.draw_phase, summary="some components set to 0, different ones at every step",
-        ),
-        Perturbation(
-            "vector_delay", "vector", "steps", (1, 2, 3, 4, 5), history.delay, history.draw_delay,
-            summary="observations arrive late; the first one is repeated until then", later_only=True, raw=True,
-        ),
-    )
-}  # fmt: skip
-"""The perturbations by name."""
+PERTURBATIONS: dict[str, Perturbation] = {}
+"""The perturbations by name; :mod:`sb3_tdpg.robustness.effects` adds those of this package."""
 
 
 def register(perturbation: Perturbation) -> None:
@@ -192,15 +115,33 @@ def register(perturbation: Perturbation) -> None:
     :raises ValueError: if the name is taken.
     """
     if perturbation.name in PERTURBATIONS:
-        raise ValueError(f"there is a perturbation {perturbation.name!r} already: choose another name")
+        raise ValueError(f"a perturbation {perturbation.name!r} exists already: choose another name")
     PERTURBATIONS[perturbation.name] = perturbation
+
+
+def perturbation(
+    kind: str, parameter: str, severities: tuple[float, ...], *, name: str | None = None, **settings: Any
+) -> Callable[[Apply], Apply]:
+    """
+    Register a function as a :class:`Perturbation`, by its own name unless another one is given.
+
+    The summary is the first line of its docstring.
+    """
+
+    def add(apply: Apply) -> Apply:
+        summary = (apply.__doc__ or "").strip().split("\n")[0].rstrip(".")
+        own_name = getattr(apply, "__name__", "")
+        register(Perturbation(name or own_name, kind, parameter, severities, apply, summary=summary, **settings))
+        return apply
+
+    return add
 
 
 def find(name: str) -> Perturbation:
     """
     Return a perturbation by its name.
 
-    :raises ValueError: if there is none.
+    :raises ValueError: if the name is unknown.
     """
     if name not in PERTURBATIONS:
         raise ValueError(f"perturbation={name!r} is unknown: use one of {list(PERTURBATIONS)}")
@@ -214,7 +155,7 @@ def applicable(space: spaces.Space, horizon: int | None = None) -> list[str]:
 
 def severity_table(kind: str | None = None) -> pd.DataFrame:
     """
-    Return the table of the severities: a row for each perturbation, with its parameter and columns 1 to 5.
+    Return the table of severities: a row for each perturbation, with its parameter and columns 1 to 5.
 
     :param kind: ``"image"`` or ``"vector"``; ``None``: both.
     """

@@ -1,9 +1,4 @@
-"""
-Perturbations of the scene, which only the environment itself can make: by keywords of its constructor.
-
-A texture is painted on a wall and a camera stands elsewhere before an image is drawn. Each is a row of data, as a
-:class:`~sb3_tdpg.envs.scenarios.Scenario` is.
-"""
+"""Perturbations of the scene, such as another texture or camera pose, which are keywords of the environment."""
 
 from __future__ import annotations
 
@@ -14,10 +9,10 @@ from sb3_tdpg.robustness.registry import N_SEVERITIES
 
 Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each
 
-# The true state stays what it is, and with it the task: mugs that stand elsewhere are not among these.
+# The true state, and with it the task, does not change: no mugs in other places.
 SCENES: dict[str, dict[str, Severities]] = {
     "BallCatch-v0": {
-        # The training texture gives way to another one.
+        # Another texture, blended into the training texture.
         "texture": tuple(dict(texture=f"{share}%-turquoise_waves") for share in (20, 40, 60, 80, 100)),
         # By default the camera is 2 m high and looks up by 30 degrees.
         "camera_pose": tuple(
@@ -29,16 +24,16 @@ SCENES: dict[str, dict[str, Severities]] = {
         "camera_pose": tuple(dict(camera_shift=height) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
     },
 }
-"""Keywords by environment, perturbation and severity; add those of your own environment."""
+"""Keywords by environment, perturbation and severity; add rows for your own environment."""
 
 
 def scene_perturbations(env_id: str) -> dict[str, Severities]:
     """
-    Return the perturbations of an environment's scene: by name, the ``env_kwargs`` of the five severities.
+    Return the perturbations of an environment's scene: the ``env_kwargs`` of the five severities by name.
 
-    :param env_id: A registered Gymnasium id, also in the ``module:id`` form. One that :data:`SCENES` does not have has
-        none.
-    :raises ValueError: if one of them has not five severities.
+    :param env_id: A registered Gymnasium id, also in the ``module:id`` form. An id that is not in :data:`SCENES` has no
+        perturbations.
+    :raises ValueError: if a perturbation does not have five severities.
     """
     rows = SCENES.get(env_id.rpartition(":")[2], {})
     for name, severities in rows.items():

@@ -1,5 +1,5 @@
 """
-What a perturbation must know of an observation space, so that one strength means the same on all of them.
+The units of observations for perturbations, so that a severity means the same in every observation space.
 
 Dimension key: N environments, C channels, H and W rows and columns, D components of a vector.
 """
@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 VAST = 1e6
-"""Bounds further apart than this are none: some environments write the largest float for "unbounded"."""
+"""Bounds further apart count as infinite: some environments use the largest float for "unbounded"."""
 
 
 def finite_range(space: spaces.Box) -> np.ndarray:
-    """Return the distance of the bounds of each component, in the space's shape; infinite where there are none."""
+    """Return the distance between the bounds of each component, in the space's shape; inf where there are none."""
     with np.errstate(over="ignore", invalid="ignore"):
         distance = space.high.astype(np.float64) - space.low.astype(np.float64)
     return np.where(distance <= VAST, distance, np.inf)
@@ -24,10 +26,10 @@ def finite_range(space: spaces.Box) -> np.ndarray:
 
 def kind_of(space: spaces.Space) -> str | None:
     """
-    Tell what is observed.
+    Return the kind of observation.
 
     :return: ``"image"``: a ``Box`` of three dimensions, one of them the channels, or of two with bytes, and finite
-        bounds; ``"vector"``: any other ``Box``; ``None``: no ``Box``
+        bounds; ``"vector"``: any other ``Box``; ``None``: not a ``Box``
     """
     if not isinstance(space, spaces.Box):
         return None
@@ -35,16 +37,23 @@ def kind_of(space: spaces.Space) -> str | None:
     return "image" if has_pixels and np.isfinite(finite_range(space)).all() else "vector"
 
 
+def horizon_of(env: gym.Env | VecEnv) -> int | None:
+    """Return the attribute ``horizon`` of an environment, if it has one."""
+    if isinstance(env, VecEnv):
+        return env.get_attr("horizon", [0])[0] if env.has_attr("horizon") else None
+    return env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
+
+
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """
     An observation space with the units that perturbations work in.
 
-    An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at its highest. A vector
-    becomes ``(N, D)`` float64 in multiples of its scale; a component with a scale of 0 never varies and is left alone.
+    An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
+    becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed.
 
     :param space: The observation space.
-    :param scale: Of the components of a vector, in the space's shape; see :func:`.observation_scale`.
+    :param scale: Scale of the components of a vector, in the space's shape; see :func:`.observation_scale`.
     """
 
     space: spaces.Box
@@ -57,19 +66,19 @@ class Sensor:
 
     @property
     def is_depth(self) -> bool:
-        """Whether a pixel is one float: a distance, and no colour."""
+        """Whether a pixel is one float: a distance, not a colour."""
         return self.is_image and np.issubdtype(self.space.dtype, np.floating) and self.shape[0] == 1
 
     @property
     def channel_axis(self) -> int | None:
-        """Where an image has its channels: as for Stable-Baselines3, the shortest side, if this is not the middle."""
+        """Axis of the channels: as for Stable-Baselines3, the shortest side, unless it is the middle one."""
         if len(self.space.shape) == 2:
             return None
         return 0 if int(np.argmin(self.space.shape)) == 0 else 2
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """``(C, H, W)`` or ``(D,)``, whatever order the space has."""
+        """``(C, H, W)`` or ``(D,)``, whatever the order in the space."""
         shape = self.space.shape
         if not self.is_image:
             return (int(np.prod(shape)),)
@@ -78,7 +87,7 @@ class Sensor:
         return shape if self.channel_axis == 0 else (shape[2], *shape[:2])
 
     def to_units(self, observations: np.ndarray) -> np.ndarray:
-        """``(N, *obs)`` to a new array ``(N, C, H, W)`` or ``(N, D)``."""
+        """Convert ``(N, *obs)`` to a new array ``(N, C, H, W)`` or ``(N, D)``."""
         if not self.is_image:
             assert self.scale is not None
             scale = np.where(self.scale > 0, self.scale, 1.0)
@@ -93,10 +102,10 @@ class Sensor:
 
     def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """
-        Return to the space: its order, bounds and type.
+        Convert back to the order, the bounds and the type of the space.
 
         :param units: ``(N, C, H, W)`` or ``(N, D)``
-        :param observations: What they were before, ``(N, *obs)``.
+        :param observations: The unperturbed observations, ``(N, *obs)``.
         :return: ``(N, *obs)``, a new array
         """
         low, high = self.space.low, self.space.high
@@ -110,7 +119,7 @@ class Sensor:
         else:
             assert self.scale is not None
             values = np.where(self.scale > 0, units.reshape(observations.shape) * self.scale, observations)
-        # Bounds before a cast to integers, which wraps around, but after one to floats, which rounds.
+        # Clip before a cast to integers, which wraps around, but after a cast to floats, which rounds.
         if np.issubdtype(self.space.dtype, np.integer):
             return np.rint(np.clip(values, low, high)).astype(self.space.dtype)
         return np.clip(values.astype(self.space.dtype), low, high)

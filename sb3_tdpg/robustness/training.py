@@ -1,7 +1,5 @@
 """
-Random changes to the images that a policy sees in training, so that the bottleneck has something to leave out.
-
-For the evaluation, by one perturbation at a time in five severities, see :mod:`sb3_tdpg.robustness`.
+Random changes to the images of a training, so that the bottleneck has something to leave out.
 
 Dimension key: N environments, C channels, H and W rows and columns.
 """
@@ -24,28 +22,28 @@ class VecImagePerturbation(VecEnvWrapper):
     r"""
     Perturb every image of a vectorised environment at random.
 
-    In the order in which it is done, with y in [0, 1] and fresh random numbers for every image:
+    These steps are applied in order, with y in [0, 1] and new random numbers for every image:
 
-    1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, rows
+    1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, with rows
        divided by their sums (or by 0.3, if that is more);
     2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p (the size of its cells, and
        whether they have edges, are drawn once for all images of a step); a is uniform up to ``pattern``, 0 for three
-       images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's;
+       images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's sides;
     3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
        [0, 1];
-    4. noise: normal at every pixel, with a standard deviation uniform up to ``noise``.
+    4. noise: Gaussian at every pixel, with a standard deviation uniform up to ``noise``.
 
-    The true state is left alone. What an encoder tells of such a change is of no use to the task and counts as
-    information with the bounds that see the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``): they bound what the
-    TRVs carry of all that is in the image. Random numbers are torch's, so that a seed and a checkpoint cover them.
+    The true state does not change. The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound
+    the information about everything in the image, so what an encoder keeps of these changes counts as information.
+    The random numbers are torch's, so a seed and a checkpoint cover them.
 
     :param venv: Environments with images of bytes, channels first or last.
-    :param color: See above; 0 leaves the colours alone.
-    :param pattern: Likewise, at most 1.
-    :param patch: Likewise, at most 1.
-    :param contrast: Likewise, at most 1.
-    :param noise: Likewise.
-    :raises ValueError: if the observations are no images of bytes, or a strength is out of its range.
+    :param color: Strength of the mixing; 0 leaves the colours unchanged.
+    :param pattern: Largest opacity of the pattern, at most 1.
+    :param patch: Largest side of the opaque rectangle, at most 1.
+    :param contrast: Largest loss of contrast, at most 1.
+    :param noise: Largest standard deviation of the noise.
+    :raises ValueError: if the observations are not images of bytes, or a strength is out of its range.
     """
 
     def __init__(
@@ -60,18 +58,13 @@ class VecImagePerturbation(VecEnvWrapper):
         super().__init__(venv)
         space = venv.observation_space
         if not (isinstance(space, spaces.Box) and is_image_space(space)):
-            raise ValueError(f"VecImagePerturbation takes images of bytes (uint8, 0 to 255), and not {space}")
-        for name, value, largest in (
-            ("color", color, np.inf), ("pattern", pattern, 1.0), ("patch", patch, 1.0),
-            ("contrast", contrast, 1.0), ("noise", noise, np.inf),
-        ):  # fmt: skip
+            raise ValueError(f"VecImagePerturbation takes images of bytes (uint8, 0 to 255), not {space}")
+        strengths = dict(color=color, pattern=pattern, patch=patch, contrast=contrast, noise=noise)
+        for name, value in strengths.items():
+            largest = np.inf if name in ("color", "noise") else 1.0
             if not 0 <= value <= largest:
                 raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
-        self.color = color
-        self.pattern = pattern
-        self.patch = patch
-        self.contrast = contrast
-        self.noise = noise
+        self.color, self.pattern, self.patch, self.contrast, self.noise = strengths.values()
         self._channels_last = space.shape[0] > space.shape[2]
 
     def reset(self) -> np.ndarray:
@@ -98,12 +91,7 @@ class VecImagePerturbation(VecEnvWrapper):
         return (interval(height)[:, None, :, None] & interval(width)[:, None, None, :]).float()
 
     def perturb(self, images: np.ndarray) -> np.ndarray:
-        """
-        Perturb each image anew.
-
-        :param images: ``(N, C, H, W)`` or ``(N, H, W, C)``, uint8
-        :return: the same shape and type
-        """
+        """Perturb each image with new random numbers: ``(N, C, H, W)`` or ``(N, H, W, C)``, uint8."""
         y = th.as_tensor(images.transpose(0, 3, 1, 2) if self._channels_last else images) / 255.0
         n, channels, height, width = y.shape
 

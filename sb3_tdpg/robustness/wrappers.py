@@ -1,5 +1,5 @@
 """
-The two faces of a perturbation: a Gymnasium wrapper for one environment, and an SB3 wrapper for many.
+The wrappers that perturb observations: one for a Gymnasium environment, one for an SB3 ``VecEnv``.
 
 Dimension key: N environments side by side.
 """
@@ -17,24 +17,24 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import find
 from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.sensor import horizon_of
 
 Scale = float | np.ndarray | None
 
 
 class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
     """
-    Perturb what one environment shows.
+    Perturb the observations of one environment.
 
-    State, reward and info stay what they are, and so do the environment's random numbers. ``reset(seed=...)`` seeds the
-    perturbation, too.
+    State, reward, info and the environment's random numbers do not change. ``reset(seed=...)`` also seeds the
+    perturbation.
 
     :param env: Any environment with a suitable observation space.
     :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`.
     :param severity: 1 (mild) to 5 (strong).
-    :param seed: Of the perturbation; together with the one that ``reset`` is given. ``None``: that one alone, and if
-        there is none either, another perturbation every time.
-    :param scale: Of the components of a vector; default: from the bounds of the space, and where they are infinite,
-        measured in a short roll-out; see :func:`~sb3_tdpg.robustness.observation_scale`.
+    :param seed: Seed of the perturbation, combined with the seed of ``reset``. Without both it is random.
+    :param scale: Scale of the components of a vector; default: from the bounds of the space, and where they are
+        infinite, measured in a short rollout (:func:`~sb3_tdpg.robustness.observation_scale`).
     :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
     """
 
@@ -42,14 +42,13 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
         self, env: gym.Env, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
     ) -> None:
         if isinstance(env, VecEnv):
-            raise ValueError(f"{type(env).__name__} is several environments: use PerturbedVecEnv")
+            raise ValueError(f"{type(env).__name__} holds several environments: use PerturbedVecEnv")
         RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
         gym.ObservationWrapper.__init__(self, env)
-        horizon = env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
-        self._perturber = _perturber(perturbation, severity, env, 1, seed, scale, horizon)
+        self._perturber = _perturber(perturbation, severity, env, 1, seed, scale)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, and show its first observation perturbed."""
+        """Start an episode, and perturb its first observation."""
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._perturber.reseed(seed)
@@ -64,20 +63,12 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
 
 class PerturbedVecEnv(VecEnvWrapper):
     """
-    Perturb what N environments show, in one call for all of them.
+    Perturb the observations of N environments in one call.
 
-    Each environment has its own draw for its own episode, also of episodes that begin by an automatic reset;
-    ``info["terminal_observation"]`` is perturbed as the last observation of the episode that has ended. State, reward
-    and the rest of info stay what they are, and so do the environments' random numbers. ``env.seed(...)`` seeds the
-    perturbation, too. It goes inside a ``VecNormalize`` or a ``VecFrameStack``.
-
-    :param venv: The environments.
-    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`.
-    :param severity: 1 (mild) to 5 (strong).
-    :param seed: Of the perturbation; together with the environments'. ``None``: theirs alone, and if they have none
-        either, another perturbation every time.
-    :param scale: See :class:`PerturbedObservation`.
-    :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
+    Every episode has its own draw, also after an automatic reset; ``info["terminal_observation"]`` is perturbed as the
+    last observation of the episode that has ended. State, reward, the rest of info and the environments' random numbers
+    do not change. ``env.seed(...)`` also seeds the perturbation. Put this wrapper inside a ``VecNormalize`` or a
+    ``VecFrameStack``. The parameters are those of :class:`PerturbedObservation`.
     """
 
     def __init__(
@@ -85,20 +76,19 @@ class PerturbedVecEnv(VecEnvWrapper):
     ) -> None:
         if not isinstance(venv, VecEnv):
             raise ValueError(
-                f"{type(venv).__name__} is no VecEnv of Stable-Baselines3: use make_vec_env, or PerturbedObservation "
-                "for one environment"
+                f"{type(venv).__name__} is not a VecEnv of Stable-Baselines3: use make_vec_env, or "
+                "PerturbedObservation for one environment"
             )
         if isinstance(venv, VecNormalize) and venv.norm_obs:
             raise ValueError(
-                "a sensor is perturbed before its observations are normalised: "
-                "VecNormalize(PerturbedVecEnv(env, ...)), and not the other way round"
+                "observations must be perturbed before they are normalised: VecNormalize(PerturbedVecEnv(env, ...)), "
+                "not the other way round"
             )
         super().__init__(venv)
-        horizon = venv.get_attr("horizon", [0])[0] if venv.has_attr("horizon") else None
-        self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale, horizon)
+        self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale)
 
     def reset(self) -> np.ndarray:
-        """Start N episodes, and show their first observations perturbed."""
+        """Start N episodes, and perturb their first observations."""
         (env_seed, *_) = self.unwrapped._seeds  # the reset takes it
         observations = self.venv.reset()
         assert isinstance(observations, np.ndarray)
@@ -109,13 +99,13 @@ class PerturbedVecEnv(VecEnvWrapper):
         return self._perturber(observations)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step, and show the observations perturbed."""
+        """Step, and perturb the observations."""
         observations, rewards, dones, infos = self.venv.step_wait()
         assert isinstance(observations, np.ndarray)
         ended = np.flatnonzero(dones)
         if not len(ended):
             return self._perturber(observations), rewards, dones, infos
-        # First what the running episodes show, to their very end, then the beginning of the next ones.
+        # First the observations of the running episodes up to their end, then the first ones of the next episodes.
         last = observations.copy()
         for i in ended:
             last[i] = infos[i].get("terminal_observation", observations[i])
@@ -131,12 +121,12 @@ class PerturbedVecEnv(VecEnvWrapper):
 
 
 def _perturber(
-    name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale, horizon: int | None
+    name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale
 ) -> Perturber:
     perturbation, space = find(name), env.observation_space
     perturbation.value(severity)
-    # Asked before the calibration, which takes its time.
-    if (objection := perturbation.objection(space, horizon)) is not None:
+    # Checked before the calibration, which takes time.
+    if (objection := perturbation.objection(space, horizon_of(env))) is not None:
         raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
     if seed is not None and (isinstance(seed, bool) or seed < 0):
         raise ValueError(f"seed={seed} must be None or an integer of at least 0")

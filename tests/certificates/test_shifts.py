@@ -244,7 +244,7 @@ def test_bad_input_is_told(model):
     with pytest.raises(ValueError, match="VecNormalize"):
         TrainingEpisodes(normalized, TRAINING, **SMALL)
     toy = tiny_tdpg(ToyEnv(), n_episodes=2)
-    with pytest.raises(ValueError, match="CartPole-v1 is no environment of this plugin"):
+    with pytest.raises(ValueError, match="CartPole-v1 is not an environment of this plugin"):
         TrainingEpisodes(toy, Scenario("x", "CartPole-v1"), **SMALL)
 
 

@@ -10,9 +10,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.settings import DEPTH, IMAGE, VECTOR
-from sb3_tdpg.evaluation.knowledge import state_knowledge
+from sb3_tdpg.evaluation.information import state_knowledge
 from sb3_tdpg.measurement import estimate_information, information_interval, trust_checks
+from sb3_tdpg.settings import DEPTH, IMAGE, VECTOR
 
 
 def in_use():

@@ -226,9 +226,9 @@ def test_keywords_are_read_as_yaml():
 
 
 @pytest.mark.parametrize(("texts", "message"), [
-    (["texture"], "'texture' is no keyword .* key=value"),
-    (["=3"], "'=3' is no keyword"),
-    (["a b=3"], "'a b=3' is no keyword"),
+    (["texture"], "'texture' is not a keyword .* key=value"),
+    (["=3"], "'=3' is not a keyword"),
+    (["a b=3"], "'a b=3' is not a keyword"),
     (["a={b: 1}"], "must be a number, a text, .* or a list of these"),
     (["a=[{b: 1}]"], "must be a number"),
     (["a=[1, 2"], "must be a number"),
@@ -245,7 +245,7 @@ def test_a_keyword_that_cannot_be_read_is_refused(texts, message):
     (["--env", "BallCatch-v0", "--env-kwargs", "renderer=fast"], ["observation_space", "does not fit"]),
     (["--env", "Lava-v0", "--env-kwargs", "horizon=7"], ["horizon of 5", "has 7"]),
     (["--env", "Lava-v0", "--env-kwargs", "depth=1"], ["depth"]),
-    (["--env", "Lava-v0", "--env-kwargs", "depth"], ["'depth' is no keyword"]),
+    (["--env", "Lava-v0", "--env-kwargs", "depth"], ["'depth' is not a keyword"]),
     (["--env", "Lava-v0", "--seed", "-1"], ["seed=-1 must not be negative"]),
     (["--env", "Lava-v0", "--record", "film.avi"], ["film.avi", "'.avi'", ".gif or .mp4"]),
     (["--env", "Lava-v0", "--record", "film"], ["''", ".gif or .mp4"]),

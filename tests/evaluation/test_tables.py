@@ -139,7 +139,7 @@ def test_the_markdown_table_has_ours_beside_the_papers_and_the_best_in_bold():
         "| second | **9.00 (0.00)** |  | 9.50 (0.00) |  |",
         "",
         "Mean episode cost (standard deviation over episodes); the paper's columns: mean (standard deviation). "
-        "2 episodes a scenario, evaluation seed 0, stochastic policy. Lowest in bold.",
+        "2 episodes per scenario, evaluation seed 0, stochastic policy. Lowest in bold.",
     ]
 
 

@@ -310,15 +310,15 @@ def test_what_does_not_fit_is_refused(problem, arguments, fragment):
 
 
 def test_a_space_that_is_no_box_is_refused():
-    with pytest.raises(ValueError, match="is no Box"):
+    with pytest.raises(ValueError, match="is not a Box"):
         PerturbedObservation(gym.make("FrozenLake-v1"), "vector_noise")
 
 
 def test_one_environment_and_several_have_each_their_wrapper():
-    with pytest.raises(ValueError, match="DummyVecEnv is several environments: use PerturbedVecEnv"):
+    with pytest.raises(ValueError, match="DummyVecEnv holds several environments: use PerturbedVecEnv"):
         PerturbedObservation(make_vec_env("Pendulum-v1", 2), "vector_noise")
     for env in (gym.make("Pendulum-v1"), gym.make_vec("Pendulum-v1", 2)):
-        with pytest.raises(ValueError, match=r"is no VecEnv of Stable-Baselines3.*PerturbedObservation"):
+        with pytest.raises(ValueError, match=r"is not a VecEnv of Stable-Baselines3.*PerturbedObservation"):
             PerturbedVecEnv(env, "vector_noise")
 
 

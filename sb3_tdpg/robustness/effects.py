@@ -1,0 +1,233 @@
+"""
+All perturbations, each a function of a batch of observations with its row of the registry above it.
+
+Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Lost and late
+observations (``raw``) are ``(n, *obs)`` in the units of their space. The first line of a docstring is the summary in
+the tables of the documentation and of the report.
+
+Dimension key: n episodes side by side, C channels, H and W rows and columns, D components, K steps of delay.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from sb3_tdpg.envs.noise import noisy_pixels
+from sb3_tdpg.envs.textures import random_texture
+from sb3_tdpg.robustness.registry import Episode, perturbation
+from sb3_tdpg.robustness.sensor import Sensor
+
+MIN_BLUR = 0.35  # pixels: a narrower Gaussian changes nothing
+N_TEXTURES = 16
+FIRST_TEXTURE = 1000  # a seed: the seeds of users start at 0
+
+
+@perturbation("image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25))
+def noise(images: np.ndarray, std: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Add noise to every pixel, and clip to [0, 1]."""
+    return noisy_pixels(images, std, "clip", rng)
+
+
+@perturbation("image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25))
+def noise_minmax(images: np.ndarray, std: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Add noise to every pixel, and stretch each image to [0, 1], as the paper does."""
+    return noisy_pixels(images, std, "minmax", rng)
+
+
+def draw_sign(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw a sign for each episode."""
+    return dict(sign=rng.choice(np.array([-1, 1], np.float32), (n, 1, 1, 1)))
+
+
+@perturbation("image", "offset, share of the range", (0.05, 0.10, 0.20, 0.30, 0.40), draw=draw_sign)
+def brightness(images: np.ndarray, amount: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Make all images of an episode brighter or darker; on depth images, add an offset."""
+    return images + np.float32(amount) * episode["sign"]
+
+
+@perturbation("image", "factor", (0.8, 0.6, 0.45, 0.3, 0.15))
+def contrast(images: np.ndarray, factor: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Move all pixels towards the mean of their image."""
+    mean = images.mean(axis=(1, 2, 3), keepdims=True)
+    return mean + np.float32(factor) * (images - mean)
+
+
+def draw_turn(rng: np.random.Generator, n: int, degrees: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw for each episode in which direction its colours turn about the axis of greys."""
+    from scipy.spatial.transform import Rotation
+
+    angle = np.deg2rad(degrees) * rng.choice([-1.0, 1.0], n)
+    turn = Rotation.from_rotvec(angle[:, None] * np.ones(3) / np.sqrt(3))
+    return dict(turn=turn.as_matrix().astype(np.float32))  # (n, 3, 3)
+
+
+@perturbation(
+    "image", "angle, degrees", (20.0, 45.0, 80.0, 120.0, 180.0), draw=draw_turn, channels=(3,), on_depth=False
+)
+def hue(images: np.ndarray, degrees: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Turn the colours about the axis of greys, in one direction for an episode."""
+    return (episode["turn"] @ images.reshape(*images.shape[:2], -1)).reshape(images.shape)
+
+
+@perturbation("image", "standard deviation, share of the height", (0.008, 0.016, 0.025, 0.04, 0.06))
+def blur(images: np.ndarray, width: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Blur with a Gaussian."""
+    from scipy.ndimage import gaussian_filter
+
+    std = max(MIN_BLUR, width * images.shape[2])
+    return np.asarray(gaussian_filter(images, std, axes=(2, 3), mode="nearest"))
+
+
+def draw_square(rng: np.random.Generator, n: int, side: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw the place and the colour of each episode's occluder."""
+    channels, *lengths = sensor.shape
+    spans = []
+    for length in lengths:
+        size = max(1, round(side * length))
+        start = rng.integers(0, length - size + 1, (n, 1))
+        at = np.arange(length)
+        spans.append((at >= start) & (at < start + size))
+    return dict(rows=spans[0], columns=spans[1], color=rng.random((n, channels, 1, 1), dtype=np.float32))
+
+
+@perturbation("image", "side, share of the image's", (0.2, 0.3, 0.4, 0.5, 0.6), draw=draw_square)
+def occlusion(images: np.ndarray, side: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Cover a rectangle with one colour, the same in all images of an episode."""
+    inside = episode["rows"][:, None, :, None] & episode["columns"][:, None, None, :]
+    return np.where(inside, episode["color"], images)
+
+
+@perturbation("image", "share of the pixels", (0.01, 0.05, 0.1, 0.2, 0.4))
+def dropped_pixels(images: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Set random pixels to the lowest value, new ones in every frame."""
+    n, _, height, width = images.shape
+    is_dead = rng.random((n, 1, height, width), dtype=np.float32) < share
+    return np.where(is_dead, np.float32(0), images)
+
+
+def evenly(number: np.ndarray, share: float, phase: np.ndarray) -> np.ndarray:
+    """
+    Choose a share of consecutive numbers at even distances (systematic sampling): one of any 1 / share, at least.
+
+    Independent choices would leave out some short episodes altogether.
+
+    :param number: 0, 1, ...
+    :param share: In [0, 1].
+    :param phase: In [0, 1): the position of the first one.
+    """
+    return np.floor(share * (number + 1) + phase) > np.floor(share * number + phase)
+
+
+def draw_frames(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw where the count of lost frames starts, and allocate the last frame that arrived."""
+    return dict(phase=rng.random(n), last=np.empty((n, *sensor.space.shape), sensor.space.dtype))
+
+
+@perturbation("image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), draw=draw_frames, later_only=True, raw=True)
+def dropped_frames(observations: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Show the last frame that arrived in place of lost ones."""
+    last, t = episode["last"], episode["t"]
+    arrived = (t == 0) | ~evenly(t - 1, share, episode["phase"])
+    last[arrived] = observations[arrived]
+    return last.copy()
+
+
+def draw_delay(rng: np.random.Generator, n: int, steps: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Allocate the memory of late observations: ``(n, K, *obs)``."""
+    return dict(waiting=np.empty((n, int(steps), *sensor.space.shape), sensor.space.dtype))
+
+
+@perturbation("image", "steps", (1, 2, 3, 4, 5), draw=draw_delay, later_only=True, raw=True)
+def delay(observations: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Show the observation of some steps ago, and the first observation until then."""
+    waiting, t = episode["waiting"], episode["t"]
+    begins = t == 0
+    waiting[begins] = observations[begins][:, None]
+    at = np.arange(len(t)), t % int(steps)
+    late: np.ndarray = waiting[at]
+    waiting[at] = observations
+    return late
+
+
+@functools.cache
+def _textures(channels: int, height: int, width: int) -> np.ndarray:
+    """Return the textures in the size of an image: ``(16, C, H, W)``, read-only."""
+    bank = np.stack([random_texture(FIRST_TEXTURE + i) for i in range(N_TEXTURES)]) / np.float32(255)
+    rows, columns = (np.arange(length) * bank.shape[1] // length for length in (height, width))
+    sized = bank[:, rows][:, :, columns].transpose(0, 3, 1, 2)
+    sized = sized if channels == 3 else sized.mean(axis=1, keepdims=True)
+    sized.flags.writeable = False
+    return sized
+
+
+def draw_texture(rng: np.random.Generator, n: int, opacity: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw the texture of each episode."""
+    return dict(texture=rng.integers(0, N_TEXTURES, n))
+
+
+@perturbation("image", "opacity", (0.1, 0.2, 0.35, 0.5, 0.7), draw=draw_texture, channels=(1, 3), on_depth=False)
+def texture_overlay(images: np.ndarray, opacity: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Lay one of 16 textures half-transparently over all images of an episode."""
+    texture = _textures(*images.shape[1:])[episode["texture"]]
+    return np.float32(1 - opacity) * images + np.float32(opacity) * texture
+
+
+def draw_shift(rng: np.random.Generator, n: int, distance: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw in which direction the camera of each episode is turned, in whole pixels."""
+    _, height, width = sensor.shape
+    angle = rng.uniform(0, 2 * np.pi, n)
+    shift = max(1.0, distance * height) * np.stack([np.sin(angle), np.cos(angle)])
+    down, right = np.rint(shift).astype(int)[..., None]  # (n, 1) each
+    return dict(
+        from_rows=np.clip(np.arange(height) + down, 0, height - 1),
+        from_columns=np.clip(np.arange(width) + right, 0, width - 1),
+    )
+
+
+@perturbation("image", "distance, share of the height", (0.02, 0.04, 0.07, 0.10, 0.15), draw=draw_shift)
+def camera_shift(images: np.ndarray, distance: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Shift all images of an episode in one direction, as if the camera were turned a little."""
+    shifted = np.take_along_axis(images, episode["from_rows"][:, None, :, None], axis=2)
+    return np.take_along_axis(shifted, episode["from_columns"][:, None, None, :], axis=3)
+
+
+@perturbation("vector", "standard deviation, scales", (0.05, 0.1, 0.2, 0.4, 0.8))
+def vector_noise(vectors: np.ndarray, std: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Add noise to every component."""
+    return vectors + std * rng.standard_normal(vectors.shape)
+
+
+def draw_signs(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw a sign for each component of each episode."""
+    return dict(sign=rng.choice([-1.0, 1.0], (n, *sensor.shape)))
+
+
+@perturbation("vector", "offset, scales", (0.05, 0.1, 0.2, 0.4, 0.8), draw=draw_signs)
+def vector_bias(vectors: np.ndarray, offset: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Add an offset to every component, constant for an episode."""
+    return vectors + offset * episode["sign"]
+
+
+@perturbation("vector", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), draw=draw_signs)
+def vector_scale(vectors: np.ndarray, factor: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Multiply every component by a factor or divide it, constant for an episode."""
+    return vectors * factor ** episode["sign"]
+
+
+def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw where the count of lost readings starts."""
+    return dict(phase=rng.random(n))
+
+
+@perturbation("vector", "share of the readings", (0.1, 0.2, 0.35, 0.5, 0.7), draw=draw_phase)
+def vector_dropout(vectors: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Set some components to 0, others at every step."""
+    n, size = vectors.shape  # the same share of the readings in every episode
+    rank = rng.permuted(np.tile(np.arange(size), (n, 1)), axis=1)
+    reading = episode["t"][:, None] * size + rank
+    return np.where(evenly(reading, share, episode["phase"][:, None]), 0.0, vectors)
+
+
+perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", draw=draw_delay, later_only=True, raw=True)(delay)
