@@ -20,7 +20,7 @@ CLEAR = 0.95
 """A comparison is clear from this probability on."""
 
 MIN_CLEAR = 3
-"""Fewer models of a method never make a comparison clear: two are both ahead of two others by chance in 1 of 6 cases."""
+"""With fewer models of a method no comparison is clear: two beat two others by chance in one case of six."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
 
     The number of a model is its mean cost over episodes (for a perturbation, also over severities). The number of a
     method is the interquartile mean over its models, with a stratified bootstrap interval over the models. The interval
-    of a single model is that of its mean over episodes, by the normal approximation, or Wilson's if all costs are 0 or 1
-    (failures): it is about this model, not about the method.
+    of a single model is that of its mean over episodes, by the normal approximation, or Wilson's if all costs are 0
+    or 1 (failures): it is about this model, not about the method.
 
     :param records: The records of all rows.
     :param level: Coverage of the intervals.

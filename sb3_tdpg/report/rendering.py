@@ -16,7 +16,7 @@ def render(template: str, **values: Any) -> str:
     from jinja2 import Environment, PackageLoader
 
     loader = PackageLoader("sb3_tdpg.report")
-    env = Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)  # noqa: S701
+    env = Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     env.filters.update(md=escaped, repr=repr)
     text = env.get_template(template).render(**values)
     return re.sub(r"\n{3,}", "\n\n", text).lstrip()

@@ -56,7 +56,12 @@ def report(folder, tmp_path_factory):
 def test_the_page_and_its_files(report):
     _, out = report
     page = (out / "report.md").read_text()
-    for words in ("3 models of **PG** and 3 models of **tdpg**", "## In short", "**tdpg compared with PG**", "vector_delay"):
+    for words in (
+        "3 models of **PG** and 3 models of **tdpg**",
+        "## In short",
+        "**tdpg compared with PG**",
+        "vector_delay",
+    ):
         assert words in page
     for words in ("about the state", "shuffled pairs", "Sensor noise 1e0", "pg-seed2/model.zip", "Made by `"):
         assert words in page
