@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from scipy.special import betaln, digamma
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.distributions import Normal, kl_divergence
@@ -34,6 +33,7 @@ from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
+from sb3_tdpg.evaluation.rollout import act
 from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.vec_env import BatchedVecEnv
 
@@ -340,27 +340,23 @@ def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) ->
     :param n: N
     :param seed: Of the start, the dynamics, the sensor and the policy.
     """
-    policy, device, box = model.policy, model.device, env.action_space
-    assert isinstance(box, spaces.Box)  # of every environment of this plugin
-    policy.set_training_mode(False)
     env.np_random = np.random.default_rng([*seed, _START])
     state, costs = env._initial_state(n), np.zeros(n)
-    trv = th.zeros(n, policy.trv_dim, device=device)
+    trv = th.zeros(n, model.policy.trv_dim, device=model.device)
     states, prev_trvs, densities = [], [], []
     policy_seed = int(np.random.SeedSequence([*seed, _POLICY]).generate_state(1)[0])
     with isolated_randomness(policy_seed, model), th.no_grad():
         for t in range(env.horizon):
             env.np_random = np.random.default_rng([*seed, _SENSOR, t])
-            step = policy.step(obs_as_tensor(env._sensor(state), device), trv, np.full(n, t))
+            step, action = act(model, env._sensor(state), trv, np.full(n, t))
             states.append(state)
             prev_trvs.append(trv)
             densities.append(Normal(step.means, step.stds))
             trv = step.trvs
-            action = np.clip(step.actions.cpu().numpy().reshape((n, *box.shape)), box.low, box.high)
             costs += env._cost(state, action)
             env.np_random = np.random.default_rng([*seed, _DYNAMICS, t])
             state = env._dynamics(state, action)
-        last = _action_density(policy, trv)
+        last = _action_density(model.policy, trv)
     costs += env._terminal_cost(state)
     return RecordedEpisodes(costs, np.stack(states), th.stack(prev_trvs), step.noise, [*densities, last], seed)
 

@@ -11,11 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.animation import Episode, check_animation_path, save_animation
 from sb3_tdpg.evaluation.environments import check_models_fit
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.tdpg import TDPG
 
 
@@ -50,24 +52,63 @@ def enjoy(
     if record is not None:
         env_kwargs.setdefault("render_mode", "rgb_array")
     check_models_fit({str(model_path): model}, [Scenario("enjoy", env_id, env_kwargs)])
-    seeds = evaluation_seeds(seed)
-    with contextlib.closing(gym.make(env_id, **env_kwargs)) as env, isolated_randomness(seeds.policy, model):
+    env = gym.make(env_id, **env_kwargs)
+    fps = env.metadata.get("render_fps", 10)
+    with contextlib.closing(DummyVecEnv([lambda: _Recorder(env, record is not None)])) as vec_env:
         if record is not None and env.render_mode != "rgb_array":
             raise ValueError(
-                f"{env_id} with render_mode={env.render_mode!r} gives no pictures to record: it needs 'rgb_array'"
+                f"{env_id} with render_mode={env.render_mode!r} renders no pictures to record: it needs 'rgb_array'"
             )
-        episodes = []
-        for i in range(n_episodes):
-            observation, _ = env.reset(seed=seeds.env if i == 0 else None)
-            episode, final_state = _run_episode(model, env, observation, deterministic, record is not None)
-            print(f"episode {i + 1}: cost {episode.costs.sum():.2f}{_described(final_state)}", flush=True)
-            episodes.append(episode)
-        if n_episodes > 1:
-            print(f"mean cost {np.mean([episode.costs.sum() for episode in episodes]):.2f}")
-        if record is not None:
-            save_animation(episodes, record, horizon=model.horizon, fps=env.metadata.get("render_fps", 10))
-            print(f"the film is {record}")
+        episodes: list[Episode] = []
+        trvs: list[np.ndarray] = []
+        for step in rollout(model, vec_env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic):
+            trvs.append(step.memory[0][0])
+            if step.finished[0]:
+                pictures, costs, between = step.infos[0]["recorded"]
+                episodes.append(Episode(pictures, np.stack(trvs), np.array(costs), between))
+                state = _described(step.infos[0].get("state"))
+                print(f"episode {len(episodes)}: cost {sum(costs):.2f}{state}", flush=True)
+                trvs = []
+    if n_episodes > 1:
+        print(f"mean cost {np.mean([episode.costs.sum() for episode in episodes]):.2f}")
+    if record is not None:
+        save_animation(episodes, record, horizon=model.horizon, fps=fps)
+        print(f"the video is {record}")
     return episodes
+
+
+class _Recorder(gym.Wrapper):
+    """Keep what a vectorised environment loses when it resets an episode: pictures, and costs in double precision."""
+
+    def __init__(self, env: gym.Env, with_pictures: bool) -> None:
+        super().__init__(env)
+        self.with_pictures = with_pictures
+        self.film = getattr(env.unwrapped, "film", None) if with_pictures else None
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        result = self.env.reset(**kwargs)
+        self.costs: list[float] = []
+        self.between: list[list[np.ndarray]] = []
+        self.pictures = [self._picture()] if self.with_pictures else []
+        return result
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.costs.append(-float(reward))
+        if self.film is not None:
+            self.between.append(list(self.film()))
+        if self.with_pictures:
+            self.pictures.append(self._picture())
+        recorded = (self.pictures, self.costs, self.between)
+        return observation, reward, terminated, truncated, {**info, "recorded": recorded}
+
+    def _picture(self) -> np.ndarray:
+        picture = self.env.render()
+        if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
+            raise ValueError(
+                f"render() of {self.env} returned no picture: it must return an array (height, width, 3) of uint8"
+            )
+        return picture
 
 
 def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
@@ -110,35 +151,6 @@ def _load(path: str | os.PathLike[str]) -> TDPG:
         return TDPG.load(Path(path))
     except OSError as e:
         raise ValueError(f"{path} cannot be read ({e.strerror}): give the .zip file that model.save() wrote") from e
-
-
-def _run_episode(
-    model: TDPG, env: gym.Env, observation: np.ndarray, deterministic: bool, with_pictures: bool
-) -> tuple[Episode, np.ndarray | None]:
-    """Run the episode that begins with an observation; return its final state, too, where the environment tells it."""
-    pictures = [_picture(env)] if with_pictures else []
-    film = getattr(env.unwrapped, "film", None) if with_pictures else None
-    between: list[list[np.ndarray]] = []
-    memory, trvs, costs, is_over = None, [], [], False
-    while not is_over:
-        action, memory = model.predict(observation, memory, deterministic=deterministic)
-        assert memory is not None
-        observation, reward, terminated, truncated, info = env.step(action)
-        trvs.append(memory[0][0])
-        costs.append(-float(reward))
-        is_over = terminated or truncated
-        if film is not None:
-            between.append(list(film()))
-        if with_pictures:
-            pictures.append(_picture(env))
-    return Episode(pictures, np.stack(trvs), np.array(costs), between), info.get("state")
-
-
-def _picture(env: gym.Env) -> np.ndarray:
-    picture = env.render()
-    if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
-        raise ValueError(f"render() of {env} gave no picture: it must return an array (height, width, 3) of uint8")
-    return picture
 
 
 def _described(state: np.ndarray | None) -> str:

@@ -10,20 +10,20 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
 from sb3_tdpg.evaluation.knowledge import state_knowledge
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.information.loo import log_density_matrix
 from sb3_tdpg.measurement import InformationInterval, TrustBadge, information_interval, trust_checks
@@ -162,29 +162,15 @@ def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisode
     :param env: N environments, of which one episode each counts.
     :param seed: Seed of the environments and of the policy's sampling.
     """
-    seeds, n = evaluation_seeds(seed), env.num_envs
-    policy, device, action_space = model.policy, model.device, model.action_space
-    policy.set_training_mode(False)
-    steps: list[tuple[th.Tensor, ...]] = []
-    with isolated_randomness(seeds.policy, model), th.no_grad():
-        env.seed(seeds.env)
-        problem = read_problem(env)
-        observations: Any = env.reset()
-        states = problem.initial_states(env, observations)
-        trvs = th.zeros(n, policy.trv_dim, device=device)
-        alive, costs = np.ones(n, dtype=bool), np.zeros(n)
-        for t in range(problem.horizon):
-            step = policy.step(obs_as_tensor(observations, device), trvs, np.full(n, t))
-            trvs = step.trvs
-            here = (th.as_tensor(states, dtype=th.float32), trvs.cpu(), step.means.cpu(), step.stds.cpu())
-            steps.append((*here, th.as_tensor(alive)))
-            actions = step.actions.cpu().numpy().reshape((-1, *action_space.shape))
-            if isinstance(action_space, spaces.Box):
-                actions = np.clip(actions, action_space.low, action_space.high)
-            observations, rewards, dones, infos = env.step(actions)
-            states = problem.next_states(env, observations, dones, infos)
-            costs -= rewards * alive
-            alive = alive & ~dones  # what follows is another episode
+    problem = read_problem(env)
+    steps, costs = [], np.zeros(env.num_envs)
+    episodes = rollout(model, env, seeds=evaluation_seeds(seed), problem=problem, encode=True)
+    for step in islice(episodes, problem.horizon):
+        assert step.encoded is not None
+        alive = step.episode == 0  # what follows is another episode
+        encoded = (x.cpu() for x in (step.encoded.trvs, step.encoded.means, step.encoded.stds))
+        steps.append((th.as_tensor(step.states, dtype=th.float32), *encoded, th.as_tensor(alive)))
+        costs -= step.rewards * alive
     return EncodedEpisodes(InformationBatch(*(th.stack(parts) for parts in zip(*steps, strict=True))), costs)
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import is_monitored, rollout
 
 MAX_PARALLEL_EPISODES = 1_000
 """Episodes run side by side; a constant, because results depend on it."""
@@ -104,40 +105,24 @@ def run_episodes(
     :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``; the
         first episodes of all environments, then the second ones, and so on, whichever ended first
     """
-    final_infos: list[dict[str, float]] = []
-    begun: list[tuple[int, int]] = []  # of each: how many this environment had ended before, and which one it is
-
-    def at_step(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
-        # evaluate_policy appends an episode's return under the very same condition, right after this call.
-        info = local_variables["info"]
-        if local_variables["done"] and ("episode" in info or not local_variables["is_monitor_wrapped"]):
-            final_infos.append(_final_columns(info))
-            begun.append((int(local_variables["episode_counts"][local_variables["i"]]), local_variables["i"]))
-            if at_end is not None:
-                at_end()
-
-    seeds = evaluation_seeds(seed)
     env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES), sensor=sensor)
-    try:
-        with isolated_randomness(seeds.policy, model):
-            env.seed(seeds.env)
-            returns, lengths = evaluate_policy(
-                model,
-                env,
-                n_episodes,
-                deterministic=deterministic,
-                callback=at_step,
-                return_episode_rewards=True,
-                warn=False,
-            )
-    finally:
-        env.close()
+    returns, monitored = np.zeros(env.num_envs), is_monitored(env)
+    ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and environment
+    with contextlib.closing(env):
+        steps = rollout(model, env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic)
+        for step in steps:
+            returns += step.rewards
+            for i in np.flatnonzero(step.finished):
+                info = step.infos[i]
+                of_monitor = info["episode"] if monitored else {}
+                cost, length = -of_monitor.get("r", returns[i]), of_monitor.get("l", step.t[i] + 1)
+                ended[step.episode[i], i] = dict(cost=cost, length=length, **_final_columns(info))
+                if at_end is not None:
+                    at_end()
+            returns[step.dones] = 0
     # In the order of their ends, a number would stand for another start with every model and perturbation.
-    order = sorted(range(n_episodes), key=begun.__getitem__)
-    ended = pd.concat(
-        [pd.DataFrame(dict(cost=-np.asarray(returns), length=lengths)), pd.DataFrame(final_infos)], axis=1
-    )
-    records = ended.iloc[order].reset_index(drop=True)
+    order = sorted(range(n_episodes), key=list(ended).__getitem__)
+    records = pd.DataFrame(list(ended.values())).iloc[order].reset_index(drop=True)
     records.insert(0, "episode", np.arange(n_episodes))
     return records
 

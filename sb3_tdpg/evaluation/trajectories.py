@@ -6,13 +6,16 @@ Dimension key: T horizon, N episodes, X state.
 
 from __future__ import annotations
 
+import contextlib
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.problem import read_problem
 
 
@@ -37,26 +40,18 @@ def rollout_states(
     :raises ValueError: if the model does not fit, or an episode ends before the horizon.
     """
     check_models_fit({type(model).__name__: model}, [scenario])
-    seeds = evaluation_seeds(seed)
     env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
-    try:
-        with isolated_randomness(seeds.policy, model):
-            env.seed(seeds.env)
-            problem = read_problem(env)
-            observations: Any = env.reset()
-            states = [problem.initial_states(env, observations)]
-            costs = np.zeros(n_episodes)
-            memory, start = None, np.ones(n_episodes, dtype=bool)
-            for t in range(problem.horizon):
-                actions, memory = model.predict(observations, memory, start, deterministic)
-                observations, rewards, dones, infos = env.step(actions)
-                start = dones
-                costs -= rewards
-                if dones.any() and t < problem.horizon - 1:
-                    raise ValueError(
-                        f"an episode ended after {t + 1} of {problem.horizon} steps: nothing to draw on one axis"
-                    )
-                states.append(np.stack([info["state"] for info in infos]))
-    finally:
-        env.close()
+    with contextlib.closing(env):
+        problem = read_problem(env)
+        states, costs = [], np.zeros(n_episodes)
+        steps = rollout(model, env, seeds=evaluation_seeds(seed), deterministic=deterministic, problem=problem)
+        for step in islice(steps, problem.horizon):
+            if step.dones.any() and len(states) < problem.horizon - 1:
+                raise ValueError(
+                    f"an episode ended after {len(states) + 1} of {problem.horizon} steps: rollout_states needs "
+                    "episodes of equal length"
+                )
+            states.append(step.states)
+            costs -= step.rewards
+        states.append(np.stack([info["state"] for info in step.infos]))
     return Trajectories(np.stack(states), costs)

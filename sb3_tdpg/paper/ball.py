@@ -22,11 +22,8 @@ from sb3_tdpg.envs.scenarios import (
 from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
-    diagnosis_bars,
-    robustness_curves,
     save_figure,
     training_curves,
-    trv_knowledge,
 )
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.paper.common import (
@@ -40,6 +37,8 @@ from sb3_tdpg.paper.common import (
     write_knowledge,
     write_results,
 )
+from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves
+from sb3_tdpg.paper.knowledge import trv_knowledge
 from sb3_tdpg.tdpg import TDPG
 
 # Fixed before any policy was evaluated on the test rows. Seeds below 100 were used to make the blocks.

@@ -12,8 +12,6 @@ from sb3_tdpg.envs.scenarios import PANDA_GRASP, PANDA_GRASP_CAMERA
 from sb3_tdpg.evaluation import (
     aggregate_seeds,
     comparison_markdown,
-    failures_by_camera,
-    failures_by_yaw,
     save_figure,
     training_curves,
 )
@@ -29,6 +27,7 @@ from sb3_tdpg.paper.common import (
     write_knowledge,
     write_results,
 )
+from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
 from sb3_tdpg.paper.grasp_analysis import (
     ESTIMATES,
     KNOWLEDGE,

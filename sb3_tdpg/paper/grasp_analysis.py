@@ -11,8 +11,8 @@ import pandas as pd
 import torch as th
 
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import draw_mugs, encode_mugs, grasp_knowledge
 from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet, Mine, own_sample_bound
+from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
 from sb3_tdpg.tdpg import TDPG
 
 N_MUGS = 10_000  # for the regression

@@ -19,14 +19,13 @@ from sb3_tdpg.evaluation import (
     add_ratio,
     aggregate_seeds,
     comparison_markdown,
-    cost_histograms,
-    lava_trajectories,
     save_figure,
     summary_table,
     training_curves,
 )
 from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
 from sb3_tdpg.paper.common import RECORD_COLUMNS, folders_of, met, read_records, write_results
+from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
 READINGS = ("table", "text")

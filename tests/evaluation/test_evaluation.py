@@ -1,4 +1,3 @@
-import json
 import math
 import random
 import subprocess
@@ -17,15 +16,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
-from sb3_tdpg.common.provenance import check_same_config, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.envs.lava import GOAL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import (
-    cost_histograms,
     evaluate_scenarios,
-    lava_trajectories,
     rollout_states,
-    save_figure,
     summary_table,
     training_curves,
 )
@@ -261,7 +256,7 @@ def test_the_last_infos_success_becomes_a_failure_column(tdpg, monkeypatch):
     ],
 )
 def test_what_does_not_fit_is_an_error_before_any_episode_is_run(change, message, tdpg, monkeypatch):
-    monkeypatch.setattr("sb3_tdpg.evaluation.records.evaluate_policy", lambda *args, **kwargs: pytest.fail("ran"))
+    monkeypatch.setattr("sb3_tdpg.evaluation.records.rollout", lambda *args, **kwargs: pytest.fail("ran"))
     arguments = dict(model=tdpg, scenarios=LAVA, n_episodes=5) | change
     with pytest.raises(ValueError, match=message):
         evaluate_scenarios(**arguments)
@@ -280,41 +275,6 @@ def test_the_rollout_states_begin_at_the_start_and_follow_the_dynamics(tdpg):
 # -- figures ------------------------------------------------------------------------------------------------------
 
 
-def test_the_histograms_have_a_panel_for_each_noise_level_and_show_every_episode(records):
-    pytest.importorskip("matplotlib")
-    figure = cost_histograms(records, LAVA[1:])
-    assert [axes.get_title() for axes in figure.axes] == [
-        r"$\sigma^2 = 10^{-3}$", r"$\sigma^2 = 10^{-2}$", r"$\sigma^2 = 10^{-1}$", r"$\sigma^2 = 1$"
-    ]  # fmt: skip
-    for axes in figure.axes:
-        filled = [sum(bar.get_height() for bar in bars) for bars in axes.containers if len(bars) > 1]
-        assert filled == pytest.approx([1.0, 1.0])
-    with pytest.raises(ValueError, match="no episodes of the scenarios"):
-        cost_histograms(records, [Scenario("other", "Lava-v0")])
-
-
-def test_the_histograms_can_show_costs_of_zero_only():
-    pytest.importorskip("matplotlib")
-    cost_histograms(
-        pd.DataFrame(dict(model="A", scenario="x", cost=[0.0, 0.0])), [Scenario("x", "Lava-v0")]
-    ).canvas.draw()
-
-
-def test_the_trajectories_have_a_panel_for_each_model_and_noise_level(tdpg, ppo, tmp_path):
-    pytest.importorskip("matplotlib")
-    figure = lava_trajectories({"PG": ppo, "TDPG": tdpg}, n_episodes=4)
-    panels = figure.axes[:4]
-    assert [axes.get_title().splitlines()[0] for axes in panels] == [
-        r"PG, $\sigma^2 = 10^{-4}$", r"TDPG, $\sigma^2 = 10^{-4}$", r"PG, $\sigma^2 = 1$", r"TDPG, $\sigma^2 = 1$"
-    ]  # fmt: skip
-    paths = [[line.get_ydata() for line in axes.lines if len(line.get_ydata()) == 6] for axes in panels]
-    assert [len(each) for each in paths] == [4, 4, 4, 4]
-    np.testing.assert_array_equal([p[0] for p in paths[0]], [p[0] for p in paths[3]])
-    save_figure(figure, tmp_path / "new" / "trajectories.png", dpi=50)
-    assert (tmp_path / "new" / "trajectories.png").read_bytes().startswith(b"\x89PNG")
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["trajectories.png"]
-
-
 def test_the_training_curves_show_an_epoch_that_costs_nothing():
     pytest.importorskip("matplotlib")
     log = pd.DataFrame({"time/iterations": [1, 2], "rollout/ep_cost_mean": [0.5, 0.0]})
@@ -330,124 +290,13 @@ def test_the_training_curves_have_no_information_for_a_model_without_a_penalty()
     assert [line.get_label() for line in information.lines] == ["TDPG"]
 
 
-def test_without_matplotlib_everything_but_the_figures_works(records, monkeypatch):
+def test_without_matplotlib_everything_but_the_figures_works(monkeypatch):
     for name in ("matplotlib", "matplotlib.cm", "matplotlib.colors", "matplotlib.figure", "matplotlib.ticker"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=r"pip install sb3_tdpg\[plots\]"):
-        cost_histograms(records, LAVA)
+        training_curves({})
 
 
 def test_importing_the_package_does_not_import_matplotlib():
     code = "import sys; from sb3_tdpg.evaluation import figures; assert 'matplotlib.figure' not in sys.modules"
     subprocess.run([sys.executable, "-c", f"import sb3_tdpg; {code}"], check=True, cwd=Path(__file__).parents[2])
-
-
-# -- provenance ---------------------------------------------------------------------------------------------------
-
-
-def test_the_provenance_is_complete_and_plain_json():
-    found = provenance()
-    assert json.loads(json.dumps(found)) == found
-    assert {"python", "sb3_tdpg", "stable-baselines3", "torch", "gymnasium", "numpy"} <= set(found["versions"])
-    assert found["versions"]["torch"] == th.__version__.split("+")[0] or found["versions"]["torch"] == th.__version__
-    assert found["git"] is None or (len(found["git"]["commit"]) == 40 and isinstance(found["git"]["dirty"], bool))
-    assert {"platform", "cpu_count", "utc_time", "command"} <= set(found)
-
-
-def test_the_command_is_told_without_the_folders_of_the_machine(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    out = tmp_path / "results" / "a b"
-    monkeypatch.setattr(
-        sys, "orig_argv", [str(tmp_path / "bin" / "python3"), "-m", "sb3_tdpg", "--out", str(out), "./x"]
-    )
-    assert provenance()["command"] == "python3 -m sb3_tdpg --out 'results/a b' ./x"
-    monkeypatch.setattr(sys, "orig_argv", ["/venv/bin/python3", "/venv/bin/sb3-tdpg", "sweep", "--out", str(out)])
-    assert provenance()["command"] == "sb3-tdpg sweep --out 'results/a b'"
-    monkeypatch.setattr(sys, "orig_argv", ["python", "train.py"])
-    assert provenance()["command"] == "python train.py"
-
-
-@pytest.mark.parametrize("in_checkout_of_something_else", [False, True])
-def test_the_provenance_knows_no_commit_of_an_installed_package(in_checkout_of_something_else, monkeypatch, tmp_path):
-    if in_checkout_of_something_else:
-        subprocess.run(["git", "init", "-q", tmp_path], check=True)
-    package = tmp_path / ".venv" / "sb3_tdpg"
-    package.mkdir(parents=True)
-    (package / "__init__.py").touch()
-    monkeypatch.setattr("sb3_tdpg.common.provenance.__file__", str(package / "provenance.py"))
-    assert provenance()["git"] is None
-
-
-def test_a_run_configuration_holds_what_was_given_and_where_it_came_from(tmp_path):
-    path = tmp_path / "new" / "config.json"
-    config = dict(beta=math.inf, seeds=np.arange(2), lr=np.float32(0.5), folder=tmp_path, space=spaces.Discrete(2))
-    write_run_config(path, config)
-    read = json.loads(path.read_text())
-    assert float(read["beta"]) == math.inf
-    assert (read["seeds"], read["lr"], read["folder"]) == ([0, 1], 0.5, str(tmp_path))
-    assert read["provenance"]["versions"]["numpy"] == np.__version__
-    assert "provenance" not in config
-    assert [file.name for file in path.parent.iterdir()] == ["config.json"]
-
-
-LONG = "dict(net_arch=dict(encoder=[64, 64], action_head=[64, 64]), trv_dim={}, log_std_init=-1.0, ortho_init=False)"
-
-
-@pytest.mark.parametrize(("found", "wanted", "told"), [
-    (dict(settings=dict(lr=0.001, beta=math.inf)), dict(settings=dict(lr=0.0005, beta=math.inf)),
-     "settings.lr: 0.001 there, 0.0005 here"),
-    (dict(settings={}), dict(settings=dict(normalize=dict(norm_obs=True))),
-     'settings.normalize: not there, {"norm_obs": true} here'),
-    (dict(seed=0, start=None), dict(seed=0), "start: null there, not here"),
-    (dict(seed=0), dict(seed=0, start=None), "start: not there, null here"),
-    (dict(rows=[dict(name="a", std=1), dict(name="b", std=1)]), dict(rows=[dict(name="a", std=1), dict(name="b")]),
-     "rows[1].std: 1 there, not here"),
-    (dict(rows=[dict(name="a")]), dict(rows=[dict(name="a"), dict(name="b")]),
-     'rows[1]: not there, {"name": "b"} here'),
-    (dict(sizes=[64, 64]), dict(sizes=[32, 32]), "sizes: [64, 64] there, [32, 32] here"),
-    (dict(a=1, b=1, c=1, d=1, e=1, f=0), dict(a=2, b=2, c=2, d=2, e=2, f=0),
-     "a: 1 there, 2 here; b: 1 there, 2 here; c: 1 there, 2 here; and 2 more"),
-    (dict(kwargs=LONG.format(2)), dict(kwargs=LONG.format(4)),
-     "kwargs: ...ction_head=[64, 64]), trv_dim=2, log_std_init=-1.0, ortho_in... there, "
-     "...ction_head=[64, 64]), trv_dim=4, log_std_init=-1.0, ortho_in... here"),
-], ids=str)  # fmt: skip
-def test_a_folder_of_another_run_is_refused_with_what_differs(found, wanted, told, tmp_path):
-    write_run_config(tmp_path / "config.json", found)
-    check_same_config(tmp_path / "config.json", found, "run")
-    with pytest.raises(ValueError) as refused:
-        check_same_config(tmp_path / "config.json", wanted, "run")
-    mend = "choose another folder or remove it"
-    assert str(refused.value) == f"{tmp_path} holds a run with other settings, {told}: {mend}"
-
-
-@pytest.mark.parametrize("name", ["episodes.csv", "episodes.csv.gz", "episodes.csv.xz"])
-def test_a_frame_is_written_and_read_back_bit_for_bit(name, records, tmp_path):
-    path = tmp_path / "new" / name
-    write_frame_atomically(records, path)
-    pd.testing.assert_frame_equal(pd.read_csv(path), records)
-    # pandas' own reader was not exact to the last bit before its version 3.
-    assert pd.read_csv(path, converters={"cost": float})["cost"].equals(records["cost"])
-    first = path.read_bytes()
-    write_frame_atomically(records, path)
-    assert path.read_bytes() == first
-    assert [file.name for file in path.parent.iterdir()] == [name]
-
-
-def test_a_failing_write_leaves_the_old_file_whole(records, tmp_path, monkeypatch):
-    path = tmp_path / "episodes.csv"
-    write_frame_atomically(records, path)
-    before = path.read_bytes()
-
-    def half(self, target, **kwargs):
-        Path(target).write_text("half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(pd.DataFrame, "to_csv", half)
-    with pytest.raises(OSError, match="disk full"):
-        write_frame_atomically(records, path)
-    assert path.read_bytes() == before
-
-
-def test_a_frame_needs_a_name_that_tells_its_format(records, tmp_path):
-    with pytest.raises(ValueError, match=r"must end in \.csv, \.csv\.gz or \.csv\.xz"):
-        write_frame_atomically(records, tmp_path / "episodes.parquet")

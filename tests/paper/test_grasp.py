@@ -14,18 +14,12 @@ from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import PANDA_CAMERA, PANDA_GRASP
-from sb3_tdpg.evaluation import (
-    draw_mugs,
-    encode_mugs,
-    failures_by_camera,
-    failures_by_yaw,
-    grasp_knowledge,
-    knowledge,
-)
 from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import InformationBatch, Mine
-from sb3_tdpg.paper import common, grasp, grasp_analysis
+from sb3_tdpg.paper import common, grasp, grasp_analysis, knowledge
+from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
+from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
 
 
 @pytest.fixture

@@ -5,9 +5,7 @@ import pytest
 import torch as th
 
 from sb3_tdpg import TDPG, make_episodes_env
-from sb3_tdpg.evaluation import (
-    knowledge,
-)
+from sb3_tdpg.paper import knowledge
 
 
 def test_the_regression_on_the_trvs_finds_what_is_in_them_and_nothing_else():

@@ -1,0 +1,249 @@
+"""The figures that only the reproduction of the paper draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdpg.envs.lava import GOAL, LAVA, WALL
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.figures import (
+    INK,
+    PALETTE,
+    WIDTH,
+    _import_matplotlib,
+    _legend_above,
+    _log_axis,
+    _new_figure,
+    _short,
+    _tidy,
+)  # fmt: skip
+from sb3_tdpg.evaluation.trajectories import rollout_states
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_bins: int = 40) -> Figure:
+    """
+    Draw how often each model incurs which cost, as in the paper's Fig. 3: one panel for each scenario.
+
+    :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
+    :param scenarios: The panels from left to right.
+    :param n_bins: Bins, the same in all panels. They are equal on a logarithmic axis, since costs range over two
+        decades, unless a cost is zero or negative.
+    """
+    names = [scenario.name for scenario in scenarios]
+    shown = records[records["scenario"].isin(names)]
+    if missing := sorted(set(names) - set(shown["scenario"])):
+        raise ValueError(f"the records have no episodes of the scenarios {missing}")
+    figure = _new_figure(WIDTH, 2.9)
+    panels = _panels(figure, 1, len(scenarios))[0]
+    low, high = shown["cost"].min(), shown["cost"].max()
+    is_positive = low > 0
+    if is_positive:
+        low = max(low, high / 1e3)  # a few costs next to 0 must not stretch the axis; they go into the first bin
+        bins = np.geomspace(low, high * 1.001, n_bins + 1)
+    else:
+        bins = np.histogram_bin_edges(shown["cost"], n_bins)
+    for axes, scenario in zip(panels, scenarios, strict=True):
+        for color, (label, group) in zip(cycle(PALETTE), shown.groupby("model", sort=False), strict=False):
+            costs = group.loc[group["scenario"] == scenario.name, "cost"].clip(lower=low)
+            weights = np.full(len(costs), 1 / len(costs))
+            axes.hist(costs, bins, weights=weights, color=color, alpha=0.45, label=str(label))
+            axes.hist(costs, bins, weights=weights, color=color, histtype="step", linewidth=1.2)
+            axes.axvline(costs.mean(), color=color, linestyle=(0, (3, 2)), linewidth=1.2)
+        axes.set_title(_title(scenario), fontsize=9)
+    if is_positive:
+        _log_axis(panels[0], "x", subs=(1, 3))
+    panels[0].set_ylabel("share of episodes", fontsize=9)
+    figure.supxlabel(f"episode cost{' (logarithmic axis)' if is_positive else ''}; dashed: mean", fontsize=9)
+    _legend_above(figure, panels[0])
+    return figure
+
+
+def lava_trajectories(
+    models: Mapping[str, Any],
+    env_kwargs: Mapping[str, Any] | None = None,
+    n_episodes: int = 60,
+    seed: int = 0,
+    *,
+    noise_variances: Sequence[float] = (1e-4, 1.0),
+    deterministic: bool = False,
+) -> Figure:
+    """
+    Draw where the robot of the lava problem is over time: one column for each model, one row for each noise level.
+
+    :param models: SB3 models by their label.
+    :param env_kwargs: Keywords of the environment beside its noise.
+    :param n_episodes: Episodes in a panel; the same start positions in all.
+    :param seed: Seed of the episodes.
+    :param noise_variances: sigma^2 of the sensor in each row.
+    :param deterministic: Act without noise.
+    """
+    matplotlib = _import_matplotlib()
+    figure = _new_figure(WIDTH, 0.6 + 2.4 * len(noise_variances))
+    panels = _panels(figure, len(noise_variances), len(models))
+    norm = matplotlib.colors.Normalize(WALL, LAVA)
+    colors = matplotlib.cm.ScalarMappable(norm, "viridis")
+    for row, variance in zip(panels, noise_variances, strict=True):
+        for axes, (label, model) in zip(row, models.items(), strict=True):
+            scenario = Scenario(label, "Lava-v0", {**(env_kwargs or {}), "sensor_noise_std": variance**0.5})
+            states, costs = rollout_states(model, scenario, n_episodes, seed=seed, deterministic=deterministic)
+            d = states[:, :, 0]  # (T + 1, N)
+            _draw_corridor(axes, horizon=len(d) - 1)
+            for path in d.T:
+                axes.plot(path, color=colors.to_rgba(path[0]), linewidth=0.8, alpha=0.8)
+            in_lava = (d[-1] >= LAVA).mean()
+            title = f"{label}, {_noise(variance)}\nmean cost {costs.mean():.0f}, {in_lava:.0%} in the lava"
+            axes.set_title(title, fontsize=9)
+    for axes in panels[-1]:
+        axes.set_xlabel("time step $t$", fontsize=9)
+    figure.supylabel("distance from the wall $d_t$ (m)", fontsize=9)
+    bar = figure.colorbar(colors, ax=panels, pad=0.01, aspect=40)
+    bar.set_label("start $d_0$ (m)", fontsize=9)
+    return figure
+
+
+def robustness_curves(
+    records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str], reference: str = "Training"
+) -> Figure:
+    """
+    Draw each method's mean cost over the rows of a table: a line for the median seed, a dot for each seed.
+
+    :param records: With a column ``train_seed``.
+    :param noise_rows: Scenarios that are ordered; they follow the reference in the left panel.
+    :param other_rows: Scenarios without an order, for the right panel.
+    :param reference: The scenario of the training.
+    """
+    figure = _new_figure(WIDTH, 3.6)
+    panels = figure.subplots(1, 2, sharey=True, width_ratios=(len(noise_rows) + 1, len(other_rows)))
+    means = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean()
+    models = list(records["model"].unique())
+    for axes, rows in zip(panels, ([reference, *noise_rows], list(other_rows)), strict=True):
+        for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
+            seeds = means[model].unstack("scenario")[rows]  # (seeds, rows)
+            at = np.arange(len(rows)) + 0.1 * (i - (len(models) - 1) / 2)
+            axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4, alpha=0.7)
+            style = "-" if axes is panels[0] else ""
+            axes.plot(at, seeds.median().to_numpy(), style + "_", color=color, linewidth=1.2, markersize=9, label=model)
+        axes.set_xticks(range(len(rows)), [_short(row) for row in rows])
+        _tidy(axes)
+    _log_axis(panels[0], "y", subs=(1, 2, 5))
+    panels[0].set_ylabel("mean episode cost", fontsize=9)
+    panels[0].set_xlabel("standard deviation of the pixel noise", fontsize=9)
+    panels[1].set_xlabel("test background", fontsize=9)
+    _legend_above(figure, panels[0])
+    return figure
+
+
+def diagnosis_bars(records: pd.DataFrame) -> Figure:
+    """
+    Draw the final distance of each method in each scenario of a diagnosis: a bar for the median seed, a dot for each.
+
+    :param records: With the columns ``train_seed`` and ``distance`` (m).
+    """
+    figure = _new_figure(WIDTH, 3.2)
+    axes = figure.add_subplot()
+    distances = records.groupby(["model", "train_seed", "scenario"], sort=False)["distance"].mean()
+    models, rows = list(records["model"].unique()), list(records["scenario"].unique())
+    width = 0.8 / len(models)
+    for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
+        seeds = distances[model].unstack("scenario")[rows]
+        at = np.arange(len(rows)) + width * (i - (len(models) - 1) / 2)
+        axes.bar(at, seeds.median(), width=0.9 * width, color=color, alpha=0.45, label=model)
+        axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4)
+    axes.set_xticks(range(len(rows)), rows)
+    _tidy(axes)
+    _log_axis(axes, "y", subs=(1, 2, 5))
+    axes.set_ylabel("final distance from the ball (m)", fontsize=9)
+    _legend_above(figure, axes)
+    return figure
+
+
+def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
+    """
+    Draw the share of failed grasps over the mug's yaw, in polar coordinates: it shows where the handle matters.
+
+    :param records: Episodes with the columns ``model``, ``yaw`` (rad) and ``cost`` (1 for a failure).
+    :param n_bins: Sectors of the circle.
+    """
+    figure = _new_figure(5.2, 5.2)
+    axes = figure.add_subplot(projection="polar")
+    edges = np.linspace(0, 2 * np.pi, n_bins + 1)
+    middles = (edges[:-1] + edges[1:]) / 2
+    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
+        sector = np.digitize(group["yaw"].to_numpy() % (2 * np.pi), edges) - 1
+        share = group["cost"].groupby(sector).mean().reindex(range(n_bins)).to_numpy()
+        axes.plot(np.append(middles, middles[0]), np.append(share, share[0]), color=color, label=str(label), marker=".")
+    axes.set_title("share of failed grasps by the mug's yaw", fontsize=10, color=INK)
+    axes.set_ylim(bottom=0)
+    axes.tick_params(labelsize=8)
+    axes.legend(loc="upper right", bbox_to_anchor=(1.1, 1.1), fontsize=8, frameon=False)
+    return figure
+
+
+def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
+    """
+    Draw the share of failed grasps over how much higher than usual the camera was.
+
+    :param records: Episodes with the columns ``model``, ``camera`` (m) and ``cost`` (1 for a failure).
+    :param n_bins: Parts of the range of heights.
+    """
+    figure = _new_figure(WIDTH * 0.7, 3.2)
+    axes = figure.add_subplot()
+    _tidy(axes)
+    centimetres = 100 * records["camera"]
+    edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
+    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
+        share = group["cost"].groupby(np.digitize(centimetres[group.index], edges) - 1).mean().reindex(range(n_bins))
+        axes.plot((edges[:-1] + edges[1:]) / 2, share, color=color, label=str(label), marker=".")
+    axes.set_xlabel("height of the camera above its usual place, in cm", fontsize=9)
+    axes.set_ylabel("share of failed grasps", fontsize=9)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _panels(figure: Figure, n_rows: int, n_columns: int) -> np.ndarray:
+    """Panels with common axes: ``(n_rows, n_columns)``."""
+    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+    for axes in panels.flat:
+        _tidy(axes)
+    return panels
+
+
+def _draw_corridor(axes: Axes, horizon: int) -> None:
+    """Wall, goal and lava behind the trajectories."""
+    low, high = WALL - 0.5, LAVA + 0.5
+    axes.axhspan(low, WALL, color="#999999", linewidth=0)
+    axes.axhspan(LAVA, high, color="#F0954B", linewidth=0)
+    axes.axhline(GOAL[0], color=INK, linestyle=(0, (4, 3)), linewidth=1)
+    for height, text in ((WALL - 0.25, "wall"), (LAVA + 0.25, "lava")):
+        axes.text(0.98 * horizon, height, text, color=INK, fontsize=8, ha="right", va="center")
+    axes.text(1.015 * horizon, GOAL[0], "goal", color=INK, fontsize=8, va="center")
+    axes.set_ylim(low, high)
+    axes.set_xlim(0, horizon)
+    axes.set_xticks(range(horizon + 1))
+
+
+def _title(scenario: Scenario) -> str:
+    std = scenario.env_kwargs.get("sensor_noise_std")
+    if std is None:
+        return scenario.name
+    return f"training: {_noise(std**2)}" if scenario.name == "Training" else _noise(std**2)
+
+
+def _noise(variance: float) -> str:
+    """sigma^2 = 10^-3 in Matplotlib's mathematics."""
+    if variance == 0:
+        return r"$\sigma^2 = 0$"
+    exponent = np.log10(variance)
+    if np.isclose(exponent, round(exponent)) and round(exponent) != 0:
+        return rf"$\sigma^2 = 10^{{{round(exponent)}}}$"
+    return rf"$\sigma^2 = {variance:.3g}$"
