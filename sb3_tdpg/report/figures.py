@@ -30,11 +30,7 @@ MAX_STEPS = 500  # of the episode that shows the perturbations
 
 
 def degradation_curves(numbers: Numbers) -> Figure:
-    """
-    Draw the cost of each method over the severities with its interval, in a panel for each perturbation.
-
-    :param numbers: The numbers of the report.
-    """
+    """Draw the cost of each method over the severities with its interval, in a panel for each perturbation."""
     names, levels = numbers.perturbations, numbers.levels
     figure, panels = _grid(len(names))
     for axes, name in zip(panels.flat, names, strict=False):
@@ -55,11 +51,7 @@ def degradation_curves(numbers: Numbers) -> Figure:
 
 
 def own_rows_figure(numbers: Numbers) -> Figure:
-    """
-    Draw the cost of each method in the test rows of the environment, with its interval.
-
-    :param numbers: The numbers of a report with such rows.
-    """
+    """Draw the cost of each method in the test rows of the environment, with its interval."""
     shown = numbers.levels[numbers.levels["kind"].isin(("unperturbed", "own"))]
     figure, axes = _intervals(numbers, shown, ("iqm", "low", "high"))
     axes.grid(alpha=0.25, axis="x")
@@ -70,11 +62,7 @@ def own_rows_figure(numbers: Numbers) -> Figure:
 
 
 def comparison_figure(numbers: Numbers) -> Figure:
-    """
-    Draw the probability that a model of each method costs less than one of the first method, for each perturbation.
-
-    :param numbers: The numbers of a report with probabilities.
-    """
+    """Draw the probability that a model of each method costs less than one of the first method."""
     frame = numbers.comparisons[numbers.comparisons["p_cost"].notna()]
     figure, axes = _intervals(numbers, frame, ("p_cost", "p_cost_low", "p_cost_high"))
     axes.axvline(0.5, color=INK, linewidth=1)
@@ -110,17 +98,12 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
 
     The model acts on the unperturbed observations, so that the true episode is the same in all panels. The component is
     the one that varies most, in multiples of its scale.
-
-    :param plan: The settings of the report.
-    :param rows: The rows with perturbations of the sensor.
-    :param model: The model that acts.
     """
     observations, space = _episode(plan, model)
     flat = observations.reshape(len(observations), -1)
     assert plan.scale is not None
     scale = np.asarray(plan.scale, dtype=np.float64).ravel()
-    spread = flat.std(axis=0) / np.where(scale > 0, scale, np.inf)
-    component = int(np.argmax(spread))
+    component = int(np.argmax(flat.std(axis=0) / np.where(scale > 0, scale, np.inf)))
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
     shades = _import_matplotlib().colormaps["viridis_r"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,15 @@ from sb3_tdpg.common.provenance import check_same_config, provenance, write_fram
 from sb3_tdpg.common.summary import how_made
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import information_report, save_figure
+from sb3_tdpg.evaluation import InformationReport, information_report, save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
 from sb3_tdpg.report.figures import comparison_figure, degradation_curves, own_rows_figure, vector_examples
-from sb3_tdpg.report.html import to_html
 from sb3_tdpg.report.models import Source, check_registered, fingerprint, load_all
 from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, write_page
 from sb3_tdpg.report.records import Models, Plan, complete_rows
+from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.scale import default_scale
@@ -101,29 +101,22 @@ def robustness_report(
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
     _check_different(fingerprints, names)
-    config = dict(
-        env_id=env_id, env_kwargs=kwargs, n_episodes=n_episodes, seed=seed, deterministic=deterministic, scale=scale,
-        models=fingerprints,
-    )  # fmt: skip
+    config = {**vars(plan), "models": fingerprints}
+    del config["sources"]
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
 
     records = complete_rows(plan, rows, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar)
     numbers = make_numbers(records, seed=seed)
-    page = Page(env_id, kwargs, n_episodes, deterministic, names, rows)
-    page.figures = _draw(numbers, plan, rows, loaded, space, out)
-    page.knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
+    figures = _draw(numbers, plan, rows, loaded, space, out)
+    knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
     how = provenance()
-    page.made = how_made(how["command"], how)
-    frames = {
-        "episodes.csv.xz": records,
-        "levels.csv": numbers.levels,
-        "perturbations.csv": numbers.groups,
-        "comparisons.csv": numbers.comparisons,
-    }
+    page = Page(plan, rows, names, figures, knowledge, how_made(how["command"], how))
+    frames = dict(levels=numbers.levels, perturbations=numbers.groups, comparisons=numbers.comparisons)
     for name, frame in frames.items():
-        write_frame_atomically(frame, out / name)
+        write_frame_atomically(frame, out / f"{name}.csv")
+    write_frame_atomically(records, out / "episodes.csv.xz")
     text = write_page(numbers, page)
     write_atomically(out / "report.md", text)
     write_atomically(out / "report.html", to_html(text, out, f"Robustness in {env_id}"))
@@ -142,23 +135,21 @@ def _import_extra() -> None:
 
 
 def _sources(models: Mapping[str, Any]) -> dict[str, list[Source]]:
-    """Turn single models into lists, and text into paths."""
-    if not isinstance(models, Mapping):
+    """Check the models, and turn single models into lists and text into paths."""
+    if not isinstance(models, Mapping) or not models:
         raise ValueError(
-            f"models={models!r} must be a dictionary of models by method, for instance "
-            "{'PG': [pg_0, pg_1], 'TDPG': [tdpg_0, tdpg_1]}"
+            f"models={models!r} must be a dictionary with at least one method, for instance "
+            "{'PG': [pg_0, pg_1], 'TDPG': ['runs/tdpg-seed0/model.zip']}"
         )
-    if not models:
-        raise ValueError("models is empty: give at least one, for instance {'TDPG': ['runs/tdpg-seed0/model.zip']}")
     sources = {}
     for label, of_method in models.items():
-        several = list(of_method) if isinstance(of_method, (list, tuple)) else [of_method]
+        several = of_method if isinstance(of_method, (list, tuple)) else [of_method]
         if not several:
             raise ValueError(f"models[{label!r}] is empty: give at least one model")
-        sources[str(label)] = [Path(each) if isinstance(each, str) else each for each in several]
-        for each in sources[str(label)]:
-            if not isinstance(each, Path) and not hasattr(each, "get_vec_normalize_env"):
+        for each in several:
+            if not isinstance(each, (str, Path)) and not hasattr(each, "get_vec_normalize_env"):
                 raise ValueError(f"models[{label!r}] has {each!r}: expected a file, or a Stable-Baselines3 model")
+        sources[str(label)] = [Path(each) if isinstance(each, str) else each for each in several]
     return sources
 
 
@@ -230,21 +221,21 @@ def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: 
     with threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
         for number, (label, model) in enumerate(firsts.items()):
             progress.set_postfix_str(f"information, {label}")
-            known.append(_measure(plan, row, number, label, model, out, progress.update))
+            if not isinstance(model, TDPG):
+                reason = f"{type(model).__name__} has no task-relevant variables"
+                known.append(Knowledge(label, f"not measured: {reason}."))
+                continue
+            try:
+                with closing(scenario_env(row.scenario, model, n_episodes=N_INFORMATION)) as env:
+                    report = information_report(model, env, N_INFORMATION, plan.seed, at_end=progress.update)
+                known.append(_knowledge(label, report, out, f"information-{number}"))
+            except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
+                known.append(Knowledge(label, f"not measured: {e}."))
     return known
 
 
-def _measure(
-    plan: Plan, row: Row, number: int, label: str, model: Any, out: Path, at_end: Callable[[], Any]
-) -> Knowledge:
-    if not isinstance(model, TDPG):
-        return Knowledge(label, f"not measured: {type(model).__name__} has no task-relevant variables.")
-    try:
-        with closing(scenario_env(row.scenario, model, n_episodes=N_INFORMATION)) as env:
-            report = information_report(model, env, N_INFORMATION, plan.seed, at_end=at_end)
-        figures = [_save(figure, out, f"information-{number}-{name}") for name, figure in report.figures().items()]
-    except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
-        return Knowledge(label, f"not measured: {e}.")
+def _knowledge(label: str, report: InformationReport, out: Path, prefix: str) -> Knowledge:
+    figures = [_save(figure, out, f"{prefix}-{name}") for name, figure in report.figures().items()]
     lower, upper = report.interval.total
     trust = "all checks passed" if report.badge.passed else "**not reliable**: a check failed"
     text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over the time steps of an episode ({trust})."

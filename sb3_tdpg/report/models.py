@@ -56,8 +56,6 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
     any model may have the file's name (``model.zip``, ``best_model.zip``, the environment's id), without the seed:
     ``runs/pg-seed3/model.zip`` is a model of ``pg``.
 
-    :param arguments: The arguments.
-    :param env_id: Id of the environment.
     :return: the files of each method, in the order of the arguments
     :raises ValueError: if a file does not exist, or is given twice.
     """
@@ -84,11 +82,11 @@ def label_of(path: Path, env_id: str = "") -> str:
     return SEED.sub("", name) or name
 
 
-def _split(argument: str) -> tuple[str | None, str]:
+def _split(argument: str) -> tuple[str, str]:
     """Split ``LABEL=PATTERN``; an argument with a path separator before the ``=`` is a path."""
     label, equals, pattern = argument.partition("=")
     if not equals or os.sep in label or Path(argument).exists():
-        return None, argument
+        return "", argument
     if not label.strip() or not pattern:
         raise ValueError(f"{argument!r}: write LABEL=FILE, for instance PG=runs/pg-seed0/model.zip")
     return label.strip(), pattern
@@ -114,7 +112,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
 
     :param path: The file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
-    :param env_kwargs: Keywords of the environment, for the normalisation.
+    :param env_kwargs: Keywords of the environment.
     :raises ValueError: if the file cannot be read, or its algorithm is unknown.
     """
     try:
@@ -127,10 +125,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     known = [name for prefix, name in ALGORITHMS.items() if module.startswith(prefix)]
     known += [name for setting, name in SETTINGS.items() if setting in settings]
     if not known:
-        raise ValueError(
-            f"{path} is not a model of TDPG, Stable-Baselines3 or sb3-contrib (its policy is in {module!r}): "
-            "load it in Python, and pass it to sb3_tdpg.report.robustness_report"
-        )
+        raise ValueError(f"{path} is of an unknown algorithm: load it in Python, and pass it to robustness_report")
     package, name = known[0].split(":")
     try:
         model = getattr(import_module(package), name).load(path, device="cpu")

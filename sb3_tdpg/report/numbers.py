@@ -100,25 +100,17 @@ def _with_first(names: list[str], frame: pd.DataFrame) -> pd.DataFrame:
 
 def _cube(of_model: pd.DataFrame, rows: pd.DataFrame) -> np.ndarray:
     """Return the costs of a method, ``(S, R, E)``."""
-    keys = ["train_seed", "perturbation", "severity", "episode"]
-    costs = of_model.set_index(keys)["cost"].unstack("episode")
-    seeds = of_model["train_seed"].unique()
-    wanted = pd.MultiIndex.from_tuples(
-        [(seed, *row) for seed in seeds for row in rows[["perturbation", "severity"]].itertuples(index=False)]
-    )
-    return costs.loc[wanted].to_numpy().reshape(len(seeds), len(rows), -1)
+    ordered = of_model.merge(rows.reset_index(names="row")).sort_values(["train_seed", "row", "episode"])
+    return ordered["cost"].to_numpy().reshape(of_model["train_seed"].nunique(), len(rows), -1)
 
 
-def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], np.ndarray]:
+def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
     """Return the indices of the rows of each perturbation, by its name and kind."""
-    groups = {
-        (str(name), str(kind)): group.index.to_numpy()
-        for (name, kind), group in rows.groupby(["perturbation", "kind"], sort=False)
-    }
-    perturbed = rows.index[rows["kind"].isin(("sensor", "scene"))].to_numpy()
-    if len(rows.loc[perturbed, "perturbation"].unique()) > 1:
+    groups = {key: group.index for key, group in rows.groupby(["perturbation", "kind"], sort=False)}
+    perturbed = rows[rows["kind"].isin(("sensor", "scene"))]
+    if perturbed["perturbation"].nunique() > 1:
         own = {key: groups.pop(key) for key in list(groups) if key[1] == "own"}
-        groups = {**groups, (ALL, "all"): perturbed, **own}
+        groups.update({(ALL, "all"): perturbed.index, **own})
     return groups
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pandas as pd
 
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.report.numbers import CLEAR, MIN_CLEAR, Numbers
+from sb3_tdpg.report.records import Plan
 from sb3_tdpg.report.rendering import escaped, render
 from sb3_tdpg.report.rows import ALL, UNPERTURBED, Row
 from sb3_tdpg.robustness.registry import find
@@ -21,55 +22,28 @@ MIN_SEEDS = 5
 
 @dataclass
 class Knowledge:
-    """
-    The information in the TRVs of the first model of a method.
-
-    :param label: The method.
-    :param text: One line with the result, or the reason why there is none.
-    :param badge: Table of the checks, in Markdown.
-    :param figures: Files of the timeline and the map of the components.
-    """
+    """The information in the TRVs of the first model of a method."""
 
     label: str
-    text: str
-    badge: str = ""
+    text: str  # the result in a line, or the reason why there is none
+    badge: str = ""  # table of the checks, in Markdown
     figures: Sequence[str] = ()
 
 
 @dataclass
 class Page:
-    """
-    The content of a page beside its numbers.
+    """The content of a page beside its numbers."""
 
-    :param env_id: The environment.
-    :param env_kwargs: Its keywords.
-    :param n_episodes: Episodes of each model in each row.
-    :param deterministic: Whether the policies act without noise.
-    :param sources: Names of the models, by method.
-    :param rows: The rows of the report.
-    :param figures: File by name: ``degradation``, ``own_rows``, ``comparison``, ``examples``.
-    :param knowledge: The information of each method.
-    :param made: How the page was made, in a sentence.
-    """
-
-    env_id: str
-    env_kwargs: Mapping[str, Any]
-    n_episodes: int
-    deterministic: bool
-    sources: Mapping[str, Sequence[str]]
+    plan: Plan
     rows: Sequence[Row]
-    figures: Mapping[str, str] = field(default_factory=dict)
-    knowledge: Sequence[Knowledge] = ()
-    made: str = ""
+    sources: Mapping[str, Sequence[str]]  # names of the models, by method
+    figures: Mapping[str, str]  # files: degradation, own_rows, comparison, examples
+    knowledge: Sequence[Knowledge]
+    made: str  # the last sentence
 
 
 def write_page(numbers: Numbers, page: Page) -> str:
-    """
-    Write the page as Markdown.
-
-    :param numbers: The numbers of the report.
-    :param page: Everything else.
-    """
+    """Write the page as Markdown."""
     costs, has_all = Costs(numbers), ALL in set(numbers.groups["perturbation"])
     perturbed = [UNPERTURBED, *numbers.perturbations, *([ALL] if has_all else [])]
     own = numbers.groups.loc[numbers.groups["kind"] == "own", "perturbation"].unique()
@@ -77,34 +51,21 @@ def write_page(numbers: Numbers, page: Page) -> str:
         perturbations=costs.groups_table(perturbed, "perturbation") if numbers.perturbations else "",
         own=costs.groups_table([UNPERTURBED, *own], "test row") if len(own) else "",
         levels=costs.levels_table() if numbers.perturbations else "",
-        comparisons=comparisons_table(numbers),
-        severities=severities_table(page),
-        models=models_table(page),
+        comparisons=_comparisons_table(numbers),
+        severities=_severities_table(page),
+        models=_models_table(page),
     )
+    verdicts = [_verdict(numbers, label) for label in numbers.models[1:]]
+    few = [label for label, names in page.sources.items() if 1 < len(names) < MIN_SEEDS]
+    limits = dict(few=few, min_seeds=MIN_SEEDS, clear=CLEAR, min_clear=MIN_CLEAR)
     return render(
-        "report.md",
-        page=page,
-        tables=tables,
-        n_conditions=len(page.rows),
-        sizes=[len(names) for names in page.sources.values()],
-        few=[label for label, names in page.sources.items() if 1 < len(names) < MIN_SEEDS],
-        min_seeds=MIN_SEEDS,
-        clear=CLEAR,
-        min_clear=MIN_CLEAR,
-        reference=numbers.models[0],
-        unperturbed=costs.sentence(UNPERTURBED),
-        perturbed=costs.sentence(ALL) if has_all else "",
-        verdicts=[verdict(numbers, label) for label in numbers.models[1:]],
-        worst_cases=[costs.worst_case(label) for label in numbers.models] if numbers.perturbations else [],
-    )
+        "report.md", page=page, numbers=numbers, costs=costs, tables=tables, verdicts=verdicts,
+        all=ALL if has_all else None, unperturbed=UNPERTURBED, **limits,
+    )  # fmt: skip
 
 
 class Costs:
-    """
-    Write costs with the same number of decimals everywhere: three significant digits of the unperturbed costs.
-
-    :param numbers: The numbers of the report.
-    """
+    """Write costs with the same number of decimals everywhere: three significant digits of the unperturbed costs."""
 
     def __init__(self, numbers: Numbers) -> None:
         self.numbers = numbers
@@ -135,7 +96,7 @@ class Costs:
         perturbed = levels[levels["kind"].isin(("sensor", "scene"))]
         worst = perturbed.loc[perturbed["iqm"].idxmax()]
         where = worst[["perturbation", "severity"]]
-        return dict(label=label, **where, cost=self.cell(worst), unperturbed=self.number(plain))
+        return dict(**where, cost=self.cell(worst), unperturbed=self.number(plain))
 
     def groups_table(self, names: Sequence[str], title: str) -> str:
         """Make a table with a row for each perturbation: the cost and the added cost of every method."""
@@ -168,7 +129,7 @@ class Costs:
         return markdown_table(rows)
 
 
-def verdict(numbers: Numbers, label: str) -> dict[str, Any]:
+def _verdict(numbers: Numbers, label: str) -> dict[str, Any]:
     """Say where a method is better than the first one."""
     frame = numbers.comparisons[numbers.comparisons["model"] == label].set_index("perturbation")
     reference, names = numbers.models[0], numbers.perturbations
@@ -197,7 +158,7 @@ def _probability(row: Mapping[str, Any] | pd.Series, name: str) -> str:
     return f"{row[name]:.2f} [{row[f'{name}_low']:.2f}, {row[f'{name}_high']:.2f}]"
 
 
-def comparisons_table(numbers: Numbers) -> str:
+def _comparisons_table(numbers: Numbers) -> str:
     """Make a table of the probabilities that a method is better than the first one; empty if there are none."""
     if numbers.comparisons.empty or numbers.comparisons["p_cost"].isna().all():
         return ""
@@ -214,7 +175,7 @@ def comparisons_table(numbers: Numbers) -> str:
     return markdown_table(rows)
 
 
-def severities_table(page: Page) -> str:
+def _severities_table(page: Page) -> str:
     """Make a table of what the perturbations do, with the parameter of each severity; empty if there are none."""
     lines = []
     perturbed = [row for row in page.rows if row.kind in ("sensor", "scene")]
@@ -225,7 +186,7 @@ def severities_table(page: Page) -> str:
             values = [f"{row.value:g}" for row in rows]
         else:
             keywords = [row.scenario.env_kwargs for row in rows]
-            changed = [{k: v for k, v in each.items() if page.env_kwargs.get(k) != v} for each in keywords]
+            changed = [{k: v for k, v in each.items() if page.plan.env_kwargs.get(k) != v} for each in keywords]
             what, parameter = "the environment changes", ", ".join(f"`{key}`" for key in changed[0])
             values = [", ".join(map(str, each.values())) for each in changed]
         by_severity = {f"severity {row.severity}": value for row, value in zip(rows, values, strict=True)}
@@ -233,11 +194,11 @@ def severities_table(page: Page) -> str:
     return markdown_table(lines) if lines else ""
 
 
-def models_table(page: Page) -> str:
+def _models_table(page: Page) -> str:
     """Make a table of the models, with their numbers in the records."""
     rows = [
-        {"method": escaped(label), "`train_seed` in the records": str(number), "model": f"`{name}`"}
+        (escaped(label), str(number), f"`{name}`")
         for label, names in page.sources.items()
         for number, name in enumerate(names)
     ]
-    return markdown_table(rows)
+    return markdown_table(rows, ["method", "`train_seed` in the records", "model"])

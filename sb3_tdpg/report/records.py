@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,50 +54,33 @@ class Plan:
 
 def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
     """
-    Run every model in one row.
+    Run every model in one row, and return a frame with a row for each episode.
 
-    With the same seed all models start from the same initial states and meet the same perturbations, as far as
-    the environment and the lengths of the episodes allow.
-
-    :param plan: The settings of all rows.
-    :param row: The row.
-    :param models: Models by method.
-    :return: a row for each episode, with the columns ``model`` (the method), ``train_seed`` (the number of the model,
-        from 0), ``perturbation``, ``severity`` and ``kind``, followed by :data:`COLUMNS`
+    All models start from the same initial states and meet the same perturbations, as far as the environment and the
+    lengths of the episodes allow. The columns are ``model`` (the method), ``train_seed`` (the number of the model,
+    from 0), ``perturbation``, ``severity`` and ``kind``, followed by :data:`COLUMNS`.
     """
+
+    def sensor(env: VecEnv) -> VecEnv:
+        return PerturbedVecEnv(env, row.perturbation, row.severity, seed=plan.seed, scale=plan.scale)
+
+    how: dict[str, Any] = dict(seed=plan.seed, deterministic=plan.deterministic)
+    how["sensor"] = sensor if row.kind == "sensor" else None
     frames = []
     for label, of_method in models.items():
         for number, model in enumerate(of_method):
-            frame = run_episodes(
-                model, row.scenario, plan.n_episodes, seed=plan.seed, deterministic=plan.deterministic,
-                sensor=_sensor(plan, row),
-            )  # fmt: skip
-            frames.append(frame[[name for name in COLUMNS if name in frame]].assign(model=label, train_seed=number))
+            frame = run_episodes(model, row.scenario, plan.n_episodes, **how)
+            frames.append(frame.assign(model=label, train_seed=number))
     records = pd.concat(frames, ignore_index=True)
     records = records.assign(perturbation=row.perturbation, severity=row.severity, kind=row.kind)
-    keys = ["model", "train_seed", "perturbation", "severity", "kind"]
-    return records[[*keys, *(name for name in COLUMNS if name in records)]]
-
-
-def _sensor(plan: Plan, row: Row) -> Callable[[VecEnv], VecEnv] | None:
-    if row.kind != "sensor":
-        return None
-    return lambda env: PerturbedVecEnv(env, row.perturbation, row.severity, seed=plan.seed, scale=plan.scale)
+    keys = ("model", "train_seed", "perturbation", "severity", "kind")
+    return records[[name for name in (*keys, *COLUMNS) if name in records]]
 
 
 def complete_rows(
     plan: Plan, rows: Sequence[Row], models: Models, folder: Path, *, jobs: int = 1, progress_bar: bool = True
 ) -> pd.DataFrame:
-    """
-    Run the rows that have no file yet, and return the records of all rows.
-
-    :param plan: The settings of all rows.
-    :param rows: The rows.
-    :param models: The loaded models of the plan.
-    :param folder: Folder of the files.
-    :param jobs: Number of processes; 1 is this process.
-    :param progress_bar: Show a progress bar on stderr.
-    """
+    """Run the rows that have no file in a folder yet, and return the records of all rows."""
     missing = [row for row in rows if not (folder / row.file_name).exists()]
     with tqdm(total=len(rows), initial=len(rows) - len(missing), unit="row", disable=not progress_bar) as progress:
         try:

@@ -60,11 +60,6 @@ def default_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any] | None) -> dic
     return {**FAST.get(env_id.rpartition(":")[2], {}), **(env_kwargs or {})}
 
 
-def own_scenarios(env_id: str) -> Sequence[Scenario]:
-    """Return the test rows of the paper's table of an environment, without the training row."""
-    return PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:]
-
-
 def make_rows(
     env_id: str,
     env_kwargs: Mapping[str, Any],
@@ -76,15 +71,8 @@ def make_rows(
     scenarios: Sequence[Scenario] | None = None,
 ) -> list[Row]:
     """
-    List the rows of a report.
+    List the rows of a report; see :func:`~sb3_tdpg.report.robustness_report`.
 
-    :param env_id: A registered id.
-    :param env_kwargs: Keywords for all rows.
-    :param space: The observation space.
-    :param horizon: Steps of an episode, if they are known.
-    :param perturbations: Perturbations of the sensor and of the scene; default: all that apply.
-    :param severities: Severities from 1 to 5.
-    :param scenarios: Test rows of the environment; default: :func:`own_scenarios`.
     :raises ValueError: if a perturbation is unknown or does not apply, a severity does not exist, or two rows have the
         same name.
     """
@@ -109,7 +97,8 @@ def make_rows(
                 rows.append(Row(name, severity, "scene", scenario))
             else:
                 rows.append(Row(name, severity, "sensor", plain, PERTURBATIONS[name].value(severity)))
-    for own in own_scenarios(env_id) if scenarios is None else scenarios:
+    # The first row of a table of the paper is the training row.
+    for own in PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:] if scenarios is None else scenarios:
         rows.append(Row(own.name, 0, "own", Scenario(own.name, own.env_id, {**env_kwargs, **own.env_kwargs})))
     # In the tables the name of a perturbation stands for all its severities, and ALL for all perturbations.
     titles = [row.title for row in rows]

@@ -20,9 +20,9 @@ from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
-from sb3_tdpg.report.html import to_html
 from sb3_tdpg.report.models import label_of
 from sb3_tdpg.report.numbers import make_numbers
+from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
 
 pytest.importorskip("matplotlib")
@@ -324,7 +324,7 @@ def test_there_is_a_page_where_the_information_cannot_be_measured(tmp_path, monk
     "models, env_id, message",
     [
         ([], "Lava-v0", "models=\\[\\] must be a dictionary"),
-        ({}, "Lava-v0", "models is empty"),
+        ({}, "Lava-v0", "models={} must be a dictionary"),
         ({"A": []}, "Lava-v0", "models\\['A'\\] is empty"),
         ({"A": "nothing.zip"}, LavaEnv(), "must be the id of an environment: gymnasium.register"),
     ],
