@@ -102,13 +102,9 @@ def certify_lava(
     for name, frame in frames.items():
         write_frame_atomically(frame, out / f"{name}.csv")
     how = provenance()
-    settings.update(n_random_shifts=n_random_shifts, n_test_episodes=n_test_episodes)
-    names = [path.name for path in models]
-    write_run_config(
-        out / "config.json", dict(models=names, env_kwargs=training.env_kwargs, **settings, provenance=how)
-    )
-    made = how_made(how["command"], how)
-    summary = "\n\n".join([*_sections(frames, confidence, bound), made]) + "\n"
+    settings.update(n_random_shifts=n_random_shifts, n_test_episodes=n_test_episodes, env_kwargs=training.env_kwargs)
+    write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
+    summary = "\n\n".join([*_sections(frames, confidence, bound), how_made(how["command"], how)]) + "\n"
     write_atomically(out / "summary.md", summary)
     return summary
 
@@ -134,30 +130,20 @@ def _row(episodes: TrainingEpisodes, shift: Shift, n_budget: int | None, n_test:
     """Certify one shift, and measure the cost under it."""
     certified = episodes.certify(shift, n_budget)
     costs, measured_kl = episodes.measure(shift, n_test, seed=test_seed)
-    return dict(
-        shift=shift.name,
-        **{key: shift.env_kwargs.get(key) for key in ("sensor_noise_std", "sensor_bias", "start_beta")},
-        cost=costs.mean(),
-        standard_error=costs.std(ddof=1) / math.sqrt(len(costs)),
-        clipped_cost=np.minimum(costs, certified.trivial).mean(),
-        bound=certified.bound,
-        through_trvs=certified.through_trvs,
-        through_sensor=certified.through_sensor,
-        kl=certified.budget.kl,
-        exceedance=certified.budget.exceedance,
-        measured_kl=measured_kl,
-        sensor_kl=certified.sensor_kl,
-    )
+    row = {key: shift.env_kwargs.get(key) for key in ("sensor_noise_std", "sensor_bias", "start_beta")}
+    row.update(cost=costs.mean(), standard_error=costs.std(ddof=1) / math.sqrt(len(costs)))
+    row["clipped_cost"] = np.minimum(costs, certified.trivial).mean()
+    row.update((name, getattr(certified, name)) for name in ("bound", "through_trvs", "through_sensor"))
+    row.update(kl=certified.budget.kl, exceedance=certified.budget.exceedance)
+    return dict(shift=shift.name, **row, measured_kl=measured_kl, sensor_kl=certified.sensor_kl)
 
 
 def _paper_row(episodes: TrainingEpisodes, shift: Shift, n_test: int) -> dict[str, Any]:
     """Add two certificates: one without an allowance for sampling, and one of the unclipped cost."""
-    env_bound = episodes.true_cost_bound
-    return dict(
-        **_row(episodes, shift, None, n_test, episodes.seed + 1),
-        estimate=episodes.allowing(None).certify(shift).bound,
-        unclipped_bound=episodes.allowing(episodes.confidence, env_bound).certify(shift).bound,
-    )
+    row = _row(episodes, shift, None, n_test, episodes.seed + 1)
+    estimate = episodes.allowing(None).certify(shift).bound
+    unclipped = episodes.allowing(episodes.confidence, episodes.true_cost_bound).certify(shift).bound
+    return dict(**row, estimate=estimate, unclipped_bound=unclipped)
 
 
 def _theorem_row(episodes: TrainingEpisodes, inverse_beta: float) -> dict[str, Any]:
@@ -191,30 +177,23 @@ def _paper_table(paper: pd.DataFrame, confidence: float) -> str:
         "bound": f"upper bound ({confidence:.0%})", "estimate": "upper bound without allowance for sampling",
         "unclipped_bound": "upper bound on the unclipped cost",
     }  # fmt: skip
-    table = paper[list(columns)].copy()
-    for name in ("measured_kl", "kl", "exceedance"):
-        table[name] = table[name].map("{:.2g}".format)
-    return markdown_table(table.rename(columns=columns), digits=1)
+    short = {name: paper[name].map("{:.2g}".format) for name in ("measured_kl", "kl", "exceedance")}
+    return markdown_table(paper.assign(**short)[list(columns)].rename(columns=columns), digits=1)
 
 
 def _random_table(random: pd.DataFrame, trivial: float) -> str:
     rows = []
     for label, group in random.groupby("model", sort=False):
-        cost, bound = group["cost"], group["bound"]
-        certified = group[bound < 0.999 * trivial]
-        rows.append(
-            {
-                "policy": label,
-                "shifts": len(group),
-                "cost at most the bound": int((cost <= bound).sum()),
-                "cost + 3 standard errors at most the bound": int((cost + 3 * group["standard_error"] <= bound).sum()),
-                "bound below the trivial bound": len(certified),
-                "bound - cost: median [range]": _spread(certified["bound"] - certified["cost"]),
-                "bound / cost: median [range]": _spread(certified["bound"] / certified["cost"]),
-                "trivial bound / cost: median": f"{(trivial / cost).median():.3g}",
-                "median bound": f"{bound.median():.3g}",
-            }
-        )
+        cost, bound, error = group["cost"], group["bound"], group["standard_error"]
+        is_certified = bound < 0.999 * trivial
+        row = {"policy": label, "shifts": len(group)}
+        row["cost at most the bound"] = int((cost <= bound).sum())
+        row["cost + 3 standard errors at most the bound"] = int((cost + 3 * error <= bound).sum())
+        row["bound below the trivial bound"] = int(is_certified.sum())
+        row["bound - cost: median [range]"] = _spread((bound - cost)[is_certified])
+        row["bound / cost: median [range]"] = _spread((bound / cost)[is_certified])
+        row["trivial bound / cost: median"] = f"{(trivial / cost).median():.3g}"
+        rows.append({**row, "median bound": f"{bound.median():.3g}"})
     return markdown_table(rows)
 
 
@@ -241,13 +220,7 @@ def _theorem_table(theorem: pd.DataFrame, random: pd.DataFrame) -> str:
 
 
 def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float) -> Figure:
-    """
-    Draw the bound over the cost, and both over the size of the shift.
-
-    :param random: ``random.csv`` of :func:`certify_lava`.
-    :param paper: ``paper.csv``; its shifts are drawn as large markers.
-    :param trivial: The bound that always holds.
-    """
+    """Draw the bound over the cost, and both over the size of the shift, from ``random.csv`` and ``paper.csv``."""
     figure = _new_figure(WIDTH, 4.0)
     against_cost, against_size = figure.subplots(1, 2, sharey=True)
     for color, label in zip(cycle(PALETTE), random["model"].unique(), strict=False):
@@ -261,8 +234,8 @@ def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float
         against_size.scatter(moved["sensor_kl"], moved["bound"], **small, linewidths=0)
         against_size.scatter(moved["sensor_kl"], moved["cost"], **small, marker="x", linewidths=0.6)
         against_size.scatter(rows["sensor_kl"], rows["bound"], **large)
-    low = 0.8 * random["cost"].min()
-    against_cost.plot([low, trivial], [low, trivial], color=INK, linewidth=1)
+    diagonal = [0.8 * random["cost"].min(), trivial]
+    against_cost.plot(diagonal, diagonal, color=INK, linewidth=1)
     place = dict(xytext=(-36, -22), textcoords="offset points", ha="right")
     against_cost.annotate("cost = bound", (trivial, trivial), **place, fontsize=8, color=INK)
     for axes in (against_cost, against_size):
@@ -272,8 +245,7 @@ def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float
     _log_axis(against_cost, "x", subs=(1, 3))
     _log_axis(against_cost, "y", subs=(1, 2, 5))
     against_size.set_xscale("log")
-    against_cost.set_xlabel("mean cost in the shifted environment", fontsize=9)
-    against_cost.set_ylabel("certified upper bound (dashed: trivial bound)", fontsize=9)
-    against_size.set_xlabel("divergence of sensor and start (nat); crosses: cost", fontsize=9)
+    against_cost.set(xlabel="mean cost in the shifted environment", ylabel="certified upper bound (dashed: trivial)")
+    against_size.set_xlabel("divergence of sensor and start (nat); crosses: cost")
     _legend_above(figure, against_cost)
     return figure

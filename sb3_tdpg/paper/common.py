@@ -62,11 +62,8 @@ def make_tasks(
     """
     Make the runs of several methods, some of which start from the policy of another one with the same seed.
 
-    :param env_id: The training environment.
-    :param folder: The folder of all runs.
     :param methods: Methods with their seeds, each after the method that it starts from.
     :param rows: Returns the rows that a method is evaluated on.
-    :param n_timesteps: Environment steps of each training; default: as in the blocks.
     """
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     tasks: list[Task] = []
@@ -95,20 +92,14 @@ def met(condition: bool) -> str:
 
 
 def goals_table(aggregated: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
-    """
-    Compare interquartile means with goals.
-
-    :param aggregated: The result of :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
-    :param goals: The largest allowed value by method and row.
-    """
+    """Compare the interquartile means of ``aggregate_seeds`` with the largest allowed values, by method and row."""
     cells = aggregated.set_index(["model", "scenario"])["iqm"]
     rows = [
-        dict(method=method, row=row, goal=f"<= {goal:g}", result=f"{cells[method, row]:.3g}",
-             verdict=met(cells[method, row] <= goal))
+        [method, row, f"<= {goal:g}", f"{cells[method, row]:.3g}", met(cells[method, row] <= goal)]
         for method, of_method in goals.items()
         for row, goal in of_method.items()
-    ]  # fmt: skip
-    return markdown_table(rows)
+    ]
+    return markdown_table(rows, ["method", "row", "goal", "result", "verdict"])
 
 
 def comparisons_table(
@@ -148,13 +139,7 @@ def comparisons_table(
 
 
 def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> str:
-    """
-    Write ``knowledge.csv``, and return the table of the means over seeds.
-
-    :param knowledge: What the TRVs know, with a row for each policy.
-    :param by: The columns that identify a row of the table.
-    :param out: Folder of the results.
-    """
+    """Write ``knowledge.csv`` with a row for each policy, and return the table of the means over seeds."""
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby(list(by), sort=False).mean().reset_index()
     return markdown_table(means.rename(columns=dict(model="method")), digits=2)
@@ -164,13 +149,10 @@ def write_results(
     out: Path, sections: Sequence[str], tasks: Sequence[Task], command: str, publish: Path | None = None
 ) -> str:
     """
-    Write ``summary.md`` and ``config.json``, and return the summary.
+    Write ``summary.md`` and ``config.json``, copy all files to another folder if asked to, and return the summary.
 
-    :param out: Folder of the results.
-    :param sections: Sections of the summary.
-    :param tasks: The finished runs.
     :param command: The command that makes the results again.
-    :param publish: Folder that gets a copy of all files, without the folders.
+    :param publish: Folder that gets the copy, without the runs.
     """
     how = provenance()
     write_run_config(out / "config.json", dict(runs=[run.config for run, *_ in tasks], provenance=how))

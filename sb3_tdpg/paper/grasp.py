@@ -54,13 +54,13 @@ COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG", "PG"))
 # without: where almost nothing fails, the gradient is mostly noise.
 SECOND_STAGE = dict(n_timesteps=8_000, learning_rate=2e-4)
 # About the cost of PG: a higher limit would let TDPG get worse than the policy that it starts from.
-COST_LIMIT = 0.01
+TDPG_SECOND_STAGE = dict(**SECOND_STAGE, cost_limit=0.01)
 
 
 def _methods(block: str) -> tuple[Method, ...]:
     return (
         Method("PG", f"{block}-pg"),
-        Method("TDPG", block, "PG", overrides={**SECOND_STAGE, "cost_limit": COST_LIMIT}),
+        Method("TDPG", block, "PG", overrides=TDPG_SECOND_STAGE),
         Method(NO_PENALTY, f"{block}-pg", "PG", overrides=SECOND_STAGE),
     )
 

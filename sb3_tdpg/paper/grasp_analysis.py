@@ -52,12 +52,7 @@ PENALTY = (
 
 
 def knowledge_table(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[Scenario]) -> pd.DataFrame:
-    """
-    Measure what the TRVs of each model know of mugs, and bound their information.
-
-    :param models: Models by label and training seed.
-    :param scenarios: The scenarios that the mugs are drawn from.
-    """
+    """Measure what the TRVs of each model (by label and seed) know of mugs, and bound their information."""
     rows = []
     for row in scenarios:
         mugs = draw_mugs(row.env_kwargs, n_mugs=N_MUGS)
@@ -77,11 +72,7 @@ def bounds(batch: InformationBatch) -> dict[str, float]:
 
 
 def estimates_table(models: Mapping[str, TDPG]) -> pd.DataFrame:
-    """
-    Compare MINE's estimates of the information in several policies with the bounds.
-
-    :param models: Models by label, in the order in which the critics are fitted to them.
-    """
+    """Compare MINE's estimates of the information in several policies, fitted one after the other, with the bounds."""
     mugs = {
         f"{FITTED_MUGS} mugs of the fit": draw_mugs(n_mugs=FITTED_MUGS, seed=1),
         "fresh mugs": draw_mugs(n_mugs=min(N_MUGS, N_BOUND), seed=2),
@@ -104,11 +95,7 @@ def estimates_table(models: Mapping[str, TDPG]) -> pd.DataFrame:
 
 
 def penalty_table(progress: Mapping[int, pd.DataFrame]) -> list[dict[str, Any]]:
-    """
-    Summarise what the penalty did in training, with a row for each seed.
-
-    :param progress: Training log by seed, from :func:`~sb3_tdpg.experiments.runs.read_progress`.
-    """
+    """Summarise what the penalty did in training, with a row for each seed; ``progress`` has the logs by seed."""
     rows = []
     for seed, log in progress.items():
         # The weight of an epoch stands in the row after it, so that the first row has no weight.

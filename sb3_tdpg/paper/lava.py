@@ -51,15 +51,8 @@ TITLES = {
     "text": "Cost definition: text",
     "paper": "The paper's own settings (cost definition: table)",
 }
-SEED_COLUMNS = {
-    "model": "method",
-    "train_seed": "seed",
-    "mean": "mean cost in training",
-    "std": "standard deviation",
-    "ratio": "ratio",
-    "attempts": "trainings",
-    "selected": "limits met",
-}
+SEED_COLUMNS = dict(model="method", train_seed="seed", attempts="trainings", selected="limits met")
+COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ratio")
 SEEDS = (
     "Every seed: the mean cost in the training row and its standard deviation over episodes; the ratio of the mean "
     "cost at sigma^2 = 1 to the mean cost in the training row; the number of trainings until one met the limits, and "
@@ -191,7 +184,7 @@ def reproduce_lava(
         seed_tables.append(by_seed.assign(group=group))
         sections += [f"## {TITLES[group]}", comparison_markdown(aggregate_seeds(records), LAVA)]
         sections += [_goals_table(by_seed, GOALS.get(group, {}))]
-        sections += [SEEDS, markdown_table(by_seed.rename(columns=SEED_COLUMNS))]
+        sections += [SEEDS, markdown_table(by_seed.rename(columns={**SEED_COLUMNS, **COLUMNS}))]
         if group in READINGS:
             folders = {method: folders_of(of_group)[method, FIRST_SEED] for method in METHODS}
             models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
@@ -212,12 +205,11 @@ def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
 
 def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, tuple[float, float | None, float | None]]) -> str:
     """Summarise the seeds of each method, and compare them with its goals."""
-    names = dict(mean="mean cost in training", std="standard deviation", ratio="ratio")
     rows = []
     for method, of_method in seeds.groupby("model", sort=False):
         spread = {
             f"{name}: mean (worst seed)": f"{of_method[c].mean():.3g} ({of_method[c].max():.3g})"
-            for c, name in names.items()
+            for c, name in COLUMNS.items()
         }
         verdict = _verdict(of_method, *goals[str(method)]) if method in goals else "none set"
         rows.append(dict(method=method, seeds=len(of_method), **spread, goals=verdict))
