@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from sb3_tdpg.common.provenance import provenance
-from sb3_tdpg.common.summary import how_made
-from sb3_tdpg.paper.common import markdown_table
+from sb3_tdpg.paper.common import how_made, markdown_table
 
 
 def sweep_summary(
