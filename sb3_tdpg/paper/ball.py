@@ -19,24 +19,10 @@ from sb3_tdpg.envs.scenarios import (
     PaperResult,
     Scenario,
 )
-from sb3_tdpg.evaluation import (
-    aggregate_seeds,
-    comparison_markdown,
-    save_figure,
-    training_curves,
-)
+from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure, training_curves
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
-from sb3_tdpg.paper.common import (
-    NO_PENALTY,
-    Method,
-    comparisons_table,
-    folders_of,
-    goals_table,
-    make_tasks,
-    read_records,
-    write_knowledge,
-    write_results,
-)
+from sb3_tdpg.paper import common
+from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves
 from sb3_tdpg.paper.knowledge import trv_knowledge
 from sb3_tdpg.tdpg import TDPG
@@ -140,7 +126,7 @@ def reproduce_ball(
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     everything = [(method, seed) for method in methods for seed in seeds]
     everything += [(method, seed) for method in paper_methods for seed in seeds[:n_paper_seeds]]
-    tasks = make_tasks(
+    tasks = common.make_tasks(
         "BallCatch-v0",
         out / "runs",
         everything,
@@ -152,7 +138,7 @@ def reproduce_ball(
     longest_first = sorted(tasks, key=lambda task: task[0].method in labels["fast"])
     complete_runs(longest_first, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
-    records = read_records(tasks)
+    records = common.read_records(tasks)
     is_row = records["scenario"].isin([row.name for row in rows])
     renderers = records["model"].map({method.label: method.renderer for method, _ in everything})
     distances = (records["final_state_0"] - records["final_state_1"]).abs()
@@ -162,7 +148,7 @@ def reproduce_ball(
     by_seed = table.groupby(["model", "train_seed", "scenario"], sort=False)[["cost", "distance"]].mean().reset_index()
     write_frame_atomically(by_seed, out / "seeds.csv")
 
-    folders = folders_of(tasks)
+    folders = common.folders_of(tasks)
     shown = table[table["model"].isin([method.label for method in methods])]
     first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in methods if m.start is not None}
     save_figure(robustness_curves(shown, NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
@@ -184,8 +170,8 @@ def reproduce_ball(
             sections += [f"## {title}", comparison_markdown(costs[is_shown], cost_rows)]
             sections += [comparison_markdown(distances[is_shown], distance_rows, quantity=quantity, digits=3)]
     if is_fixed:
-        sections += ["## Goals", goals_table(costs, GOALS)]
-    sections += ["## Effect of the penalty", COMPARISON, comparisons_table(table, COMPARISONS, KINDS)]
+        sections += ["## Goals", common.goals_table(costs, GOALS)]
+    sections += ["## Effect of the penalty", COMPARISON, common.comparisons_table(table, COMPARISONS, KINDS)]
     with threads(1):  # sums are the same on any number of cores
         knowledge = [
             dict(model=m.label, train_seed=seed, **trv_knowledge(TDPG.load(path, device="cpu"), launch_kwargs))
@@ -193,9 +179,9 @@ def reproduce_ball(
             for seed in seeds
             for path in [folders[m.label, seed] / "model.zip"]
         ]
-    sections += ["## What the TRVs know", KNOWLEDGE, write_knowledge(pd.DataFrame(knowledge), ["model"], out)]
+    sections += ["## What the TRVs know", KNOWLEDGE, common.write_knowledge(pd.DataFrame(knowledge), ["model"], out)]
     command = "make reproduce-ball" + ("-varying" if not is_fixed else "-controls" if controls else "")
-    return write_results(out, sections, tasks, command, publish)
+    return common.write_results(out, sections, tasks, command, publish)
 
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:

@@ -9,24 +9,10 @@ from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import PANDA_GRASP, PANDA_GRASP_CAMERA
-from sb3_tdpg.evaluation import (
-    aggregate_seeds,
-    comparison_markdown,
-    save_figure,
-    training_curves,
-)
+from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure, training_curves
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
-from sb3_tdpg.paper.common import (
-    NO_PENALTY,
-    Method,
-    comparisons_table,
-    folders_of,
-    goals_table,
-    make_tasks,
-    read_records,
-    write_knowledge,
-    write_results,
-)
+from sb3_tdpg.paper import common
+from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
 from sb3_tdpg.paper.grasp_analysis import (
     ESTIMATES,
@@ -106,16 +92,16 @@ def reproduce_grasp(
     rows = PANDA_GRASP if is_fixed else PANDA_GRASP_CAMERA
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     everything = [(method, seed) for method in methods for seed in seeds]
-    tasks = make_tasks("PandaGrasp-v0", out / "runs", everything, lambda _: rows, n_timesteps)
+    tasks = common.make_tasks("PandaGrasp-v0", out / "runs", everything, lambda _: rows, n_timesteps)
     complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-    folders = folders_of(tasks)
+    folders = common.folders_of(tasks)
 
     # The poses of the mug and of the grasp.
     poses = {f"final_mug_{i}": name for i, name in ((0, "x"), (1, "y"), (3, "yaw"))}
     poses.update({f"final_grasp_{i}": f"grasp_{name}" for i, name in enumerate(("x", "y", "z", "yaw"))})
     if not is_fixed:
         poses["final_state_4"] = "camera"
-    records = read_records(tasks).rename(columns=poses)
+    records = common.read_records(tasks).rename(columns=poses)
     columns = ["model", "train_seed", "scenario", "episode", "cost", *poses.values(), "seed", "deterministic"]
     write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 6)), out / "episodes.csv.xz")
     by_seed = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
@@ -135,7 +121,7 @@ def reproduce_grasp(
         comparison_markdown(aggregated, rows, quantity=QUANTITY, digits=3),
     ]
     if is_fixed:
-        sections += ["## Goals", goals_table(aggregated, GOALS)]
+        sections += ["## Goals", common.goals_table(aggregated, GOALS)]
     kinds = {row.name.lower(): (row.name,) for row in rows}
     logs = {seed: read_progress(folders["TDPG", seed]) for seed in seeds}
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
@@ -144,15 +130,15 @@ def reproduce_grasp(
         sections += [
             "## Effect of the penalty",
             COMPARISON,
-            comparisons_table(records, COMPARISONS, kinds, "failed grasps"),
+            common.comparisons_table(records, COMPARISONS, kinds, "failed grasps"),
             PENALTY,
             markdown_table(penalty_table(logs)),
             "## What the TRVs know",
             KNOWLEDGE,
-            write_knowledge(knowledge, ["model", "mugs"], out),
+            common.write_knowledge(knowledge, ["model", "mugs"], out),
         ]
         if is_fixed:
             first = {label: models[label, FIRST_SEED] for label in ("PG", "TDPG")}
             estimates = markdown_table(estimates_table(first), digits=2)
             sections += ["## How much information is it?", ESTIMATES, estimates]
-    return write_results(out, sections, tasks, f"make reproduce-grasp{'' if is_fixed else '-camera'}", publish)
+    return common.write_results(out, sections, tasks, f"make reproduce-grasp{'' if is_fixed else '-camera'}", publish)
