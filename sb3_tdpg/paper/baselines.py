@@ -277,8 +277,9 @@ def baselines_table(
             if cell["n_seeds"] > 1:
                 text += f" [{cell['low']:.{digits}f}, {cell['high']:.{digits}f}]"
             line[row] = f"**{text}**" if cell["iqm"] == lowest[row] else text
-        for title, name in (("CPU time (s)", "cpu_s"), ("wall time (s)", "wall_s")) if seeds is not None else ():
-            times = seeds.loc[seeds["model"] == model, name]
-            line[title] = f"{times.median():.0f}" if len(times) else "-"
+        if seeds is not None:
+            for title, name in (("CPU time (s)", "cpu_s"), ("wall time (s)", "wall_s")):
+                times = seeds.loc[seeds["model"] == model, name]
+                line[title] = f"{times.median():.0f}" if len(times) else "-"
         lines.append(line)
     return markdown_table(lines, align="lr")

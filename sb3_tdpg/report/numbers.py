@@ -120,7 +120,7 @@ def _interval_columns(
     """Aggregate ``(S, G, E)`` over models: a column with the number, and two with the ends of its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
     if len(cube) > 1:
-        columns = interquartile_means(cube.mean(axis=2), **how)
+        columns: tuple[np.ndarray, ...] = interquartile_means(cube.mean(axis=2), **how)
     else:
         columns = _mean_of_one_model(cube[0], how["level"], is_share)
     return dict(zip(names, columns, strict=True))
