@@ -76,13 +76,15 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-def test_the_wheel_holds_every_module_environment_and_hyperparameter_file(wheel: Path) -> None:
+def test_the_wheel_holds_every_module_environment_template_and_hyperparameter_file(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {"sb3_tdpg/py.typed", "sb3_tdpg/hub/card.md"}
     expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("envs/**/*.py")}
     expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("hyperparams/*.yml")}
     expected |= {str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("sb3_tdpg/**/*.py")}
+    expected |= {str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("sb3_tdpg/**/templates/*")}
     assert any(name.endswith(".yml") for name in expected)
+    assert "sb3_tdpg/report/templates/report.md" in expected
     assert expected <= names, f"missing from the wheel: {sorted(expected - names)}"
 
 

@@ -1,4 +1,4 @@
-"""Runs of Stable-Baselines3's own algorithms beside TDPG's, each with the time that its training took."""
+"""Timed runs of TDPG and of the algorithms of Stable-Baselines3 and sb3-contrib."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from sb3_tdpg.hyperparams import load_hyperparams
 
 @dataclass(frozen=True)
 class TimedRun(Run):
-    """A run that leaves ``time.json`` in its folder: seconds that the training took, on the clock and of the CPU."""
+    """A run that writes ``time.json``: the wall time and the CPU time of its training in seconds."""
 
     def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        """Train as :class:`~sb3_tdpg.experiments.runs.Run` does; later calls add to its time, an interrupted one does not."""
+        """Train as the base class does; a resumed call adds to the time, an interrupted one does not."""
         path = folder / "time.json"
         before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
         wall, cpu = time.perf_counter(), time.process_time()
@@ -39,9 +39,9 @@ class TimedRun(Run):
 @dataclass(frozen=True)
 class SB3Run(TimedRun):
     """
-    A run of an algorithm that is not ours; it has no selection, and an interrupted training begins anew.
+    A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew.
 
-    :param algo: ``"ppo"`` or ``"ppo_lstm"``; the block is one of ``hyperparams/<algo>.yml``.
+    :param algo: ``"ppo"`` or ``"ppo_lstm"``; the block is in ``hyperparams/<algo>.yml``.
     """
 
     algo: str = "ppo"
@@ -53,7 +53,7 @@ class SB3Run(TimedRun):
 
     @property
     def config(self) -> dict[str, Any]:
-        """What makes this run."""
+        """The settings that make this run."""
         return {**super().config, "algo": self.algo}
 
     def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
@@ -84,10 +84,6 @@ def _algorithm(name: str) -> Any:
 
 
 def training_time(folder: Path) -> dict[str, float]:
-    """
-    Add up what the training of a run took, attempts in vain included.
-
-    :return: ``wall_s`` and ``cpu_s``
-    """
+    """Return the total ``wall_s`` and ``cpu_s`` of the training of a run, including failed attempts."""
     times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
     return {name: sum(each[name] for each in times) for name in ("wall_s", "cpu_s")}

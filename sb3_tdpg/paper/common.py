@@ -1,34 +1,42 @@
-"""What the reproductions share: runs of several methods, small tables, how something was made, the copy for docs."""
+"""Shared by all reproductions: the runs of several methods, tables, and the files of a result."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from sb3_tdpg.common.files import write_atomically
+from sb3_tdpg.common.markdown import markdown_table
+from sb3_tdpg.common.provenance import provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.summary import how_made
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
-from sb3_tdpg.experiments.runs import Run, complete_runs
+from sb3_tdpg.experiments.runs import Run, Task
 
 RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
-"""What is kept of each episode."""
+"""The columns of the records that are kept."""
+
+NO_PENALTY = "TDPG without the penalty"
+"""Label of the ablation, which differs from TDPG in the missing penalty only."""
 
 
 @dataclass(frozen=True)
 class Method:
     """
-    How one column of a table is trained and evaluated.
+    One column of a table: how it is trained and evaluated.
 
-    :param label: The column's title.
+    :param label: Title of the column.
     :param block: Block of ``hyperparams/tdpg.yml``.
     :param start: Label of the method whose policy it starts from, with the same seed; ``None``: from scratch.
-    :param renderer: What draws the images that it is evaluated on, where the environment has several.
+    :param renderer: Renderer of the images for the evaluation, if the environment has several.
     :param overrides: Settings that replace those of the block.
+    :param max_attempts: See :class:`~sb3_tdpg.experiments.runs.Run`.
     """
 
     label: str
@@ -36,155 +44,126 @@ class Method:
     start: str | None = None
     renderer: str = "fast"
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    max_attempts: int = 1
+
+    def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
+        """Return the run of this method with one seed."""
+        settings = {**self.overrides, **overrides}
+        return Run(self.label, env_id, self.block, seed, settings, self.max_attempts, start)
 
 
-class Trained:
+def make_tasks(
+    env_id: str,
+    folder: Path,
+    methods: Iterable[tuple[Method, int]],
+    rows: Callable[[Method], Sequence[Scenario]],
+    n_timesteps: int | None = None,
+) -> list[Task]:
     """
-    Runs of methods, of which some start from the policy of another one with the same seed.
+    Make the runs of several methods, some of which start from the policy of another one with the same seed.
 
-    :param env_id: The training environment.
-    :param out: Folder for ``runs/``.
-    :param everything: Methods with their seeds, each after what it starts from.
-    :param overrides: Settings that replace those of every method.
+    :param methods: Methods with their seeds, each after the method that it starts from.
+    :param rows: Returns the rows that a method is evaluated on.
     """
+    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    tasks: list[Task] = []
+    folders: dict[tuple[str, int], Path] = {}
+    for method, seed in methods:
+        start = None if method.start is None else folders[method.start, seed]
+        run = method.run(env_id, seed, start, **overrides)
+        folders[method.label, seed] = folder / run.folder_name
+        tasks.append((run, folder / run.folder_name, rows(method)))
+    return tasks
 
-    def __init__(
-        self, env_id: str, out: Path, everything: Sequence[tuple[Method, int]], overrides: Mapping[str, Any]
-    ) -> None:
-        self.everything = everything
-        self.folders: dict[tuple[str, int], Path] = {}
-        self.runs: dict[tuple[str, int], Run] = {}
-        for method, seed in everything:
-            start = None if method.start is None else self.folders[method.start, seed]
-            run = Run(method.label, env_id, method.block, seed, {**method.overrides, **overrides}, start=start)
-            self.runs[method.label, seed], self.folders[method.label, seed] = run, out / "runs" / run.folder_name
 
-    def complete(
-        self,
-        rows: Callable[[Method], Sequence[Scenario]],
-        *,
-        n_eval_episodes: int,
-        jobs: int | None = None,
-        is_long: Callable[[Method], bool] = lambda _: False,
-    ) -> None:
-        """
-        Complete all runs, see :func:`~sb3_tdpg.experiments.runs.complete_runs`.
+def folders_of(tasks: Iterable[Task]) -> dict[tuple[str, int], Path]:
+    """Return the folders by method and seed."""
+    return {(run.method, run.seed): folder for run, folder, _ in tasks}
 
-        :param rows: What each method is evaluated on.
-        :param n_eval_episodes: Episodes of each row.
-        :param jobs: Runs at a time; default: the number of cores.
-        :param is_long: What to begin with, so that the cores finish together.
-        """
-        tasks = [
-            (self.runs[method.label, seed], self.folders[method.label, seed], rows(method))
-            for method, seed in sorted(self.everything, key=lambda item: not is_long(item[0]))
-        ]
-        complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
-    def records(self) -> pd.DataFrame:
-        """Return the episodes of all runs."""
-        return pd.concat([pd.read_csv(f / "episodes.csv") for f in self.folders.values()], ignore_index=True)
-
-    @property
-    def configs(self) -> list[dict[str, Any]]:
-        """What makes the runs."""
-        return [run.config for run in self.runs.values()]
+def read_records(tasks: Iterable[Task]) -> pd.DataFrame:
+    """Return the episodes of finished runs."""
+    return pd.concat([pd.read_csv(folder / "episodes.csv") for _, folder, _ in tasks], ignore_index=True)
 
 
 def met(condition: bool) -> str:
-    """Say whether a goal was met, so that a miss is seen."""
+    """Say whether a goal was met, so that a miss is easy to see."""
     return "met" if condition else "MISSED"
 
 
-def markdown_table(frame: pd.DataFrame, digits: int = 3) -> str:
-    """Write a frame as a Markdown table."""
-    header = [f"| {' | '.join(frame.columns)} |", "|" + "---|" * len(frame.columns)]
-    rows = frame.itertuples(index=False)
-    cells = ([f"{x:.{digits}f}" if isinstance(x, float) else str(x) for x in row] for row in rows)
-    return "\n".join([*header, *(f"| {' | '.join(row)} |" for row in cells)])
-
-
 def goals_table(aggregated: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
-    """
-    Hold interquartile means against goals.
-
-    :param aggregated: From :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
-    :param goals: The largest value by method and row.
-    """
+    """Compare the interquartile means of ``aggregate_seeds`` with the largest allowed values, by method and row."""
     cells = aggregated.set_index(["model", "scenario"])["iqm"]
     rows = [
-        dict(
-            method=method,
-            row=row,
-            goal=f"<= {goal:g}",
-            ours=f"{cells[method, row]:.3g}",
-            verdict=met(cells[method, row] <= goal),
-        )
+        [method, row, f"<= {goal:g}", f"{cells[method, row]:.3g}", met(cells[method, row] <= goal)]
         for method, of_method in goals.items()
         for row, goal in of_method.items()
     ]
-    return markdown_table(pd.DataFrame(rows))
+    return markdown_table(rows, ["method", "row", "goal", "result", "verdict"])
 
 
 def comparisons_table(
-    table: pd.DataFrame, comparisons: Sequence[tuple[str, str]], kinds: Mapping[str, Sequence[str]]
+    table: pd.DataFrame,
+    comparisons: Sequence[tuple[str, str]],
+    kinds: Mapping[str, Sequence[str]],
+    quantity: str = "mean cost",
 ) -> str:
     """
-    Say how likely a seed of one method beats a seed of another, and by how much, seed by seed.
+    Write how likely a seed of one method beats a seed of another one, and the paired difference of their means.
 
     :param table: Records with a column ``train_seed``.
-    :param comparisons: Labels of a method and of what it is compared with; left out if one is not there.
+    :param comparisons: Labels of a method and of the method that it is compared with; missing methods are left out.
     :param kinds: Rows over which the mean is taken, by name.
+    :param quantity: Name of the mean in the header.
     """
     rows = []
-    models = set(table["model"])
-    for model, control in comparisons:
-        if not {model, control} <= models:
+    for model, other in comparisons:
+        if not {model, other} <= set(table["model"]):
             continue
         for name, members in kinds.items():
             part = table[table["scenario"].isin(members)]
-            better, difference = (f(part, model, control) for f in (probability_of_improvement, paired_difference))
+            better, difference = (f(part, model, other) for f in (probability_of_improvement, paired_difference))
             cost = part.groupby("model")["cost"].mean()
             rows.append(
                 {
                     "method": model,
-                    "against": control,
+                    "compared with": other,
                     "rows": name,
-                    "P(improvement) [95 %]": "{:.2f} [{:.2f}, {:.2f}]".format(*better),
-                    "mean cost": f"{cost[model]:.3g}",
-                    "of the other": f"{cost[control]:.3g}",
+                    "probability of being better [95 %]": "{:.2f} [{:.2f}, {:.2f}]".format(*better),
+                    f"{quantity} of the method": f"{cost[model]:.3g}",
+                    f"{quantity} of the other": f"{cost[other]:.3g}",
                     "difference [95 %]": "{:+.3g} [{:+.3g}, {:+.3g}]".format(*difference),
                 }
             )
-    return markdown_table(pd.DataFrame(rows))
+    return markdown_table(rows)
 
 
-def commits_of(folders: Sequence[Path]) -> list[str]:
-    """Return the commits at which the runs were made: more than one if the reproduction was resumed after a change."""
-    gits = (json.loads((folder / "config.json").read_text())["provenance"]["git"] for folder in folders)
-    return sorted({git["commit"][:7] for git in gits if git is not None})
+def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> str:
+    """Write ``knowledge.csv`` with a row for each policy, and return the table of the means over seeds."""
+    write_frame_atomically(knowledge, out / "knowledge.csv")
+    means = knowledge.drop(columns="train_seed").groupby(list(by), sort=False).mean().reset_index()
+    return markdown_table(means.rename(columns=dict(model="method")), digits=2)
 
 
-def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str]) -> str:
+def write_results(
+    out: Path, sections: Sequence[str], tasks: Sequence[Task], command: str, publish: Path | None = None
+) -> str:
     """
-    Say in a sentence how a summary was made.
+    Write ``summary.md`` and ``config.json``, copy all files to another folder if asked to, and return the summary.
 
-    :param command: What makes it again.
-    :param how: From :func:`~sb3_tdpg.common.provenance.provenance`.
-    :param commits: Those of the runs.
+    :param command: The command that makes the results again.
+    :param publish: Folder that gets the copy, without the runs.
     """
-    versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
-    git = how["git"]
-    commit = (
-        "outside a checkout" if git is None else git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
-    )
-    runs = f"runs at {', '.join(commits)}; " if commits else ""
-    return f"Made by `{command}` at commit {commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
-
-
-def publish_files(out: Path, publish: Path) -> None:
-    """Copy the files of a folder, but not the folders in it."""
-    publish.mkdir(parents=True, exist_ok=True)
-    for path in out.iterdir():
-        if path.is_file():
-            shutil.copy2(path, publish / path.name)
+    how = provenance()
+    write_run_config(out / "config.json", dict(runs=[run.config for run, *_ in tasks], provenance=how))
+    # There are several commits if the reproduction was resumed after a change.
+    gits = [json.loads((folder / "config.json").read_text())["provenance"]["git"] for _, folder, _ in tasks]
+    commits = sorted({git["commit"][:7] for git in gits if git is not None})
+    summary = "\n\n".join([*sections, how_made(command, how, commits)]) + "\n"
+    write_atomically(out / "summary.md", summary)
+    if publish is not None:
+        publish.mkdir(parents=True, exist_ok=True)
+        for path in out.iterdir():
+            if path.is_file():
+                shutil.copy2(path, publish / path.name)
+    return summary

@@ -1,4 +1,4 @@
-"""The lava problem from training to table and figures: a quick demonstration, and the full reproduction of Table I."""
+"""Reproduce Table I, the lava problem: a quick demonstration, and the full reproduction with many seeds."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any
 
 import pandas as pd
 
+from sb3_tdpg.certificates.lava import PAPER_INVERSE_BETAS
 from sb3_tdpg.common.files import write_atomically
-from sb3_tdpg.common.provenance import provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.markdown import markdown_table
+from sb3_tdpg.common.provenance import write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import LAVA, LAVA_TABLE_READING
 from sb3_tdpg.evaluation import (
@@ -21,45 +23,49 @@ from sb3_tdpg.evaluation import (
     summary_table,
     training_curves,
 )
-from sb3_tdpg.experiments.runs import Run, complete_run, complete_runs, read_progress
-from sb3_tdpg.paper.common import (
-    RECORD_COLUMNS,
-    commits_of,
-    how_made,
-    markdown_table,
-    met,
-    publish_files,
-)
+from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
+from sb3_tdpg.paper.common import RECORD_COLUMNS, folders_of, met, read_records, write_results
 from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
 READINGS = ("table", "text")
-"""Readings of the lava problem: the one that fits Table I, and the one that the paper's text describes."""
+"""Cost definitions of the lava problem: the one that fits Table I, and the one in the text of the paper."""
 
-# Method -> block of hyperparams/tdpg.yml, to which "-table" is added for the table's reading.
+# Method -> block of hyperparams/tdpg.yml; "-table" is appended for the cost definition that fits the table.
 METHODS = {"PG": "Lava-v0-pg", "TDPG": "Lava-v0", "TDPG (log-det)": "Lava-v0-logdet"}
 
-# Goals of the reproduction by reading: the largest mean, standard deviation and ratio (sigma^2 = 1 over training).
+# Goals by cost definition: the largest mean, standard deviation and ratio (sigma^2 = 1 over training).
 GOALS: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = {
     "table": {"PG": (14.0, None, None), "TDPG": (28.0, 10.0, 1.05), "TDPG (log-det)": (28.0, 10.0, 1.05)},
     "text": {"PG": (12.0, None, None), "TDPG": (20.0, 10.0, 1.10), "TDPG (log-det)": (20.0, 10.0, 1.10)},
 }
 
-# Seeds below 300 were seen while the blocks were tuned.
+# Seeds below 300 were used to tune the blocks.
 FIRST_SEED = 300
 
-# Trainings of a policy with a penalty, at most: the next one only if the last one did not meet the block's limits.
+# Trainings of a policy with a penalty: another one only if the last one did not meet the limits of the block.
 MAX_ATTEMPTS = 3
 
-PAPER_INVERSE_BETAS = (25, 50, 75, 100)
+TITLES = {
+    "table": "Cost definition: table",
+    "text": "Cost definition: text",
+    "paper": "The paper's own settings (cost definition: table)",
+}
+SEED_COLUMNS = dict(model="method", train_seed="seed", attempts="trainings", selected="limits met")
+COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ratio")
+SEEDS = (
+    "Every seed: the mean cost in the training row and its standard deviation over episodes; the ratio of the mean "
+    "cost at sigma^2 = 1 to the mean cost in the training row; the number of trainings until one met the limits, and "
+    "whether one did."
+)
 
 
 def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
     """
-    Name a run of the lava problem.
+    Return a run of the lava problem.
 
     :param method: A key of :data:`METHODS`.
-    :param reading: ``"table"`` or ``"text"``.
+    :param reading: The cost definition, ``"table"`` or ``"text"``.
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
     """
@@ -67,12 +73,14 @@ def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
     return Run(method, "Lava-v0", block, seed, overrides, max_attempts=1 if method == "PG" else MAX_ATTEMPTS)
 
 
-def env_kwargs_of(reading: str) -> dict[str, Any]:
-    """Return the environment keywords of a reading."""
-    return dict(LAVA_TABLE_READING) if reading == "table" else {}
-
-
-# -- the demonstration ----------------------------------------------------------------------------------------
+def _write_figures(
+    out: Path, suffix: str, records: pd.DataFrame, folders: Mapping[str, Path], models: Mapping[str, TDPG], reading: str
+) -> None:
+    """Draw the figures of one seed; ``folders`` and ``models`` are by method."""
+    env_kwargs = dict(LAVA_TABLE_READING) if reading == "table" else {}
+    save_figure(cost_histograms(records, LAVA), out / f"histograms{suffix}.png")
+    save_figure(lava_trajectories(models, env_kwargs), out / f"trajectories{suffix}.png")
+    save_figure(training_curves({m: read_progress(f) for m, f in folders.items()}), out / f"training{suffix}.png")
 
 
 def demo(
@@ -83,7 +91,7 @@ def demo(
 
     :param out: Folder for ``episodes.csv``, ``table.md``, ``histograms.png``, ``trajectories.png``, ``training.png``,
         ``config.json`` and the runs with their models.
-    :param reading: ``"table"`` or ``"text"``.
+    :param reading: The cost definition, ``"table"`` or ``"text"``.
     :param seed: Training seed.
     :param n_eval_episodes: Episodes of each row.
     :param n_timesteps: Environment steps of each training; default: as in the block.
@@ -91,34 +99,30 @@ def demo(
     """
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
-    folders = {run.method: out / "runs" / run.folder_name for run in runs}
+    tasks: list[Task] = [(run, out / "runs" / run.folder_name, LAVA) for run in runs]
+    folders = {run.method: folder for run, folder, _ in tasks}
     with threads(1):
-        for run in runs:
-            print(f"{run.method}: training and evaluating, {folders[run.method]}")
-            complete_run(run, folders[run.method], LAVA, n_eval_episodes=n_eval_episodes, progress_bar=True)
+        for task in tasks:
+            print(f"{task[0].method}: training and evaluating, {task[1]}")
+            complete_run(*task, n_eval_episodes=n_eval_episodes, progress_bar=True)
 
-        records = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders.values()], ignore_index=True)
+        records = read_records(tasks)
         models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
         table = comparison_markdown(summary_table(records).drop(columns="train_seed"), LAVA)
         write_frame_atomically(records, out / "episodes.csv")
         write_atomically(out / "table.md", table + "\n")
-        save_figure(cost_histograms(records, LAVA), out / "histograms.png")
-        save_figure(lava_trajectories(models, env_kwargs_of(reading)), out / "trajectories.png")
-        save_figure(training_curves({m: read_progress(f) for m, f in folders.items()}), out / "training.png")
+        _write_figures(out, "", records, folders, models, reading)
         for method, model in models.items():
             model.save(out / f"{method.lower()}.zip")
     write_run_config(out / "config.json", dict(reading=reading, runs=[run.config for run in runs]))
     return table
 
 
-# -- the reproduction -----------------------------------------------------------------------------------------
-
-
 def paper_runs(n_seeds: int) -> list[Run]:
     """
-    List the runs with the paper's own settings, on the table's reading: PG, and TDPG for each beta of the sweep.
+    List the runs with the paper's own settings and the table's cost definition: PG, and TDPG with each beta.
 
-    See the block ``Lava-v0-paper`` for what is set as printed.
+    See the block ``Lava-v0-paper`` for the settings.
     """
     runs = []
     for seed in range(FIRST_SEED, FIRST_SEED + n_seeds):
@@ -141,110 +145,83 @@ def reproduce_lava(
     publish: Path | None = None,
 ) -> str:
     """
-    Train every method on both readings with many seeds, and the paper's own settings; write tables, figures and
-    records.
+    Train every method with both cost definitions and many seeds, and the paper's own settings; write tables, figures
+    and records.
 
-    Finished runs are kept: the same call goes on where an interrupted one stopped.
+    Finished runs are kept: the same call continues an interrupted one.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes_*.csv.gz``, figures, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each method.
     :param n_paper_seeds: Training seeds of the paper's own settings.
     :param n_eval_episodes: Episodes of each row of Table I.
     :param n_timesteps: Environment steps of each training; default: as in the blocks.
-    :param jobs: Runs at a time; default: the number of cores.
+    :param jobs: Parallel runs; default: the number of cores.
     :param publish: Folder that gets a copy of everything but ``runs/``.
     :return: the summary, as Markdown
     """
     overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
-    # Longest first, so that the cores finish together.
-    groups: dict[str, list[Run]] = {
+    runs = {
         reading: [lava_run(m, reading, seed, **overrides) for m in reversed(METHODS) for seed in seeds]
         for reading in READINGS
     }
-    groups["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
-    folders = {group: [out / "runs" / group / run.folder_name for run in runs] for group, runs in groups.items()}
-    tasks = [(run, folder, LAVA) for group in groups for run, folder in zip(groups[group], folders[group], strict=True)]
-    tasks.sort(key=lambda task: task[0].method != "TDPG")
-    complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    runs["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
+    tasks: dict[str, list[Task]] = {
+        group: [(run, out / "runs" / group / run.folder_name, LAVA) for run in of_group]
+        for group, of_group in runs.items()
+    }
+    everything = [task for of_group in tasks.values() for task in of_group]
+    # The longest runs first, so that the cores finish together.
+    longest_first = sorted(everything, key=lambda task: task[0].method != "TDPG")
+    complete_runs(longest_first, n_eval_episodes=n_eval_episodes, jobs=jobs)
 
-    sections, seed_tables = [], []
-    for group in groups:
-        records = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders[group]], ignore_index=True)
+    sections, seed_tables = ["# The lava problem (Table I)"], []
+    for group, of_group in tasks.items():
+        records = read_records(of_group)
         records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
         write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
-        sections.append(_section(group, records, by_seed))
+        sections += [f"## {TITLES[group]}", comparison_markdown(aggregate_seeds(records), LAVA)]
+        sections += [_goals_table(by_seed, GOALS.get(group, {}))]
+        sections += [SEEDS, markdown_table(by_seed.rename(columns={**SEED_COLUMNS, **COLUMNS}))]
         if group in READINGS:
-            first = {
-                run.method: folder
-                for run, folder in zip(groups[group], folders[group], strict=True)
-                if run.seed == FIRST_SEED
-            }
-            shown = {method: TDPG.load(first[method] / "model.zip", device="cpu") for method in METHODS}
+            folders = {method: folders_of(of_group)[method, FIRST_SEED] for method in METHODS}
+            models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
             one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]
-            save_figure(cost_histograms(one_seed, LAVA), out / f"histograms_{group}.png")
-            save_figure(lava_trajectories(shown, env_kwargs_of(group)), out / f"trajectories_{group}.png")
-            save_figure(training_curves({m: read_progress(first[m]) for m in METHODS}), out / f"training_{group}.png")
+            _write_figures(out, f"_{group}", one_seed, folders, models, group)
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True), out / "seeds.csv")
-    how = provenance()
-    write_run_config(
-        out / "config.json", dict(runs=[run.config for runs in groups.values() for run in runs], provenance=how)
-    )
-    made_at = how_made(
-        "make reproduce-lava", how, commits_of([folder for group in groups for folder in folders[group]])
-    )
-    summary = "\n\n".join(["# The lava problem (Table I)", *sections, made_at]) + "\n"
-    write_atomically(out / "summary.md", summary)
-    if publish is not None:
-        publish_files(out, publish)
-    return summary
+    return write_results(out, sections, everything, "make reproduce-lava", publish)
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
-    """
-    Return for each method and seed: mean and standard deviation in training, and the ratio of the noisiest row
-    to it.
-    """
+    """Return mean and standard deviation in training for each method and seed, and the ratio of the noisiest row."""
     summary = add_ratio(summary_table(records))
     keys = ["model", "train_seed"]
     training = summary[summary["scenario"] == LAVA[0].name].set_index(keys)[["mean", "std"]]
     noisiest = summary[summary["scenario"] == LAVA[-1].name].set_index(keys)[["ratio"]]
-    training_outcome = records.groupby(keys)[["attempts", "selected"]].first()
-    return training.join(noisiest).join(training_outcome).reset_index()
+    return training.join(noisiest).join(records.groupby(keys)[["attempts", "selected"]].first()).reset_index()
 
 
-def _section(group: str, records: pd.DataFrame, seeds: pd.DataFrame) -> str:
-    titles = {"table": "The table's reading", "text": "The text's reading", "paper": "The paper's own settings"}
-    parts = [f"## {titles[group]}", comparison_markdown(aggregate_seeds(records), LAVA)]
-    lines = [
-        "| method | seeds | training mean: mean over seeds (worst) | std: mean (worst) | ratio: mean (worst) | goals |"
-    ]
-    lines += ["|---|---|---|---|---|---|"]
-    for method, rows in seeds.groupby("model", sort=False):
-        spread = [f"{rows[c].mean():.3g} ({rows[c].max():.3g})" for c in ("mean", "std", "ratio")]
-        goal = GOALS.get(group, {}).get(str(method))
-        lines.append(f"| {method} | {len(rows)} | {' | '.join(spread)} | {_verdict(rows, goal)} |")
-    parts.append("\n".join(lines))
-    parts.append(
-        "Every seed (cost in training; std over episodes; ratio of the mean at sigma^2 = 1 to that in training; "
-        "attempts: trainings until one met the limits; selected: whether one did):"
-    )
-    parts.append(markdown_table(seeds))
-    return "\n\n".join(parts)
+def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, tuple[float, float | None, float | None]]) -> str:
+    """Summarise the seeds of each method, and compare them with its goals."""
+    rows = []
+    for method, of_method in seeds.groupby("model", sort=False):
+        spread = {
+            f"{name}: mean (worst seed)": f"{of_method[c].mean():.3g} ({of_method[c].max():.3g})"
+            for c, name in COLUMNS.items()
+        }
+        verdict = _verdict(of_method, *goals[str(method)]) if method in goals else "none set"
+        rows.append(dict(method=method, seeds=len(of_method), **spread, goals=verdict))
+    return markdown_table(rows)
 
 
-def _verdict(rows: pd.DataFrame, goal: tuple[float, float | None, float | None] | None) -> str:
-    """Hold one method's seeds against its goals."""
-    if goal is None:
-        return "none set"
-    mean, std, ratio = goal
-    checks = [f"mean <= {mean:g}: {met(rows['mean'].mean() <= mean)}"]
+def _verdict(seeds: pd.DataFrame, mean: float, std: float | None, ratio: float | None) -> str:
+    checks = [f"mean <= {mean:g}: {met(seeds['mean'].mean() <= mean)}"]
     if std is not None:
-        checks.append(f"std <= {std:g}: {met(rows['std'].mean() <= std)}")
+        checks.append(f"standard deviation <= {std:g}: {met(seeds['std'].mean() <= std)}")
     if ratio is not None:
-        checks.append(f"ratio <= {ratio:g}: {(rows['ratio'] <= ratio).sum()} of {len(rows)} seeds")
+        checks.append(f"ratio <= {ratio:g}: {(seeds['ratio'] <= ratio).sum()} of {len(seeds)} seeds")
     return "; ".join(checks)
 
 

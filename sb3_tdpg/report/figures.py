@@ -1,24 +1,24 @@
-"""The pictures of a report."""
+"""The figures of a report."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import cycle
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, _import_matplotlib, _log_axis, _new_figure, _tidy
-from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.numbers import CLEAR, Numbers
 from sb3_tdpg.report.records import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import find
-from sb3_tdpg.robustness.sensor import kind_of
 from sb3_tdpg.vec_env import make_episodes_env
 
 if TYPE_CHECKING:
@@ -26,19 +26,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^vP"
+MAX_STEPS = 500  # of the episode that shows the perturbations
 
 
 def degradation_curves(numbers: Numbers) -> Figure:
-    """
-    Draw each method's cost over the severities, with its interval: one panel for each perturbation, one scale.
-
-    :param numbers: Of the report.
-    """
-    names = numbers.perturbations
+    """Draw the cost of each method over the severities with its interval, in a panel for each perturbation."""
+    names, levels = numbers.perturbations, numbers.levels
     figure, panels = _grid(len(names))
-    levels = numbers.levels
     for axes, name in zip(panels.flat, names, strict=False):
-        for style, label in zip(_styles(), numbers.models, strict=False):
+        for label, style in _styles(numbers).items():
             of_model = levels[levels["model"] == label]
             curve = of_model[of_model["perturbation"].isin((UNPERTURBED, name))].sort_values("severity")
             axes.fill_between(curve["severity"], curve["low"], curve["high"], color=style["color"], alpha=0.2, lw=0)
@@ -55,25 +51,10 @@ def degradation_curves(numbers: Numbers) -> Figure:
 
 
 def own_rows_figure(numbers: Numbers) -> Figure:
-    """
-    Draw each method's cost in the environment's own rows, with its interval.
-
-    :param numbers: Of the report; there must be such rows.
-    """
+    """Draw the cost of each method in the test rows of the environment, with its interval."""
     shown = numbers.levels[numbers.levels["kind"].isin(("unperturbed", "own"))]
-    names = list(shown["perturbation"].unique())
-    figure = _new_figure(WIDTH, 0.9 + 0.24 * len(names))
-    axes = figure.add_subplot()
-    models = numbers.models
-    for i, (style, label) in enumerate(zip(_styles(), models, strict=False)):
-        of_model = shown[shown["model"] == label].set_index("perturbation").loc[names]
-        at = np.arange(len(names)) + 0.22 * (i - (len(models) - 1) / 2)
-        axes.hlines(at, of_model["low"], of_model["high"], color=style["color"], linewidth=2, alpha=0.5)
-        axes.plot(of_model["iqm"], at, style["marker"], color=style["color"], markersize=4.5, label=label)
-    axes.set_yticks(range(len(names)), names, fontsize=9)
-    axes.invert_yaxis()
+    figure, axes = _intervals(numbers, shown, ("iqm", "low", "high"))
     axes.grid(alpha=0.25, axis="x")
-    _tidy(axes)
     _log_if_wide(axes, shown, "x")
     axes.set_xlabel("episode cost", fontsize=9)
     _legend(figure, axes)
@@ -81,53 +62,48 @@ def own_rows_figure(numbers: Numbers) -> Figure:
 
 
 def comparison_figure(numbers: Numbers) -> Figure:
-    """
-    Draw how likely a model of each method costs less than one of the first method, perturbation by perturbation.
-
-    :param numbers: Of the report; there must be probabilities.
-    """
+    """Draw the probability that a model of each method costs less than one of the first method."""
     frame = numbers.comparisons[numbers.comparisons["p_cost"].notna()]
-    names = list(frame["perturbation"].unique())
-    figure = _new_figure(WIDTH * 0.8, 1.1 + 0.21 * len(names))
-    axes = figure.add_subplot()
-    control = frame["control"].iloc[0]
-    styles = dict(zip(numbers.models, _styles(), strict=False))
-    labels = list(frame["model"].unique())
-    for i, label in enumerate(labels):
-        rows = frame[frame["model"] == label].set_index("perturbation").loc[names]
-        at = np.arange(len(names)) + 0.22 * (i - (len(labels) - 1) / 2)
-        style = styles[label]
-        axes.hlines(at, rows["p_cost_low"], rows["p_cost_high"], color=style["color"], linewidth=2, alpha=0.5)
-        axes.plot(rows["p_cost"], at, style["marker"], color=style["color"], markersize=5, label=label)
+    figure, axes = _intervals(numbers, frame, ("p_cost", "p_cost_low", "p_cost_high"))
     axes.axvline(0.5, color=INK, linewidth=1)
     for edge in (1 - CLEAR, CLEAR):
         axes.axvline(edge, color=INK, linewidth=0.8, linestyle=(0, (3, 3)), alpha=0.6)
     axes.set_xlim(-0.02, 1.02)
-    axes.set_yticks(range(len(names)), names, fontsize=9)
-    axes.invert_yaxis()
-    _tidy(axes)
-    axes.set_xlabel(f"probability of a lower cost than {control} (dashed: {1 - CLEAR:.2g} and {CLEAR:.2g})", fontsize=9)
+    text = f"probability of a lower cost than {numbers.models[0]} (dashed: {1 - CLEAR:.2g} and {CLEAR:.2g})"
+    axes.set_xlabel(text, fontsize=9)
     _legend(figure, axes)
     return figure
 
 
+def _intervals(numbers: Numbers, frame: pd.DataFrame, columns: Sequence[str]) -> tuple[Figure, Axes]:
+    """Draw an interval for each perturbation (rows) and method; the columns hold the value and the two ends."""
+    names, labels = list(frame["perturbation"].unique()), list(frame["model"].unique())
+    figure = _new_figure(WIDTH, 1.1 + 0.24 * len(names))
+    axes = figure.add_subplot()
+    for i, label in enumerate(labels):
+        style = _styles(numbers)[label]
+        value, low, high = (frame[frame["model"] == label].set_index("perturbation").loc[names, c] for c in columns)
+        at = np.arange(len(names)) + 0.22 * (i - (len(labels) - 1) / 2)
+        axes.hlines(at, low, high, color=style["color"], linewidth=2, alpha=0.5)
+        axes.plot(value, at, style["marker"], color=style["color"], markersize=4.5, label=label)
+    axes.set_yticks(range(len(names)), names, fontsize=9)
+    axes.invert_yaxis()
+    _tidy(axes)
+    return figure, axes
+
+
 def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     """
-    Draw one component of what is observed in an episode, as it is and as each perturbation shows it.
+    Draw one component of the observations of an episode, unperturbed and under each perturbation.
 
     The model acts on the unperturbed observations, so that the true episode is the same in all panels. The component is
-    the one that varies most in it, in multiples of its scale.
-
-    :param plan: Of the report.
-    :param rows: Those with perturbations of the sensor.
-    :param model: Which acts.
+    the one that varies most, in multiples of its scale.
     """
     observations, space = _episode(plan, model)
     flat = observations.reshape(len(observations), -1)
     assert plan.scale is not None
     scale = np.asarray(plan.scale, dtype=np.float64).ravel()
-    spread = flat.std(axis=0) / np.where(scale > 0, scale, np.inf)
-    component = int(np.argmax(spread))
+    component = int(np.argmax(flat.std(axis=0) / np.where(scale > 0, scale, np.inf)))
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
     shades = _import_matplotlib().colormaps["viridis_r"]
@@ -148,38 +124,19 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
 
 
 def _episode(plan: Plan, model: Any) -> tuple[np.ndarray, spaces.Box]:
-    """Return what is observed in an episode, ``(T, *obs)``, as it comes from the sensor, and its space."""
-    env = make_episodes_env(plan.env_id, 1, env_kwargs=plan.env_kwargs, use_processes=False)
-    seeds = evaluation_seeds(plan.seed)
-    normalize: VecNormalize | None = model.get_vec_normalize_env()
-    try:
-        env.seed(seeds.env)
-        observation = np.asarray(env.reset())
-        seen: list[np.ndarray] = []
-        memory, start = None, np.ones(1, dtype=bool)
-        with isolated_randomness(seeds.policy, model):
-            while len(seen) < 500:
-                seen.append(observation[0])
-                normal = observation if normalize is None else normalize.normalize_obs(observation)
-                action, memory = model.predict(normal, memory, start, deterministic=plan.deterministic)
-                shown, _, start, _ = env.step(action)
-                observation = np.asarray(shown)
-                if start[0]:
-                    break
-        space = env.observation_space
-        assert isinstance(space, spaces.Box)
-        return np.stack(seen), space
-    finally:
-        env.close()
-
-
-def shows_images(space: spaces.Space) -> bool:
-    """Tell whether there are images to show."""
-    return kind_of(space) == "image"
+    """Return the observations of an episode, ``(T, *obs)``, before they are normalised, and their space."""
+    normalize = model.get_vec_normalize_env()
+    observe = None if normalize is None else normalize.normalize_obs
+    with closing(make_episodes_env(plan.env_id, 1, env_kwargs=plan.env_kwargs, use_processes=False)) as env:
+        seeds = evaluation_seeds(plan.seed)
+        steps = rollout(model, env, 1, seeds=seeds, deterministic=plan.deterministic, observe=observe)
+        observations = [step.observations[0] for step in islice(steps, MAX_STEPS)]
+        assert isinstance(env.observation_space, spaces.Box)
+        return np.stack(observations), env.observation_space
 
 
 def _grid(n: int) -> tuple[Figure, np.ndarray]:
-    """Make a figure with n panels of common axes, in rows of five at the most that are as full as can be."""
+    """Make a figure with n panels that share their axes, in evenly filled rows of up to five."""
     n_columns = n if n <= 5 else min((5, 4, 3), key=lambda columns: -n % columns)
     n_rows = -(-n // n_columns)
     figure = _new_figure(WIDTH, 0.7 + 1.8 * n_rows)
@@ -187,16 +144,18 @@ def _grid(n: int) -> tuple[Figure, np.ndarray]:
     for axes in panels.flat[n:]:
         axes.set_axis_off()
     for axes in panels.flat[max(0, n - n_columns) : n]:
-        axes.tick_params(labelbottom=True)  # also above a panel that is not there
+        axes.tick_params(labelbottom=True)  # also above a missing panel
     return figure, panels
 
 
-def _styles() -> Any:
-    return ({"color": color, "marker": marker} for color, marker in zip(cycle(PALETTE), cycle(MARKERS), strict=False))
+def _styles(numbers: Numbers) -> Mapping[str, dict[str, str]]:
+    """Return the colour and the marker of each method."""
+    styles = zip(numbers.models, cycle(PALETTE), cycle(MARKERS), strict=False)
+    return {label: dict(color=color, marker=marker) for label, color, marker in styles}
 
 
 def _log_if_wide(axes: Axes, frame: pd.DataFrame, which: str) -> None:
-    """Make an axis logarithmic where costs are positive and range over more than a decade."""
+    """Make an axis logarithmic if all costs are positive and range over more than a decade."""
     low, high = frame[["low", "iqm"]].min().min(), frame["iqm"].max()
     if low > 0 and high > 10 * low:
         _log_axis(axes, which, subs=(1, 3) if high < 300 * low else (1,))

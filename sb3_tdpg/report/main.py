@@ -1,9 +1,9 @@
-"""Make a report: check, run what is missing, aggregate, draw, write."""
+"""Make a report: check the arguments, run the missing rows, aggregate, draw, write."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +13,22 @@ from tqdm import tqdm
 
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.summary import how_made
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import information_report, save_figure
+from sb3_tdpg.evaluation import InformationReport, information_report, save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
-from sb3_tdpg.paper.common import how_made
-from sb3_tdpg.report.figures import (
-    comparison_figure,
-    degradation_curves,
-    own_rows_figure,
-    shows_images,
-    vector_examples,
-)
-from sb3_tdpg.report.html import to_html
+from sb3_tdpg.report.figures import comparison_figure, degradation_curves, own_rows_figure, vector_examples
 from sb3_tdpg.report.models import Source, check_registered, fingerprint, load_all
 from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, write_page
-from sb3_tdpg.report.records import Plan, complete_rows
+from sb3_tdpg.report.records import Models, Plan, complete_rows
+from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.sensor import kind_of
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
@@ -58,30 +53,30 @@ def robustness_report(
     progress_bar: bool = True,
 ) -> str:
     """
-    Run every model under every perturbation, and write a page that tells which method is more robust, and where.
+    Run every model under every perturbation, and write a page that says which method is more robust, and where.
 
-    ``out`` then holds ``report.md`` and ``report.html`` (one file, nothing to be fetched), ``figures/``,
+    ``out`` then contains ``report.md`` and ``report.html`` (one file with its pictures), ``figures/``,
     ``episodes.csv.xz`` (every episode), ``levels.csv``, ``perturbations.csv`` and ``comparisons.csv`` (the numbers of
     the page, see :class:`~sb3_tdpg.report.numbers.Numbers`), ``config.json`` (settings, versions, commit) and
-    ``rows/``, by which an interrupted call goes on. A later call may name other perturbations or severities: what has
-    been run is not run again.
+    ``rows/``, from which an interrupted call continues. A later call may ask for other perturbations or severities:
+    finished rows are not run again.
 
-    :param models: By method, a model or several: those of its training seeds. Files (:class:`~pathlib.Path` or text) or
-        models of TDPG, Stable-Baselines3 or sb3-contrib. The others are compared with the first method.
+    :param models: Models by method: one model or a list with one model for each training seed. A model is a file
+        (:class:`~pathlib.Path` or text) or a model of TDPG, Stable-Baselines3 or sb3-contrib. All methods are compared
+        with the first one.
     :param env_id: A registered id, also in the ``module:id`` form.
     :param out: Folder of the results.
-    :param env_kwargs: Keywords for the environment of all rows. (Of ``BallCatch-v0`` images are drawn by its fast
-        renderer unless they say otherwise.)
-    :param perturbations: Of the sensor and of the scene; default: all that apply.
-    :param severities: Which of the five.
-    :param scenarios: Rows of the environment's own; default: those of the paper's table, if it is in one.
-    :param n_episodes: Of each model in each row; default: 100 with images, 500 with vectors.
-    :param seed: Of environments, policies, perturbations and bootstrap.
+    :param env_kwargs: Keywords of the environment in all rows. (``BallCatch-v0`` uses its fast renderer by default.)
+    :param perturbations: Perturbations of the sensor and of the scene; default: all that apply.
+    :param severities: Severities from 1 to 5.
+    :param scenarios: Test rows of the environment; default: the test rows of the paper's table, if there are any.
+    :param n_episodes: Episodes of each model in each row; default: 100 with images, 500 with vectors.
+    :param seed: Seed of environments, policies, perturbations and bootstrap.
     :param deterministic: Act without noise.
-    :param jobs: Processes, for models that are files.
+    :param jobs: Number of processes, if all models are files.
     :param progress_bar: Show progress on stderr.
     :return: the page, as Markdown
-    :raises ValueError: if something does not fit, or the folder holds another report; nothing has been run by then.
+    :raises ValueError: if an argument is wrong, or the folder contains another report; nothing has been run by then.
     :raises ImportError: without the extra ``plots``.
     """
     _import_extra()
@@ -90,80 +85,76 @@ def robustness_report(
     sources = _sources(models)
     check_registered(env_id)
     kwargs = default_env_kwargs(env_id, env_kwargs)
-    _check_whole(n_episodes=n_episodes, seed=seed, jobs=jobs)
+    for name, value, least in (("n_episodes", n_episodes, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
+        if value is not None and (not isinstance(value, (int, np.integer)) or value < least):
+            raise ValueError(f"{name}={value!r} must be an integer of at least {least}")
     if jobs > 1 and not all(isinstance(source, Path) for of_method in sources.values() for source in of_method):
-        raise ValueError(f"jobs={jobs} is for models that are files; those in memory are run by this process: jobs=1")
+        raise ValueError(f"jobs={jobs} needs models that are files; models in memory run in this process: use jobs=1")
     space, horizon, scale = _look_at(env_id, kwargs)
     rows = make_rows(
         env_id, kwargs, space, horizon, perturbations=perturbations, severities=severities, scenarios=scenarios
     )
     loaded = load_all(sources, env_id, kwargs)
     _check_fit(loaded, rows)
-    n_episodes = n_episodes or N_EPISODES["image" if shows_images(space) else "vector"]
+    n_episodes = n_episodes or N_EPISODES["image" if kind_of(space) == "image" else "vector"]
     plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
+    names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
-    _check_different(fingerprints, sources)
-    config = dict(
-        env_id=env_id,
-        env_kwargs=kwargs,
-        n_episodes=n_episodes,
-        seed=seed,
-        deterministic=deterministic,
-        scale=scale,
-        models=fingerprints,
-    )
+    _check_different(fingerprints, names)
+    config = {**vars(plan), "models": fingerprints}
+    del config["sources"]
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
 
     records = complete_rows(plan, rows, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar)
     numbers = make_numbers(records, seed=seed)
-    names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
-    page = Page(env_id, kwargs, n_episodes, deterministic, names)
-    page.severities = {
-        row.perturbation: [each for each in rows if each.perturbation == row.perturbation]
-        for row in rows
-        if row.kind in ("sensor", "scene")
-    }
-    page.figures = _draw(numbers, plan, rows, loaded, space, out)
-    page.knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
+    figures = _draw(numbers, plan, rows, loaded, space, out)
+    knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
     how = provenance()
-    page.made = how_made(how["command"], how, [])
-    write_frame_atomically(records, out / "episodes.csv.xz")
-    for name, frame in (("levels", numbers.levels), ("perturbations", numbers.groups)):
+    page = Page(plan, rows, names, figures, knowledge, how_made(how["command"], how))
+    frames = dict(levels=numbers.levels, perturbations=numbers.groups, comparisons=numbers.comparisons)
+    for name, frame in frames.items():
         write_frame_atomically(frame, out / f"{name}.csv")
-    write_frame_atomically(numbers.comparisons, out / "comparisons.csv")
+    write_frame_atomically(records, out / "episodes.csv.xz")
     text = write_page(numbers, page)
     write_atomically(out / "report.md", text)
     write_atomically(out / "report.html", to_html(text, out, f"Robustness in {env_id}"))
     return text
 
 
+def _import_extra() -> None:
+    """Check the optional dependencies before the work begins."""
+    try:
+        import jinja2  # noqa: F401
+        import markdown_it  # noqa: F401
+        import matplotlib  # noqa: F401
+        import rliable  # noqa: F401
+    except ImportError as e:
+        raise ImportError(f"a report needs {e.name}: pip install sb3_tdpg[plots]") from e
+
+
 def _sources(models: Mapping[str, Any]) -> dict[str, list[Source]]:
-    """Make lists, and paths of texts."""
-    if not isinstance(models, Mapping):
+    """Check the models, and turn single models into lists and text into paths."""
+    if not isinstance(models, Mapping) or not models:
         raise ValueError(
-            f"models={models!r} must be a dictionary of models by method, for instance "
-            "{'PG': [pg_0, pg_1], 'TDPG': [tdpg_0, tdpg_1]}"
+            f"models={models!r} must be a dictionary with at least one method, for instance "
+            "{'PG': [pg_0, pg_1], 'TDPG': ['runs/tdpg-seed0/model.zip']}"
         )
-    if not models:
-        raise ValueError("models is empty: give at least one, for instance {'TDPG': ['runs/tdpg-seed0/model.zip']}")
     sources = {}
     for label, of_method in models.items():
-        several = list(of_method) if isinstance(of_method, (list, tuple)) else [of_method]
+        several = of_method if isinstance(of_method, (list, tuple)) else [of_method]
         if not several:
             raise ValueError(f"models[{label!r}] is empty: give at least one model")
-        sources[str(label)] = [Path(each) if isinstance(each, str) else each for each in several]
-        for each in sources[str(label)]:
-            if not isinstance(each, Path) and not hasattr(each, "get_vec_normalize_env"):
+        for each in several:
+            if not isinstance(each, (str, Path)) and not hasattr(each, "get_vec_normalize_env"):
                 raise ValueError(f"models[{label!r}] has {each!r}: expected a file, or a Stable-Baselines3 model")
+        sources[str(label)] = [Path(each) if isinstance(each, str) else each for each in several]
     return sources
 
 
-def _check_whole(*, n_episodes: int | None, seed: int, jobs: int) -> None:
-    for name, value, least in (("n_episodes", n_episodes, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
-        if value is not None and (not isinstance(value, (int, np.integer)) or value < least):
-            raise ValueError(f"{name}={value!r} must be an integer of at least {least}")
+def _name(source: Source) -> str:
+    return str(source) if isinstance(source, Path) else f"{type(source).__name__} in memory"
 
 
 def _look_at(env_id: str, env_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, int | None, np.ndarray | None]:
@@ -172,12 +163,12 @@ def _look_at(env_id: str, env_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, 
         env = make_episodes_env(env_id, 8, env_kwargs=env_kwargs, use_processes=False)
     except Exception as e:
         raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
-    with contextlib.closing(env):
+    with closing(env):
         horizon = env.get_attr("horizon", [0])[0] if env.has_attr("horizon") else None
         return env.observation_space, horizon, default_scale(env.observation_space, env)
 
 
-def _check_fit(models: Mapping[str, Sequence[Any]], rows: Sequence[Row]) -> None:
+def _check_fit(models: Models, rows: Sequence[Row]) -> None:
     for label, of_method in models.items():
         named = {f"{label} {number}" if len(of_method) > 1 else label: each for number, each in enumerate(of_method)}
         check_models_fit(named, [rows[0].scenario])
@@ -185,35 +176,21 @@ def _check_fit(models: Mapping[str, Sequence[Any]], rows: Sequence[Row]) -> None
     check_models_fit({label: first}, [row.scenario for row in rows[1:] if row.kind in ("own", "scene")])
 
 
-def _check_different(fingerprints: Mapping[str, Sequence[str]], sources: Mapping[str, Sequence[Source]]) -> None:
-    """Refuse a policy that is there twice: it is one training seed, and would make intervals too narrow."""
+def _check_different(fingerprints: Mapping[str, Sequence[str]], names: Mapping[str, Sequence[str]]) -> None:
+    """Refuse a policy that occurs twice: as two training seeds it would make intervals too narrow."""
     for label, prints in fingerprints.items():
         for number, each in enumerate(prints):
             if (before := prints.index(each)) != number:
-                first, second = (_name(sources[label][i]) for i in (before, number))
                 raise ValueError(
-                    f"models {before} and {number} of {label!r} are the same policy ({first}, {second}): a training "
-                    "seed counts once"
+                    f"models {before} and {number} of {label!r} are the same policy ({names[label][before]}, "
+                    f"{names[label][number]}): a training seed counts once"
                 )
 
 
-def _firsts(models: Mapping[str, Sequence[Any]]) -> list[tuple[int, str, Any]]:
-    return [(number, label, of_method[0]) for number, (label, of_method) in enumerate(models.items())]
-
-
-def _name(source: Source) -> str:
-    return str(source) if isinstance(source, Path) else f"{type(source).__name__} in memory"
-
-
 def _draw(
-    numbers: Numbers,
-    plan: Plan,
-    rows: Sequence[Row],
-    models: Mapping[str, Sequence[Any]],
-    space: spaces.Space,
-    out: Path,
+    numbers: Numbers, plan: Plan, rows: Sequence[Row], models: Models, space: spaces.Space, out: Path
 ) -> dict[str, str]:
-    """Draw what there is to draw; return the files by name."""
+    """Draw the figures that this report has, and return their files by name."""
     figures = {}
     if numbers.perturbations:
         figures["degradation"] = degradation_curves(numbers)
@@ -222,13 +199,11 @@ def _draw(
     if not numbers.comparisons.empty and numbers.comparisons["p_cost"].notna().any():
         figures["comparison"] = comparison_figure(numbers)
     of_sensor = [row for row in rows if row.kind == "sensor"]
-    if shows_images(space) and numbers.perturbations:
-        figures["examples"] = perturbation_gallery(
-            plan.env_id, numbers.perturbations, env_kwargs=plan.env_kwargs, seed=plan.seed
-        )
+    if kind_of(space) == "image" and numbers.perturbations:
+        names = numbers.perturbations
+        figures["examples"] = perturbation_gallery(plan.env_id, names, env_kwargs=plan.env_kwargs, seed=plan.seed)
     elif of_sensor:
-        first = next(iter(models.values()))[0]
-        figures["examples"] = vector_examples(plan, of_sensor, first)
+        figures["examples"] = vector_examples(plan, of_sensor, next(iter(models.values()))[0])
     return {name: _save(figure, out, name) for name, figure in figures.items()}
 
 
@@ -238,45 +213,32 @@ def _save(figure: Any, out: Path, name: str) -> str:
     return path
 
 
-def _measure_all(
-    plan: Plan, row: Row, models: Mapping[str, Sequence[Any]], out: Path, progress_bar: bool
-) -> list[Knowledge]:
-    """Tell what the first model of each method knows of the state: a minute for each where episodes are long."""
-    firsts = _firsts(models)
-    total = len(ESTIMATES) * sum(isinstance(model, TDPG) for _, _, model in firsts)
+def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: bool) -> list[Knowledge]:
+    """Measure the information in the TRVs of the first model of each method; long episodes take a minute each."""
+    firsts = {label: of_method[0] for label, of_method in models.items()}
+    total = len(ESTIMATES) * sum(isinstance(model, TDPG) for model in firsts.values())
     known = []
     with threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
-        for number, label, model in firsts:
+        for number, (label, model) in enumerate(firsts.items()):
             progress.set_postfix_str(f"information, {label}")
-            known.append(_measure(plan, row, number, label, model, out, progress.update))
+            if not isinstance(model, TDPG):
+                reason = f"{type(model).__name__} has no task-relevant variables"
+                known.append(Knowledge(label, f"not measured: {reason}."))
+                continue
+            try:
+                with closing(scenario_env(row.scenario, model, n_episodes=N_INFORMATION)) as env:
+                    report = information_report(model, env, N_INFORMATION, plan.seed, at_end=progress.update)
+                known.append(_knowledge(label, report, out, f"information-{number}"))
+            except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
+                known.append(Knowledge(label, f"not measured: {e}."))
     return known
 
 
-def _measure(
-    plan: Plan, row: Row, number: int, label: str, model: Any, out: Path, at_end: Callable[[], Any]
-) -> Knowledge:
-    if not isinstance(model, TDPG):
-        return Knowledge(label, f"not measured: {type(model).__name__} has no task-relevant variables.")
-    env = scenario_env(row.scenario, model, n_episodes=N_INFORMATION)
-    try:
-        with contextlib.closing(env):
-            report = information_report(model, env, N_INFORMATION, plan.seed, at_end=at_end)
-        figures = [_save(figure, out, f"information-{number}-{name}") for name, figure in report.figures().items()]
-    except ValueError as e:  # a state that never varies, say: the rows are worth a page without it
-        return Knowledge(label, f"not measured: {e}.")
+def _knowledge(label: str, report: InformationReport, out: Path, prefix: str) -> Knowledge:
+    figures = [_save(figure, out, f"{prefix}-{name}") for name, figure in report.figures().items()]
     lower, upper = report.interval.total
-    trust = "all checks passed" if report.badge.passed else "**not to be trusted**: a check failed"
-    text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over an episode's time steps ({trust})."
+    trust = "all checks passed" if report.badge.passed else "**not reliable**: a check failed"
+    text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over the time steps of an episode ({trust})."
     if n_left_out := report.interval.n_left_out:
-        text += f" **Left out**: {n_left_out} time steps to which too few of the {N_INFORMATION} episodes last."
+        text += f" **Left out**: {n_left_out} time steps that too few of the {N_INFORMATION} episodes reach."
     return Knowledge(label, text, report.badge.markdown(), figures)
-
-
-def _import_extra() -> None:
-    """Fail before the work, not after it."""
-    try:
-        import markdown_it  # noqa: F401
-        import matplotlib  # noqa: F401
-        import rliable  # noqa: F401
-    except ImportError as e:
-        raise ImportError(f"a report needs {e.name}: pip install sb3_tdpg[plots]") from e

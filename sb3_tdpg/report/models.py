@@ -1,4 +1,4 @@
-"""Which models a report compares: from arguments to methods, and from files to models."""
+"""Read the models of a report: group the arguments into methods, and load the files."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.vec_env import make_episodes_env
 
-# Names that tell nothing of a model: the folder's name does.
+# File names that any model may have: then the folder names the model.
 PLAIN_NAMES = re.compile(r"model|best_model|final_model|selected|last|rl_model_\d+_steps")
 SEED = re.compile(r"[-_. ]*(seed[-_. ]?\d+|_\d+)$", re.IGNORECASE)
 
-# By the module of the policy, and where that is not an algorithm's own, by a setting that only this algorithm has.
+# A model is recognised by the module of its policy, or by a setting that only its algorithm has.
 ALGORITHMS = {
     "sb3_tdpg.": "sb3_tdpg:TDPG",
     "sb3_contrib.common.recurrent.": "sb3_contrib:RecurrentPPO",
@@ -34,7 +34,7 @@ ALGORITHMS = {
     "sb3_contrib.tqc.": "sb3_contrib:TQC",
     "stable_baselines3.dqn.": "stable_baselines3:DQN",
     "stable_baselines3.sac.": "stable_baselines3:SAC",
-    "stable_baselines3.td3.": "stable_baselines3:TD3",  # DDPG, too: it acts alike
+    "stable_baselines3.td3.": "stable_baselines3:TD3",  # and DDPG, which acts in the same way
 }
 SETTINGS = {
     "mi_estimator": "sb3_tdpg:TDPG",
@@ -51,15 +51,13 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
     """
     Read models from the command line, and group them into methods.
 
-    An argument is a file, a folder with a ``model.zip``, or a pattern such as ``runs/pg-seed*/model.zip``, with
-    ``LABEL=`` in front or not. Without a label, a method is called as the file, or as its folder if the file's name is
-    one that any model may have (``model.zip``, ``best_model.zip``, the environment's id); less the seed:
+    An argument is a file, a folder with a ``model.zip``, or a pattern such as ``runs/pg-seed*/model.zip``, with an
+    optional ``LABEL=`` in front. Without a label, the name of the method is that of the file, or that of its folder if
+    any model may have the file's name (``model.zip``, ``best_model.zip``, the environment's id), without the seed:
     ``runs/pg-seed3/model.zip`` is a model of ``pg``.
 
-    :param arguments: As given.
-    :param env_id: Of the environment.
     :return: the files of each method, in the order of the arguments
-    :raises ValueError: if there is no such file, or one is given twice.
+    :raises ValueError: if a file does not exist, or is given twice.
     """
     methods: dict[str, list[Path]] = {}
     seen: dict[Path, str] = {}
@@ -76,7 +74,7 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
 
 
 def label_of(path: Path, env_id: str = "") -> str:
-    """Return the name of the method that a file is a model of; see :func:`parse_models`."""
+    """Return the name of the method of a model file; see :func:`parse_models`."""
     stem = path.name.removesuffix(".zip")
     is_plain = PLAIN_NAMES.fullmatch(stem) is not None or stem == env_id.rpartition(":")[2]
     folder = path.absolute().parent.name
@@ -84,11 +82,11 @@ def label_of(path: Path, env_id: str = "") -> str:
     return SEED.sub("", name) or name
 
 
-def _split(argument: str) -> tuple[str | None, str]:
-    """Divide ``LABEL=PATTERN``; what has a separator before the ``=`` is a path with a ``=`` in it."""
+def _split(argument: str) -> tuple[str, str]:
+    """Split ``LABEL=PATTERN``; an argument with a path separator before the ``=`` is a path."""
     label, equals, pattern = argument.partition("=")
     if not equals or os.sep in label or Path(argument).exists():
-        return None, argument
+        return "", argument
     if not label.strip() or not pattern:
         raise ValueError(f"{argument!r}: write LABEL=FILE, for instance PG=runs/pg-seed0/model.zip")
     return label.strip(), pattern
@@ -107,15 +105,15 @@ def _files(pattern: str, argument: str) -> list[Path]:
 
 def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     """
-    Load a model of TDPG, Stable-Baselines3 or sb3-contrib: the file tells which.
+    Load a model of TDPG, Stable-Baselines3 or sb3-contrib, and recognise its algorithm from the file.
 
-    If rl-zoo3 has left a ``vecnormalize.pkl`` beside it, observations are normalised as in the training. To load is to
-    unpickle, which can run any code: load what you trust.
+    If rl-zoo3 has saved a ``vecnormalize.pkl`` beside it, observations are normalised as in training. Loading unpickles
+    the file, which can run any code: load only files that you trust.
 
-    :param path: What ``model.save`` wrote.
-    :param env_id: Of the environment, for the normalisation.
-    :param env_kwargs: Likewise.
-    :raises ValueError: if it cannot be read, or is no model of a known algorithm.
+    :param path: The file that ``model.save`` wrote.
+    :param env_id: Id of the environment, for the normalisation.
+    :param env_kwargs: Keywords of the environment.
+    :raises ValueError: if the file cannot be read, or its algorithm is unknown.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -127,15 +125,12 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     known = [name for prefix, name in ALGORITHMS.items() if module.startswith(prefix)]
     known += [name for setting, name in SETTINGS.items() if setting in settings]
     if not known:
-        raise ValueError(
-            f"{path} is no model of TDPG, Stable-Baselines3 or sb3-contrib (its policy is of {module!r}): "
-            "load it, and hand it to sb3_tdpg.report.robustness_report"
-        )
+        raise ValueError(f"{path} is of an unknown algorithm: load it in Python, and pass it to robustness_report")
     package, name = known[0].split(":")
     try:
         model = getattr(import_module(package), name).load(path, device="cpu")
     except (AttributeError, EOFError, ImportError, KeyError, RuntimeError, TypeError, pickle.UnpicklingError) as e:
-        raise ValueError(f"{path} looks like a model of {name}, and does not load as one: {e}") from e
+        raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {e}") from e
     statistics = [path.parent / "vecnormalize.pkl", path.with_suffix("") / "vecnormalize.pkl"]
     if found := [each for each in statistics if each.is_file()]:
         env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
@@ -146,7 +141,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
 def load_all(
     sources: Mapping[str, Sequence[Source]], env_id: str, env_kwargs: Mapping[str, Any]
 ) -> dict[str, list[Any]]:
-    """Load what is a file; a model stays what it is."""
+    """Load the models that are given as files."""
     return {
         label: [load_model(s, env_id, env_kwargs) if isinstance(s, Path) else s for s in of_method]
         for label, of_method in sources.items()
@@ -154,7 +149,7 @@ def load_all(
 
 
 def fingerprint(model: Any) -> str:
-    """Return a name for what a model does: of its weights, and of the statistics that it normalises with."""
+    """Return a hash of the weights of a model and of the statistics that it normalises observations with."""
     digest = hashlib.sha256(type(model).__name__.encode())
     for name, values in sorted(model.policy.state_dict().items()):
         digest.update(name.encode())
@@ -166,11 +161,7 @@ def fingerprint(model: Any) -> str:
 
 
 def check_registered(env_id: str) -> None:
-    """
-    Raise a ``ValueError`` if there is no such environment.
-
-    :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    """
+    """Raise a ``ValueError`` if an id is not registered; it may have the ``module:id`` form."""
     if not isinstance(env_id, str):
         raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
     module, _, bare_id = env_id.rpartition(":")

@@ -193,7 +193,7 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
 
     assert (tmp_path / "summary.md").read_text() == summary
     assert {path.name for path in published.iterdir()} == {path.name for path in tmp_path.iterdir()} - {"runs"}
-    for title in ("The table's reading", "The text's reading", "The paper's own settings"):
+    for title in ("Cost definition: table", "Cost definition: text", "The paper's own settings"):
         assert f"## {title}" in summary
     assert "MISSED" in summary, "two epochs reach no goal, and the summary must say so"
     for reading in READINGS:

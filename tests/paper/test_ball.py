@@ -39,7 +39,7 @@ def tiny(monkeypatch):
         asked.append([run.method for run, *_ in tasks])
         complete_runs_here(tasks, n_eval_episodes=n_eval_episodes)
 
-    monkeypatch.setattr("sb3_tdpg.paper.common.complete_runs", complete_runs)
+    monkeypatch.setattr(ball, "complete_runs", complete_runs)
     return asked
 
 
@@ -55,7 +55,14 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     assert "MISSED" in summary, "an epoch reaches no goal, and the summary must say so"
     for method in (*ball.METHODS, *ball.PAPER_METHODS):
         assert method.label in summary
-    for title in ("PyBullet's images", "The others", "own settings", "Goals", "penalty is worth", "TRVs know"):
+    for title in (
+        "images by PyBullet",
+        "images by the ray caster",
+        "own settings",
+        "Goals",
+        "Effect of the penalty",
+        "TRVs know",
+    ):
         assert title in summary
     records = pd.read_csv(out / "episodes.csv.xz")
     n_policies = 2 * len(ball.METHODS) + len(ball.PAPER_METHODS)
@@ -65,13 +72,13 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     assert (records["cost"] <= 100 * records["distance"] + 25 * 0.2 + 0.1).all()
 
 
-def test_the_controls_may_be_added_later(tmp_path, tiny):
+def test_the_ablations_may_be_added_later(tmp_path, tiny):
     arguments = dict(n_seeds=1, n_eval_episodes=2, n_timesteps=100)
     summary = ball.reproduce_ball(tmp_path, controls=False, **arguments)
-    assert "its control" not in summary
+    assert common.NO_PENALTY not in summary
     assert sorted(tiny[0]) == ["PG", "PG, perturbed images", "TDPG"]
     before = (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes()
-    assert "its control" in ball.reproduce_ball(tmp_path, **arguments)
+    assert common.NO_PENALTY in ball.reproduce_ball(tmp_path, **arguments)
     assert (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes() == before
 
 
@@ -125,13 +132,13 @@ def test_every_method_but_the_first_stages_starts_from_one():
         assert {label for pair in ball.COMPARISONS for label in pair} <= set(labels)
 
 
-def test_a_control_differs_from_its_method_in_nothing_but_the_penalty():
+def test_an_ablation_differs_from_its_method_in_nothing_but_the_penalty():
     for methods in (ball.METHODS, ball.VARYING_METHODS):
         by_label = {method.label: method for method in methods}
-        for model, control in ball.COMPARISONS[:2]:
+        for model, ablation in ball.COMPARISONS[:2]:
             settings = [
-                {**load_hyperparams(by_label[label].block), **by_label[label].overrides} for label in (model, control)
+                {**load_hyperparams(by_label[label].block), **by_label[label].overrides} for label in (model, ablation)
             ]
-            assert by_label[model].start == by_label[control].start
+            assert by_label[model].start == by_label[ablation].start
             assert {key for key in settings[0] if settings[0][key] != settings[1].get(key)} == {"beta", "cost_limit"}
             assert set(settings[0]) == set(settings[1])

@@ -99,7 +99,7 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
 
 @pytest.mark.parametrize(("algo", "cls"), [("ppo", PPO), ("ppo_lstm", RecurrentPPO)])
 def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tiny):
-    run = Baseline("baseline", "Lava-v0", algo, dict(n_timesteps=200)).run("Lava-v0", 3)
+    run = Baseline("baseline", "Lava-v0", algo=algo, overrides=dict(n_timesteps=200)).run("Lava-v0", 3)
     complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=4)
 
     settings = run.settings
@@ -117,7 +117,7 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
 
 
 def test_a_model_that_was_half_written_when_a_run_was_killed_is_trained_anew(tmp_path, tiny, monkeypatch):
-    run = Baseline("baseline", "Lava-v0", "ppo", dict(n_timesteps=20)).run("Lava-v0", 3)
+    run = Baseline("baseline", "Lava-v0", algo="ppo", overrides=dict(n_timesteps=20)).run("Lava-v0", 3)
     save = PPO.save
 
     def killed(self, path, *args, **kwargs):
@@ -162,13 +162,13 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
 
 
 def test_the_time_of_a_second_stage_holds_that_of_the_first(tmp_path, monkeypatch):
-    runs = {path: run for path, run in BALL_BASELINES.runs(1, tmp_path).items() if run.method[:3] in ("fir", "VIB")}
-    for (path, run), seconds in zip(runs.items(), (100.0, 30.0), strict=True):
-        write_atomically(path_of_time(path), json.dumps(dict(wall_s=seconds, cpu_s=seconds / 2)))
-        assert run.start == (None if run.method == "first stage" else next(iter(runs)))
-    rows = [("BallCatch-v0", run.method, 100, 1, False, "Training", 1.0) for run in runs.values()]
+    tasks = [task for task in BALL_BASELINES.tasks(1, tmp_path) if task[0].method[:3] in ("fir", "VIB")]
+    for (run, folder, _), seconds in zip(tasks, (100.0, 30.0), strict=True):
+        write_atomically(path_of_time(folder), json.dumps(dict(wall_s=seconds, cpu_s=seconds / 2)))
+        assert run.start == (None if run.method == "first stage" else tasks[0][1])
+    rows = [("BallCatch-v0", run.method, 100, 1, False, "Training", 1.0) for run, *_ in tasks]
     columns = ["env_id", "model", "train_seed", "attempts", "selected", "scenario", "cost"]
-    table = baselines._seed_table(pd.DataFrame(rows, columns=columns), runs)
+    table = baselines._seed_table(pd.DataFrame(rows, columns=columns), tasks)
     assert list(table["wall_s"]) == [100.0, 130.0]
     assert list(table["cpu_s"]) == [50.0, 65.0]
 
@@ -212,7 +212,7 @@ def changed(one, other):
 
 
 @pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda comparison: comparison.env_id)
-def test_the_peers_of_one_table_have_as_many_steps_as_tdpg_in_all_stages(comparison):
+def test_the_baselines_of_one_table_have_as_many_steps_as_tdpg_in_all_stages(comparison):
     of_tdpg = {
         "Lava-v0": load_hyperparams("Lava-v0-logdet")["n_timesteps"],
         "BallCatch-v0": load_hyperparams("BallCatch-v0-perturbed-pg")["n_timesteps"] + ball.SECOND_STAGE["n_timesteps"],
@@ -225,7 +225,7 @@ def test_the_peers_of_one_table_have_as_many_steps_as_tdpg_in_all_stages(compari
             assert steps == of_tdpg[comparison.env_id], baseline
 
 
-def test_a_peer_differs_in_what_its_name_says():
+def test_a_baseline_differs_in_what_its_name_says():
     lava, on_ball, on_grasp = (settings_of(comparison) for comparison in COMPARISONS)
     assert changed(lava["TDPG (log-det)"], lava["VIB"]) == {"mi_estimator"}
     assert changed(lava["PG"], lava["PG, weight decay"]) == {"policy_kwargs"}
@@ -235,7 +235,7 @@ def test_a_peer_differs_in_what_its_name_says():
     # And from the methods of the tables of which the records are.
     for methods, vib in (
         (ball.METHODS, on_ball["VIB, perturbed images"]),
-        (grasp.EXPERIMENTS["fixed"].methods, on_grasp["VIB"]),
+        (grasp.METHODS["fixed"], on_grasp["VIB"]),
     ):
         (tdpg,) = (method for method in methods if method.label == "TDPG")
         assert changed({**load_hyperparams(tdpg.block), **tdpg.overrides}, vib) == {"mi_estimator"}
@@ -259,7 +259,7 @@ def test_an_option_of_another_experiment_is_refused(arguments, capsys):
 
 def test_the_records_in_the_documentation_have_what_the_table_takes_from_them():
     for each in COMPARISONS:
-        records = each.read_records(RESULTS, 1000)
+        records = each.read_recorded(RESULTS, 1000)
         counts = records.groupby(["model", "train_seed", "scenario"]).size()
         assert len(counts) == len(each.recorded) * baselines.N_RECORDED_SEEDS * len(each.rows)
         assert (counts == 1000).all()

@@ -37,7 +37,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(grasp_analysis, "FITTED_MUGS", 60)
     short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in grasp_analysis.CRITICS.items()}
     monkeypatch.setattr(grasp_analysis, "CRITICS", short)
-    monkeypatch.setattr(common, "complete_runs", complete_runs_here)
+    monkeypatch.setattr(grasp, "complete_runs", complete_runs_here)
 
 
 def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
@@ -46,10 +46,13 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     assert main(["reproduce", "grasp", "--out", str(out), "--publish", str(published), *arguments]) == 0
     summary = (out / "summary.md").read_text()
     assert summary in capsys.readouterr().out
-    for heading in ("Goals", "What the penalty is worth", "What the TRVs know", "How much information is it?"):
+    for heading in ("Goals", "Effect of the penalty", "What the TRVs know", "How much information is it?"):
         assert f"## {heading}" in summary
     assert "0.107" in summary, "the paper's"
-    assert "| estimate | PG, 60 mugs | PG, fresh mugs | TDPG, 60 mugs | TDPG, fresh mugs |" in summary
+    assert (
+        "| estimate | PG, 60 mugs of the fit | PG, fresh mugs | TDPG, 60 mugs of the fit | TDPG, fresh mugs |"
+        in summary
+    )
     files = {"summary.md", "seeds.csv", "episodes.csv.xz", "knowledge.csv", "config.json", "yaw.png", "training.png"}
     assert {path.name for path in published.iterdir()} == files
     records = pd.read_csv(out / "episodes.csv.xz")
@@ -94,22 +97,23 @@ def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
     np.testing.assert_array_equal(outcomes, records["cost"])
 
 
-@pytest.mark.parametrize("camera", grasp.EXPERIMENTS)
-def test_the_control_differs_from_tdpg_in_nothing_but_the_penalty(camera):
-    methods = {method.label: method for method in grasp.EXPERIMENTS[camera].methods}
-    tdpg, control = ({**load_hyperparams(m.block), **m.overrides} for m in (methods["TDPG"], methods["its control"]))
-    assert methods["TDPG"].start == methods["its control"].start == "PG"
-    assert {key for key in tdpg if tdpg[key] != control.get(key)} == {"beta", "cost_limit"}
-    assert set(tdpg) == set(control)
+@pytest.mark.parametrize("camera", grasp.METHODS)
+def test_the_ablation_differs_from_tdpg_in_nothing_but_the_penalty(camera):
+    methods = {method.label: method for method in grasp.METHODS[camera]}
+    pair = methods["TDPG"], methods[common.NO_PENALTY]
+    tdpg, ablation = ({**load_hyperparams(m.block), **m.overrides} for m in pair)
+    assert [method.start for method in pair] == ["PG", "PG"]
+    assert {key for key in tdpg if tdpg[key] != ablation.get(key)} == {"beta", "cost_limit"}
+    assert set(tdpg) == set(ablation)
 
 
 def test_the_training_row_of_a_varying_camera_is_what_the_blocks_train_on():
-    for method in grasp.EXPERIMENTS["varying"].methods:
+    for method in grasp.METHODS["varying"]:
         assert tuple(load_hyperparams(method.block)["env_kwargs"]["camera_range"]) == PANDA_CAMERA["camera_range"]
 
 
 def test_every_goal_is_of_a_row_and_a_method():
-    assert set(grasp.GOALS) <= {method.label for method in grasp.EXPERIMENTS["fixed"].methods}
+    assert set(grasp.GOALS) <= {method.label for method in grasp.METHODS["fixed"]}
     for goals in grasp.GOALS.values():
         assert set(goals) == {row.name for row in PANDA_GRASP}
 
@@ -174,20 +178,19 @@ def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
         "mi/total": [5.0, 5.0, 5.0, 4.5, 4.0, 3.5],
         "rollout/ep_cost_mean": [0.9, 0.05, 0.01, 0.01, 0.02, 0.01],
     })  # fmt: skip
-    with_penalty, without = grasp_analysis.penalty_table({1: log, 2: log.assign(**{"train/mi_coef": 0.0})}).to_dict(
-        "records"
-    )
+    with_penalty, without = grasp_analysis.penalty_table({1: log, 2: log.assign(**{"train/mi_coef": 0.0})})
     assert with_penalty == {
         "seed": 1,
-        "penalty from epoch": "2",
-        "weight": "0.04",
-        "nats, first": "5.00",
-        "nats, last": "3.50",
-        "failures": "0.020",
+        "first epoch with the penalty": "2",
+        "last weight": "0.04",
+        "information in the first epoch": "5.00",
+        "information in the last epoch": "3.50",
+        "failed grasps": "0.020",
     }
-    assert (without["penalty from epoch"], without["weight"]) == ("none", "0")
-    (of_one_epoch,) = grasp_analysis.penalty_table({1: log.drop(columns="train/mi_coef")[:1]}).to_dict("records")
-    assert (of_one_epoch["penalty from epoch"], of_one_epoch["nats, last"]) == ("none", "5.00")
+    assert (without["first epoch with the penalty"], without["last weight"]) == ("none", "0")
+    (of_one_epoch,) = grasp_analysis.penalty_table({1: log.drop(columns="train/mi_coef")[:1]})
+    assert of_one_epoch["first epoch with the penalty"] == "none"
+    assert of_one_epoch["information in the last epoch"] == "5.00"
 
 
 @pytest.mark.parametrize("half_width", [np.pi, np.pi / 4])

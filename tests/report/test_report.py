@@ -20,9 +20,9 @@ from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
-from sb3_tdpg.report.html import to_html
 from sb3_tdpg.report.models import label_of
 from sb3_tdpg.report.numbers import make_numbers
+from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
 
 pytest.importorskip("matplotlib")
@@ -56,7 +56,12 @@ def report(folder, tmp_path_factory):
 def test_the_page_and_its_files(report):
     _, out = report
     page = (out / "report.md").read_text()
-    for words in ("3 models of **PG** and 3 models of **tdpg**", "## In short", "**tdpg against PG**", "vector_delay"):
+    for words in (
+        "3 models of **PG** and 3 models of **tdpg**",
+        "## In short",
+        "**tdpg compared with PG**",
+        "vector_delay",
+    ):
         assert words in page
     for words in ("about the state", "shuffled pairs", "Sensor noise 1e0", "pg-seed2/model.zip", "Made by `"):
         assert words in page
@@ -65,7 +70,7 @@ def test_the_page_and_its_files(report):
     assert all((out / picture).stat().st_size > 1000 for picture in pictures)
     assert not list(out.rglob("*.partial"))
     assert "| vector_noise | noise on every component | standard deviation, scales | 0.1 | 0.8 |" in page
-    assert "A scale is how much a component" in page
+    assert "A scale is the standard deviation of a component" in page
 
 
 def test_the_html_needs_no_other_file(report):
@@ -76,7 +81,7 @@ def test_the_html_needs_no_other_file(report):
     assert len(sources) == len(pictures)
     assert set(sources) == {"data:image/png;base64,"}
     assert not re.search(r"https?://|<script|<link|@import|url\(|file:", re.sub(r'src="[^"]*"', "", html))
-    assert html.count("<table>") == (out / "report.md").read_text().count("| --- |\n") + html.count("shuffled pairs")
+    assert html.count("<table>") == len(re.findall(r"^\|[-:| ]+\|$", (out / "report.md").read_text(), re.MULTILINE))
 
 
 def test_what_is_html_in_a_name_is_shown_and_not_used(tmp_path):
@@ -275,7 +280,7 @@ def test_images_get_a_gallery_and_a_scene(tmp_path):
     )  # fmt: skip
     assert "figures/examples.png" in text
     assert "renderer='fast'" in text
-    assert "| camera_pose | the environment is made otherwise | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
+    assert "| camera_pose | the environment changes | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
     assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
 
@@ -289,9 +294,9 @@ BAD = {
     "spaces": (["{pg}"], {"--env": "Pendulum-v1"}, "does not fit.*the model's observation_space"),
     "keyword": (["{pg}"], {"--env-kwargs": "lava=3"}, "cannot be made"),
     "horizon": (["{pg}"], {"--env-kwargs": "horizon=7"}, "horizon of 5 steps, the environment has 7"),
-    "perturbation": (["{pg}"], {"--perturbations": "fog"}, "'fog' is unknown: here there are .*vector_noise"),
+    "perturbation": (["{pg}"], {"--perturbations": "fog"}, "'fog' is unknown; this environment has .*vector_noise"),
     "another kind": (["{pg}"], {"--perturbations": "hue"}, "'hue' does not apply"),
-    "severity": (["{pg}"], {"--severities": "6"}, "some of 1 to 5"),
+    "severity": (["{pg}"], {"--severities": "6"}, "integers from 1 to 5"),
     "seed": (["{pg}"], {"--seed": "-1"}, "seed=-1 must be"),
 }
 
@@ -319,7 +324,7 @@ def test_there_is_a_page_where_the_information_cannot_be_measured(tmp_path, monk
     "models, env_id, message",
     [
         ([], "Lava-v0", "models=\\[\\] must be a dictionary"),
-        ({}, "Lava-v0", "models is empty"),
+        ({}, "Lava-v0", "models={} must be a dictionary"),
         ({"A": []}, "Lava-v0", "models\\['A'\\] is empty"),
         ({"A": "nothing.zip"}, LavaEnv(), "must be the id of an environment: gymnasium.register"),
     ],
