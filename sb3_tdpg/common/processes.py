@@ -1,10 +1,62 @@
-"""How many processes a machine has room for."""
+"""Pools of worker processes."""
 
 from __future__ import annotations
 
+import multiprocessing as mp
 import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
+
+from sb3_tdpg.common.threads import set_threads
 
 
 def usable_cores() -> int:
     """Count the processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def process_pool(
+    n_processes: int, initializer: Callable[..., Any] | None = None, initargs: tuple[Any, ...] = ()
+) -> Iterator[ProcessPoolExecutor]:
+    """
+    Open a pool of worker processes, which start tasks in the order in which they are submitted.
+
+    Every worker is a fresh interpreter that computes with one thread. Workers ignore Ctrl-C; an exception in the
+    ``with`` block, such as ``KeyboardInterrupt``, stops all of them at once. They also end when this process is killed.
+
+    :param n_processes: Number of workers.
+    :param initializer: Called once in each worker before its first task.
+    :param initargs: Arguments of the initializer.
+    """
+    context = mp.get_context("spawn")
+    # Only this process holds the writing end, so the workers see when it is closed, or when this process has died.
+    reading, writing = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
+        try:
+            yield pool
+        except BaseException:
+            writing.close()
+            raise
+        pool.shutdown()
+        writing.close()
+
+
+def _start_worker(reading: Connection, initializer: Callable[..., Any] | None, initargs: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_exit_at_end_of, args=(reading,), daemon=True).start()
+    set_threads(1)
+    if initializer is not None:
+        initializer(*initargs)
+
+
+def _exit_at_end_of(pipe: Connection) -> None:
+    try:
+        pipe.recv()
+    except EOFError:
+        os._exit(1)
