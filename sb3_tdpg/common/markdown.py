@@ -1,0 +1,39 @@
+"""The one writer of Markdown tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+from pandas.api.types import is_bool_dtype, is_numeric_dtype
+
+_MARKS = dict(l="---", r="---:", c=":---:")
+
+
+def markdown_table(
+    rows: Any, columns: Sequence[str] | None = None, *, digits: int = 3, align: str | None = None
+) -> str:
+    """
+    Write a Markdown table.
+
+    :param rows: A frame, a list of dicts, or a list of lists together with ``columns``. The index is left out.
+    :param columns: Header of the table; default: the names that the rows have.
+    :param digits: Decimals of floats. ``NaN`` and ``None`` become empty cells.
+    :param align: ``"l"``, ``"r"`` or ``"c"`` for each column; the last letter holds for the remaining columns.
+        Default: numbers are right-aligned, everything else is left-aligned.
+    """
+    frame = pd.DataFrame(rows, columns=None if columns is None else list(columns))
+    if align is None:
+        align = "".join("r" if is_numeric_dtype(t) and not is_bool_dtype(t) else "l" for t in frame.dtypes)
+    marks = [_MARKS[letter] for letter in align.ljust(frame.shape[1], align[-1:])]
+
+    def cell(value: Any) -> str:
+        if value is None or value != value:  # NaN
+            return ""
+        text = f"{value:.{digits}f}" if isinstance(value, float) else str(value)
+        return text.replace("|", r"\|")
+
+    lines = [[cell(name) for name in frame.columns], marks]
+    lines += [[cell(value) for value in row] for row in frame.itertuples(index=False, name=None)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,23 @@
+"""The last sentence of a summary: how it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str] = ()) -> str:
+    """
+    Say in a sentence how a summary was made.
+
+    :param command: The command that makes it again.
+    :param how: The result of :func:`~sb3_tdpg.common.provenance.provenance`.
+    :param commits: The commits at which the runs were made, if they are known.
+    """
+    versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
+    git = how["git"]
+    commit = "outside a checkout"
+    if git is not None:
+        commit = git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
+    runs = f"runs at {', '.join(commits)}; " if commits else ""
+    return f"Made by `{command}` at commit {commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
