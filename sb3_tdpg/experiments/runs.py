@@ -42,8 +42,8 @@ class Run:
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Maximum number of trainings from scratch, each with its own seed, until one meets the limits of
         the block's selection. The paper likewise chooses its policy from several trainings.
-    :param start: Folder of a finished run whose policy the training starts from. The environment's random numbers begin
-        anew: with the same seed, the training meets the initial states of that run's first epochs again.
+    :param start: Folder of a finished run whose policy the training starts from. With the same seed, the training meets
+        the initial states of that run's first epochs again.
     """
 
     method: str
@@ -68,16 +68,9 @@ class Run:
     @property
     def config(self) -> dict[str, Any]:
         """Everything that determines the result of the run."""
-        return dict(
-            method=self.method,
-            env_id=self.env_id,
-            block=self.block,
-            seed=self.seed,
-            max_attempts=self.max_attempts,
-            start=None if self.start is None else self.start.name,
-            start_policy=None if self.start is None else _digest(self.start / "model.zip"),
-            settings=self.settings,
-        )
+        config = {name: getattr(self, name) for name in ("method", "env_id", "block", "seed", "max_attempts")}
+        start, policy = (None, None) if self.start is None else (self.start.name, _digest(self.start / "model.zip"))
+        return {**config, "start": start, "start_policy": policy, "settings": self.settings}
 
     def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
         """

@@ -1,9 +1,8 @@
 """
 Optuna studies that any number of worker processes share, on one machine or on many.
 
-Optuna does most of the work: heartbeats show which workers are alive, and the trial of a dead worker is put back into
-the queue. This module adds heartbeats for journal files, which Optuna has for databases only, jobs that are run once
-each, and a loop that ends when nothing is left to do, other workers' trials included.
+Optuna's heartbeats show which workers are alive, and the trial of a dead worker is put back into the queue. This module
+adds heartbeats for journal files, jobs that are run once each, and a loop that also waits for other workers' trials.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ class _Journal(JournalStorage, BaseHeartbeat):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and path.read_bytes()[:1] not in (b"", b"{"):
             raise ValueError("it is not a journal file")
-        # Through a link to this path workers see how old the lock of a dead one is, so the path must be absolute.
+        # Absolute: through a link to this path workers see how old the lock of a dead one is.
         super().__init__(JournalFileBackend(str(path.absolute())))
         self.grace_period = grace_period
         self.retry = RetryHeartbeatStaleTrialCallback(MAX_RETRIES)
@@ -100,11 +99,11 @@ def _silence(trial: FrozenTrial) -> float:
 
 def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PERIOD) -> BaseStorage:
     """
-    Open the storage that workers share. Tables or a file that do not exist yet are made.
+    Open the storage that workers share, and make its tables or file if necessary.
 
     :param storage: A path that ends in ``.log``: a journal file, for the processes of one machine. For many machines
         ``postgresql://user:password@host:port/database`` (psycopg 3, unless the URL names another driver), or another
-        database that SQLAlchemy knows. SQLite is refused, since it is not meant for several workers.
+        database that SQLAlchemy knows, except SQLite, which is not meant for several workers.
     :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
     :raises ValueError: if the storage is malformed or does not answer.
     :raises ImportError: if the driver of the database is not installed.

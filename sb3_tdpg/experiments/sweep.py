@@ -1,11 +1,9 @@
 """
 The paper's sweep over beta as one command: train, evaluate, select, draw; on one machine or on many.
 
-Without a storage parallel processes of this machine make the runs, each in its own folder. With a storage this process
-is one of any number of workers of an Optuna study, in which every run is a trial. A trial also keeps the numbers of its
-run, so that every worker can write the summary. Models and episodes are in ``runs/`` of the folder that their worker
-was given: give all workers the same folder where they share a file system, so that the selected model is at hand and a
-killed run goes on from its checkpoint.
+With a storage, this process is one of any number of workers of an Optuna study, in which every run is a trial that also
+keeps the numbers of its run, so that every worker can write the summary. Give all workers the same folder where they
+share a file system: then the selected model is at hand, and a killed run goes on from its checkpoint.
 """
 
 from __future__ import annotations
@@ -93,20 +91,18 @@ def sweep(
         check_folder(*task, n_eval_episodes)
 
     failures: Mapping[str, str] = {}
-    if not study:
-        complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-        with threads(1):
+    with threads(1):
+        if not study:
+            complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
             rows = [plan.row(plan.folder(out, *job), *job) for job in wanted]
-    else:
-        arguments = (plan, out, wanted, *study)
-        if jobs is None or jobs == 1:
-            with threads(1):
-                _work(*arguments)
         else:
-            with process_pool(jobs) as pool:
-                for worker in as_completed([pool.submit(_work, *arguments) for _ in range(jobs)]):
-                    worker.result()
-        rows, failures = _results(_open_study(plan, *study))
+            if jobs is None or jobs == 1:
+                _work(plan, out, wanted, *study)
+            else:
+                with process_pool(jobs) as pool:
+                    for worker in as_completed([pool.submit(_work, plan, out, wanted, *study) for _ in range(jobs)]):
+                        worker.result()
+            rows, failures = _results(_open_study(plan, *study))
     if not rows:
         raise ValueError(f"no run was finished: {failures}")
     runs = pd.DataFrame(rows).sort_values(["inverse_beta", "seed"], ignore_index=True)
@@ -167,26 +163,21 @@ def _write(plan: Sweep, out: Path, runs: pd.DataFrame, failures: Mapping[str, st
     """Write everything except the runs; any worker may do so, and more than once."""
     best = select(runs, cost_limit)
     write_frame_atomically(runs, out / "runs.csv")
-    source = None if best is None else out / "runs" / best["folder"] / "model.zip"
-    model, record = out / "selected.zip", out / "selected.json"
-    has_model = source is not None and source.exists()
-    if has_model:
-        with replaced_atomically(model) as partial:
-            shutil.copyfile(source, partial)
-    else:
-        model.unlink(missing_ok=True)
-    chosen = None
-    if best is None:
-        record.unlink(missing_ok=True)
-    else:
+    model, record, chosen = out / "selected.zip", out / "selected.json", None
+    model.unlink(missing_ok=True)
+    record.unlink(missing_ok=True)
+    if best is not None:
         chosen = (str(best["label"]), int(best["seed"]))
-        content = {name: best[name] for name in ("seed", "cost", "std", "information", "folder")}
-        content = {"beta": best["label"], **content, "cost_limit": cost_limit}
-        write_atomically(record, json.dumps(content, indent=2, default=lambda x: x.item()) + "\n")
+        content = {"beta": best["label"], **best[["seed", "cost", "std", "information", "folder"]]}
+        text = json.dumps({**content, "cost_limit": cost_limit}, indent=2, default=lambda x: x.item())
+        write_atomically(record, text + "\n")
+        source = out / "runs" / best["folder"] / "model.zip"
+        if source.exists():
+            with replaced_atomically(model) as partial:
+                shutil.copyfile(source, partial)
     save_figure(tradeoff_figure(runs, plan.columns, cost_limit=cost_limit, selected=chosen), out / "sweep.png")
     write_run_config(out / "config.json", {**plan.config, "cost_limit": cost_limit, "runs": runs["folder"].tolist()})
-    text = sweep_summary(
-        runs, best, plan.columns, failures, cost_limit=cost_limit, title=plan.block, has_model=has_model
-    )
+    limits: dict[str, Any] = dict(cost_limit=cost_limit, title=plan.block, has_model=model.exists())
+    text = sweep_summary(runs, best, plan.columns, failures, **limits)
     write_atomically(out / "summary.md", text + "\n")
     return text

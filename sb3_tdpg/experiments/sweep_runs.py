@@ -54,11 +54,7 @@ class Sweep:
         return out / "runs" / self.run(inverse_beta, seed).folder_name
 
     def row(self, folder: Path, inverse_beta: float, seed: int) -> dict[str, Any]:
-        """
-        Measure the cost of a finished run in each scenario, and its information in the first.
-
-        :return: a row of ``runs.csv``, which the folder of the run keeps, too
-        """
+        """Return a finished run's row of ``runs.csv``: its cost in each scenario and its information in the first."""
         path = folder / "sweep_row.json"
         if path.exists():
             return json.loads(path.read_text())
@@ -91,11 +87,9 @@ class Sweep:
     @property
     def config(self) -> dict[str, Any]:
         """Everything that makes one run comparable with another."""
-        first = self.run(1.0, 0).config
-        names = ("method", "seed", "start", "start_policy", "max_attempts")
-        config = {name: value for name, value in first.items() if name not in names}
-        config["settings"] = {name: value for name, value in first["settings"].items() if name != "beta"}
+        settings = {name: value for name, value in self.run(1.0, 0).settings.items() if name != "beta"}
         rows = {row.name: dict(env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in self.scenarios}
+        config = dict(env_id=self.env_id, block=self.block, settings=settings)
         return {**config, "scenarios": rows, "n_eval_episodes": self.n_eval_episodes}
 
 
@@ -127,11 +121,6 @@ def make_sweep(
     """
     Describe a sweep, and build a model of it, so that errors in the settings are found before any training.
 
-    :param env_id: The training environment.
-    :param block: Block of ``hyperparams/tdpg.yml``.
-    :param settings: Settings that replace those of the block.
-    :param n_timesteps: Environment steps of each training; default: as in the block.
-    :param n_eval_episodes: Episodes of each scenario.
     :raises ValueError: if something does not fit.
     """
     for name in ("beta", "seed"):

@@ -29,12 +29,7 @@ EVERY_RUN = (
 
 
 def select(runs: pd.DataFrame, cost_limit: float) -> pd.Series | None:
-    """
-    Select a run by the paper's rule (see :func:`~sb3_tdpg.experiments.sweep.sweep`), if one is below the limit.
-
-    :param runs: With the columns ``cost`` and ``information``.
-    :param cost_limit: Limit on the cost.
-    """
+    """Select a run by the paper's rule (see :func:`~sb3_tdpg.experiments.sweep.sweep`), if one is below the limit."""
     below = runs[runs["cost"] < cost_limit]
     if below.empty:
         return None
@@ -55,12 +50,9 @@ def sweep_summary(
     """
     Write the summary as Markdown.
 
-    :param runs: ``runs.csv``, sorted.
-    :param best: The selected row, if there is one.
+    :param runs: ``runs.csv``, sorted; ``best`` is the selected row.
     :param columns: Column of the mean cost, by scenario.
     :param failures: Reasons of the failed runs, by job.
-    :param cost_limit: Limit of the selection.
-    :param title: Name of the block.
     :param has_model: Whether the selected model lies in the folder of the summary.
     """
     is_below = runs["cost"] < cost_limit
