@@ -255,7 +255,7 @@ def _add_sweep(commands: Any) -> None:
     )  # fmt: skip
     sweep.add_argument("--study-name", default=None, help="its name there (default: sweep-<block>)")
     sweep.add_argument(
-        "--grace-period", type=float, default=120.0, help="seconds of silence after which a worker counts as dead"
+        "--grace-period", type=float, default=60.0, help="seconds without a heartbeat until a worker counts as dead"
     )
     sweep.add_argument(
         "--jobs", type=_positive, default=None, help="runs at a time (default: the number of cores; with --storage 1)"
