@@ -251,7 +251,7 @@ def _add_sweep(commands: Any) -> None:
     sweep.add_argument("--out", type=Path, default=None, help="folder for the results (default: results/sweep-<block>)")
     sweep.add_argument(
         "--storage", default=None, metavar="URL",
-        help="work at a sweep that others work at, too: postgresql://..., sqlite:///FILE or FILE.log",
+        help="work at a sweep that others work at, too: postgresql://... or FILE.log",
     )  # fmt: skip
     sweep.add_argument("--study-name", default=None, help="its name there (default: sweep-<block>)")
     sweep.add_argument(

@@ -155,7 +155,7 @@ def _results(study: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Return the rows of the finished runs of a study, and the reasons of the failed ones."""
     attributes = [trial.user_attrs for trial in study.get_trials(deepcopy=False) if "job" in trial.user_attrs]
     rows = {each["job"]: each["row"] for each in attributes if "row" in each}
-    reasons = {each["job"]: each.get("reason", "its worker was killed") for each in attributes}
+    reasons = {each["job"]: each.get("reason", "its worker failed or was killed") for each in attributes}
     return list(rows.values()), {job: reason for job, reason in reasons.items() if job not in rows}
 
 
