@@ -209,7 +209,7 @@ def work(
     objective: Callable[[optuna.Trial], float | Sequence[float]],
     n_trials: int | None = None,
     *,
-    describe: Callable[[FrozenTrial], str] = lambda trial: ", ".join(f"{value:.4g}" for value in trial.values),
+    describe: Callable[[FrozenTrial], str] = lambda trial: ", ".join(map("{:.4g}".format, trial.values)),
     report: Callable[[str], None] = print,
 ) -> None:
     """

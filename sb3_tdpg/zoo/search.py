@@ -68,16 +68,14 @@ def relevant(space: Space, block: Mapping[str, Any]) -> Space:
 
 def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
     """Sample a value for each name."""
-    return {name: _suggest(trial, name, entry) for name, entry in space.items()}
-
-
-def _suggest(trial: optuna.Trial, name: str, entry: Mapping[str, Any]) -> Any:
-    if "choices" in entry:
-        return trial.suggest_categorical(name, entry["choices"])
-    low, high, log = entry["low"], entry["high"], entry.get("log", False)
-    if isinstance(low, int) and isinstance(high, int):
-        return trial.suggest_int(name, low, high, log=log)
-    return trial.suggest_float(name, low, high, log=log)
+    values = {}
+    for name, entry in space.items():
+        if "choices" in entry:
+            values[name] = trial.suggest_categorical(name, entry["choices"])
+        else:
+            is_integer = isinstance(entry["low"], int) and isinstance(entry["high"], int)
+            values[name] = (trial.suggest_int if is_integer else trial.suggest_float)(name, **entry)
+    return values
 
 
 def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: float) -> dict[str, Any]:

@@ -80,11 +80,10 @@ class TuningManager(TDPGExperimentManager):
         return block, saved
 
     def _find_limit(self, block: dict[str, Any]) -> float:
-        threshold = gym.spec(self.env_name.gym_id).reward_threshold
-        selections = [c for c in get_callback_list(block) if isinstance(c, SelectionCallback)]
-        limits = [self.cost_limit, block.get("cost_limit"), *(c.cost_limit for c in selections)]
-        for limit in (*limits, None if threshold is None else -threshold):
-            if limit is not None and limit != 0 and math.isfinite(limit):
+        selections = [c.cost_limit for c in get_callback_list(block) if isinstance(c, SelectionCallback)]
+        threshold = gym.spec(self.env_name.gym_id).reward_threshold or 0.0
+        for limit in (self.cost_limit, block.get("cost_limit"), *selections, -threshold):
+            if limit and math.isfinite(limit):
                 return float(limit)
         raise ValueError(
             f"tuning needs a limit on the expected cost (minus the reward) of {self.env_name.gym_id}, a finite number "
@@ -96,8 +95,7 @@ class TuningManager(TDPGExperimentManager):
         if self.algo != "tdpg":
             return super().objective(trial)
         assert self.cost_limit is not None
-        values = sample(trial, self.space)
-        settings = put_in(self.settings, values, abs(self.cost_limit))
+        settings = put_in(self.settings, sample(trial, self.space), abs(self.cost_limit))
         sampled = {key: value for key, value in settings.items() if value != self.settings.get(key)}
         hyperparams = {**self._hyperparams, **self._preprocess_schedules(sampled)}
         with (
@@ -106,12 +104,11 @@ class TuningManager(TDPGExperimentManager):
         ):
             model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
             model.set_logger(Logger(None, []))  # SB3 would make a folder in /tmp for each trial
-            callbacks = get_callback_list({"callback": self.specified_callbacks})
             is_constrained = self.objective_kind == "information"
             limit = self.cost_limit if is_constrained else math.inf
             measuring = _Measuring(trial, eval_env, limit, self.n_timesteps // self.n_evaluations)
-            # The last policy is evaluated, not a selected one.
-            others = [callback for callback in callbacks if not isinstance(callback, SelectionCallback)]
+            callbacks = get_callback_list({"callback": self.specified_callbacks})
+            others = [c for c in callbacks if not isinstance(c, SelectionCallback)]  # the last policy is evaluated
             model.learn(self.n_timesteps, [*others, measuring])
             cost, information = measuring.last if measuring.is_pruned else measuring.measure()
             if self.optimization_log_path is not None:
@@ -175,8 +172,7 @@ class TuningManager(TDPGExperimentManager):
             )
             return
         assert self.cost_limit is not None
-        settings = put_in(self.settings, best.params, abs(self.cost_limit))
-        settings["n_timesteps"] = self.n_timesteps
+        settings = {**put_in(self.settings, best.params, abs(self.cost_limit)), "n_timesteps": self.n_timesteps}
         text = yaml.safe_dump({self.block or self.env_name.gym_id: settings}, sort_keys=False)
         write_atomically(folder / "best.yml", f"# Trial {best.number} of {self.study_name}: {_result(best)}\n{text}")
         print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")
