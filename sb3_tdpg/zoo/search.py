@@ -68,13 +68,14 @@ def relevant(space: Space, block: Mapping[str, Any]) -> Space:
 
 def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
     """Sample a value for each name."""
-    values = {}
+    values: dict[str, Any] = {}
     for name, entry in space.items():
         if "choices" in entry:
             values[name] = trial.suggest_categorical(name, entry["choices"])
         else:
             is_integer = isinstance(entry["low"], int) and isinstance(entry["high"], int)
-            values[name] = (trial.suggest_int if is_integer else trial.suggest_float)(name, **entry)
+            suggest: Any = trial.suggest_int if is_integer else trial.suggest_float
+            values[name] = suggest(name, **entry)
     return values
 
 
