@@ -239,7 +239,7 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--out", type=Path, help="folder for the results (default: results/sweep-<block>)")
     add("--storage", metavar="URL", help="share the sweep with other workers: postgresql://... or FILE.log")
     add("--study-name", help="name of the study in the storage (default: sweep-<block>)")
-    add("--grace-period", type=float, default=120.0, help="seconds without a heartbeat until a worker counts as dead")
+    add("--grace-period", type=float, default=60.0, help="seconds without a heartbeat until a worker counts as dead")
     _add_jobs(add)
     _add_sizes(add)
 

@@ -60,7 +60,7 @@ BAD = {
     "beta": ([*SWEEP, "--betas", "1/x"], "beta='1/x' must be a positive number"),
     "environment": ([*SWEEP, "--env", "Foo-v0"], "'Foo-v0' is not registered"),
     "block": ([*SWEEP, "--block", "Lava-v0-foo"], "no block 'Lava-v0-foo'.*choose one with --block"),
-    "storage": ([*SWEEP, *TINY, "--storage", "postgresql://a:b@127.0.0.1:1/c"], "does not answer"),
+    "storage": ([*SWEEP, *TINY, "--storage", "postgresql://a:b@127.0.0.1:1/c"], "cannot be opened"),
     "out": ([*SWEEP, *TINY, "--out", "/proc/nowhere"], "No such file or directory: '/proc/nowhere'"),
     "folder": (["push", "nothing", "--repo-id", "a/b"], "nothing holds no training"),
 }

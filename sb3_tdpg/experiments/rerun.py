@@ -1,6 +1,8 @@
 """
-A recorded run once more: ``python -m sb3_tdpg.experiments.rerun config.json again`` trains and evaluates what ``config.json``
-describes, in the folder ``again``.
+Repeat a recorded run.
+
+``python -m sb3_tdpg.experiments.rerun config.json again`` trains and evaluates the run that ``config.json`` describes,
+in the folder ``again``.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from sb3_tdpg.experiments.runs import Run, complete_run
 
 @dataclass(frozen=True)
 class _RecordedRun(Run):
-    """A run whose settings were recorded whole: a block that was changed since then does not change them."""
+    """A run with all settings recorded, so that a later change of its block does not matter."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -29,11 +31,11 @@ class _RecordedRun(Run):
 
 def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progress_bar: bool = True) -> Path:
     """
-    Train and evaluate anew what a run's ``config.json`` describes: the same numbers, given the same versions.
+    Train and evaluate the run that a ``config.json`` describes; with the same versions it gives the same numbers.
 
-    :param config: The file. The policy that the run started from, if from any, must lie beside it:
+    :param config: The file. If the run started from the policy of another run, that policy must lie beside the file:
         ``<name of that run>/model.zip``.
-    :param out: Folder of the new run, see ``sb3_tdpg.experiments.runs.complete_run``.
+    :param out: Folder of the new run, see :func:`~sb3_tdpg.experiments.runs.complete_run`.
     :param progress_bar: Show progress bars.
     :return: ``out``
     :raises ValueError: if the file does not describe a run, or the policy to start from is another one.
@@ -58,16 +60,12 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
 
 
 def scenarios_of(config: Mapping[str, Any]) -> list[Scenario]:
-    """
-    Return what a recorded run was evaluated on.
-
-    :raises KeyError: if it was not recorded.
-    """
+    """Return the scenarios that a recorded run was evaluated on."""
     return [Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"])) for row in config["scenarios"]]
 
 
 def with_numbers(value: Any) -> Any:
-    """Read back what JSON has no numbers for: ``"inf"``, ``"-inf"``, ``"nan"``."""
+    """Replace ``"inf"``, ``"-inf"`` and ``"nan"``, which JSON cannot write as numbers, by numbers."""
     if isinstance(value, dict):
         return {key: with_numbers(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -76,16 +74,10 @@ def with_numbers(value: Any) -> Any:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run :func:`rerun` from the command line.
-
-    :return: exit code: 0 done, 2 bad input
-    """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_tdpg.experiments.rerun", description="train and evaluate a recorded run anew"
-    )
-    parser.add_argument("config", type=Path, help="the config.json of a run")
-    parser.add_argument("out", type=Path, help="folder for the new run")
+    """Run :func:`rerun` from the command line; return 0, or 2 if the input is bad."""
+    parser = argparse.ArgumentParser(prog="python -m sb3_tdpg.experiments.rerun", description="repeat a recorded run")
+    parser.add_argument("config", help="the config.json of a run")
+    parser.add_argument("out", help="folder for the new run")
     try:
         rerun(**vars(parser.parse_args(arguments)))
     except ValueError as e:

@@ -1,144 +1,297 @@
 """
-One Optuna study that any number of worker processes on any number of machines work at.
+Optuna studies that any number of worker processes share, on one machine or on many.
 
-What is to be done follows from the trials in the storage alone, so that a worker may be killed between any two steps:
-
-- A *job* is a parameter set that is to be run to its end once. Its trials are its *attempts*: they share the
-  attribute ``job``, the number of the first one or what :func:`enqueue_once` wrote there.
-- Of several living attempts at a job the one with the lowest number counts; the others are handed back before they are
-  run. So is a job beyond ``n_trials``, as appears when two workers begin the last one at once.
-- A worker changes the attribute ``heartbeat`` of its trial every few seconds. A running trial whose heartbeat no other
-  worker sees change for ``grace_period`` is failed, and attempted again with the same parameters.
-
-Optuna's own heartbeats are not used: there are none for journal files, a trial whose worker dies before its first
-heartbeat counts as running for ever, and one whose finder dies before it has put it into the queue again is lost.
+Optuna's heartbeats show which workers are alive, and the trial of a dead worker is put back into the queue. This module
+adds heartbeats for journal files, jobs that are run once each, and a loop that also waits for other workers' trials.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import re
 import time
+import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 try:
     import optuna
+    import sqlalchemy as sa
 except ImportError as e:
     raise ImportError("studies need Optuna: pip install sb3_tdpg[zoo]") from e
 
+from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, StorageInternalError, TrialPruned
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
+from optuna.storages._heartbeat import BaseHeartbeat
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import FrozenTrial, TrialState
+
 from sb3_tdpg.common.provenance import differences, jsonable
-from sb3_tdpg.experiments.storages import open_storage, quiet_optuna, told_in_one_line
-from sb3_tdpg.experiments.study_jobs import JOB, job_of
-from sb3_tdpg.experiments.study_worker import Objective, UnfitWorkerError, Worker, values_of
 
-__all__ = ["UnfitWorkerError", "enqueue_once", "open_storage", "open_study", "quiet_optuna", "work"]
+GRACE_PERIOD = 60.0  # seconds
+MAX_RETRIES = 3
+FORMS = "postgresql://user:password@host/database (many machines) or a path that ends in .log (one machine)"
+POSTGRES = dict(connect_timeout=5, keepalives_idle=30, keepalives_interval=10, keepalives_count=3)  # seconds
+OPEN_ATTEMPTS = 5
 
-GRACE_PERIOD = 120.0  # seconds
-CREATION_TIME = 10.0  # seconds from the creation of a study to the description of its space, at most
 SPACE = "space"  # attribute of a study
+JOB, HEARTBEAT, STARTED, REASON = "job", "heartbeat", "started", "reason"  # attributes of a trial
+DONE = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
-@told_in_one_line()
+class _Journal(JournalStorage, BaseHeartbeat):
+    """A journal file with heartbeats. Its workers run on one machine and read the same clock."""
+
+    def __init__(self, path: Path, grace_period: float) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and path.read_bytes()[:1] not in (b"", b"{"):
+            raise ValueError("it is not a journal file")
+        # Absolute: through a link to this path workers see how old the lock of a dead one is.
+        super().__init__(JournalFileBackend(str(path.absolute())))
+        self.grace_period = grace_period
+        self.retry = RetryHeartbeatStaleTrialCallback(MAX_RETRIES)
+
+    def record_heartbeat(self, trial_id: int) -> None:
+        with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
+            self.set_trial_user_attr(trial_id, HEARTBEAT, time.time())
+
+    def get_heartbeat_interval(self) -> int:
+        return _interval(self.grace_period)
+
+    def get_heartbeat_stale_trial_callback(self) -> Callable[[optuna.Study, FrozenTrial], None]:
+        return self.retry
+
+    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
+        trials = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
+        return [trial._trial_id for trial in trials if _silence(trial) > self.grace_period]
+
+
+class _Database(RDBStorage):
+    """A database whose heartbeats go on after an outage and also cover the first moment of a trial."""
+
+    def record_heartbeat(self, trial_id: int) -> None:
+        with contextlib.suppress(StorageInternalError, sa.exc.SQLAlchemyError):
+            super().record_heartbeat(trial_id)
+
+    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
+        trials = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
+        # Optuna would wait forever for a worker that has died before its first heartbeat.
+        early = [t._trial_id for t in trials if STARTED not in t.user_attrs and _silence(t) > (self.grace_period or 0)]
+        return [*super()._get_stale_trial_ids(study_id), *early]
+
+
+def _interval(grace_period: float) -> int:
+    return max(1, int(grace_period / 6))
+
+
+def _silence(trial: FrozenTrial) -> float:
+    """Return the seconds since the start or the last heartbeat of a running trial, by this machine's clock."""
+    assert trial.datetime_start is not None
+    # A trial that is run again has inherited an old heartbeat.
+    return time.time() - max(trial.datetime_start.timestamp(), trial.user_attrs.get(HEARTBEAT, 0.0))
+
+
+def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PERIOD) -> BaseStorage:
+    """
+    Open the storage that workers share, and make its tables or file if necessary.
+
+    :param storage: A path that ends in ``.log``: a journal file, for the processes of one machine. For many machines
+        ``postgresql://user:password@host:port/database`` (psycopg 3, unless the URL names another driver), or another
+        database that SQLAlchemy knows, except SQLite, which is not meant for several workers.
+    :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+    :raises ValueError: if the storage is malformed or does not answer.
+    :raises ImportError: if the driver of the database is not installed.
+    """
+    text = os.fspath(storage)
+    url = re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", text)
+    shown = re.sub(r"(//[^:@]*):.*@", r"\1:***@", text)
+    if grace_period < 2:
+        raise ValueError(f"grace_period={grace_period} must be at least 2 seconds")
+    if text.startswith("sqlite") or ("://" not in text and not text.endswith(".log")):
+        raise ValueError(f"storage={shown!r} must be {FORMS}; SQLite is not meant for several workers")
+    if text.count("@") > 1:
+        raise ValueError(f"storage={shown!r}: write an @ in the password as %40")
+    for attempt in range(OPEN_ATTEMPTS):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)
+                if "://" not in text:
+                    return _Journal(Path(text), grace_period)
+                return _Database(
+                    url.replace("{", "{{").replace("}", "}}"),  # Optuna formats it
+                    dict(pool_pre_ping=True, connect_args=POSTGRES if url.startswith("postgresql") else {}),
+                    heartbeat_interval=_interval(grace_period),
+                    grace_period=int(grace_period),
+                    heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(MAX_RETRIES),
+                )
+        except ImportError as e:
+            raise ImportError(f"storage {shown} needs a driver: pip install 'sb3_tdpg[postgres]'") from e
+        except (OSError, ValueError, KeyError, AssertionError, RuntimeError, sa.exc.SQLAlchemyError) as e:
+            # Workers that start at once disturb each other while they make the tables.
+            if attempt == OPEN_ATTEMPTS - 1 or not isinstance(e, (sa.exc.DBAPIError, AssertionError)):
+                if isinstance(e, sa.exc.ArgumentError) or ("://" in text and isinstance(e, ValueError)):
+                    raise ValueError(f"storage={shown!r} is malformed or of an unknown kind, expected {FORMS}") from e
+                raise ValueError(f"storage {shown} cannot be opened: {_one_line(e)}") from e
+            time.sleep(0.5)
+    raise AssertionError("not reached")
+
+
+def _one_line(error: BaseException) -> str:
+    error = getattr(error.__cause__, "orig", None) or getattr(error, "orig", None) or error
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def quiet_optuna() -> None:
+    """Turn off Optuna's messages, as :func:`work` reports the trials."""
+    optuna.logging.set_verbosity(optuna.logging.CRITICAL)
+    warnings.filterwarnings("ignore", category=ExperimentalWarning)
+
+
 def open_study(
-    storage: optuna.storages.BaseStorage,
+    storage: BaseStorage,
     name: str,
     *,
+    space: Mapping[str, Any],
     directions: Sequence[str] = ("minimize",),
     sampler: optuna.samplers.BaseSampler | None = None,
     pruner: optuna.pruners.BasePruner | None = None,
-    space: Mapping[str, Any],
 ) -> optuna.Study:
     """
-    Create a study, or load it if it is there; workers may do so at once.
+    Create a study, or load it if it exists; directions, sampler and pruner are those of ``optuna.create_study``.
 
     :param storage: From :func:`open_storage`.
     :param name: Name of the study.
-    :param directions: ``"minimize"`` or ``"maximize"`` for each objective.
-    :param sampler: As for ``optuna.create_study``. Not shared: each worker has its own.
-    :param pruner: Likewise.
-    :param space: All that makes one trial comparable with another, in JSON's types: search space, environment,
-        settings. It is kept with the study.
-    :raises ValueError: if the study was made with another space or other directions; it says what differs. Likewise if
-        the storage does not answer.
+    :param space: Everything that makes one trial comparable with another: search space, environment, settings.
+    :raises ValueError: if the study was made with another space; the message names the differences.
     """
-    wanted = jsonable(space)
     kinds: list[Any] = list(directions)
     try:
         study = optuna.create_study(storage=storage, study_name=name, directions=kinds, sampler=sampler, pruner=pruner)
-    except optuna.exceptions.DuplicatedStudyError:
+    except DuplicatedStudyError:
         study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=pruner)
-        # Only the one that created the study writes, so that two with different spaces cannot both believe in theirs.
-        deadline = time.monotonic() + CREATION_TIME
-        while SPACE not in study.user_attrs and not study.get_trials(deepcopy=False) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        if SPACE not in study.user_attrs and study.get_trials(deepcopy=False):
-            raise ValueError(
-                f"study {name!r} was made by another program and does not say what its trials are: choose another name"
-            ) from None
-        if SPACE in study.user_attrs:
-            found = [d.name.lower() for d in study.directions]
-            changed = differences({"directions": found}, {"directions": list(directions)})
-            if changed := changed or differences(study.user_attrs[SPACE], wanted):
-                raise ValueError(
-                    f"study {name!r} is there with other settings, {changed}: choose another name for the study, or "
-                    "the settings that it was made with"
-                ) from None
-            return study
-    study.set_user_attr(SPACE, wanted)
+        study.sampler.reseed_rng()  # two workers with the same seed would try the same points
+    if SPACE not in study.user_attrs:
+        if study.get_trials(deepcopy=False):
+            raise ValueError(f"study {name!r} was made by another program: choose another name")
+        study.set_user_attr(SPACE, jsonable(space))
+    elif changed := differences(study.user_attrs[SPACE], jsonable(space)):
+        raise ValueError(
+            f"study {name!r} exists with other settings, {changed}: choose another name for the study, or the settings "
+            "that it was made with"
+        )
     return study
 
 
-@told_in_one_line()
 def enqueue_once(study: optuna.Study, jobs: Sequence[Mapping[str, Any]]) -> None:
     """
-    Put jobs into the queue, each once, however often and by however many workers at once this is called.
+    Enqueue the jobs that a study does not have yet, and those that have failed.
+
+    A job that several workers enqueue at once is in the queue several times; :func:`work` runs it once.
 
     :param study: From :func:`open_study`.
-    :param jobs: Parameters of each, in JSON's types. An objective gets them through ``trial.suggest_*``.
+    :param jobs: The parameters of each job. An objective gets them through ``trial.suggest_*``.
     """
-    there = {job_of(trial) for trial in study.get_trials(deepcopy=False)}
+    known = {trial.user_attrs.get(JOB) for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL}
     for job in jobs:
         name = json.dumps(jsonable(job), sort_keys=True)
-        if name not in there:
+        if name not in known:
             study.enqueue_trial(dict(job), user_attrs={JOB: name})
 
 
 def work(
     study: optuna.Study,
-    objective: Objective,
+    objective: Callable[[optuna.Trial], float | Sequence[float]],
     n_trials: int | None = None,
     *,
-    max_retries: int = 3,
-    grace_period: float = GRACE_PERIOD,
-    heartbeat_interval: float | None = None,
+    describe: Callable[[FrozenTrial], str] = lambda trial: ", ".join(map("{:.4g}".format, trial.values)),
     report: Callable[[str], None] = print,
-    describe: Callable[[optuna.trial.FrozenTrial], str] = values_of,
 ) -> None:
     """
-    Run trials of a study until it is finished, beside any number of workers that do the same.
+    Run trials until a study is finished, side by side with any number of other workers.
 
-    A trial is finished when it is complete or pruned. One that raises a ``ValueError`` is pruned, and keeps the message
-    as its attribute ``reason``. Any other exception is recorded likewise, puts the trial back into the queue and ends
-    this worker. Ctrl-C and an ``UnfitWorkerError`` put the trial back. One whose worker was killed is run again by
-    another, or by a later, worker. A worker that was suspended for so long that it counted as dead is interrupted in
-    its trial, whose result is dropped, and goes on with the next one.
+    A ``ValueError``, raised by a training that has diverged for instance, prunes the trial, which keeps the message as
+    its attribute ``reason``. Any other exception ends this worker and puts the trial back into the queue; so does
+    Ctrl-C. The trial of a worker that was killed is put back by another worker, or by the next one.
 
     :param study: From :func:`open_study`.
     :param objective: Gets a trial, returns its value or values.
-    :param n_trials: Finished trials that the study is to have, all workers and earlier calls together; ``None``: all
-        that :func:`enqueue_once` put into the queue.
-    :param max_retries: How often a trial that failed, or took its worker with it, is run again. Then it is left, and
-        if ``n_trials`` is given, another one takes its place.
-    :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
-    :param heartbeat_interval: Seconds; default: a sixth of the grace period.
-    :param report: Gets a line of text whenever something happens.
-    :param describe: What the line says of a complete trial; default: its values.
-    :raises ValueError: if the grace period is too short, or the storage stays away.
+    :param n_trials: Complete and pruned trials that the study is to have, all workers together; it may get up to one
+        more for each worker. ``None``: run the jobs of :func:`enqueue_once`.
+    :param describe: Describes a complete trial; default: its values.
+    :param report: Gets a line of text for each trial.
+    :raises ValueError: if the storage does not answer any more.
     """
     if n_trials is not None and n_trials < 1:
         raise ValueError(f"n_trials={n_trials} must be at least 1")
-    if heartbeat_interval is None:
-        heartbeat_interval = grace_period / 6
-    if not 0 < 2 * heartbeat_interval <= grace_period:
-        raise ValueError(f"{grace_period=} must be at least twice {heartbeat_interval=}, and both positive (seconds)")
-    Worker(study, objective, n_trials, max_retries, heartbeat_interval, grace_period, report, describe).run()
+    number: int | None = None  # of the trial that this worker runs
+
+    def attempt(trial: optuna.Trial) -> float | Sequence[float]:
+        nonlocal number
+        if n_trials is None and not _is_to_be_run(study, trial):
+            return [float("nan")] * len(study.directions)  # for Optuna, the trial has failed
+        number = trial.number
+        trial.set_user_attr(STARTED, os.getpid())
+        try:
+            values = objective(trial)
+            if np.isnan(values).any():
+                raise ValueError(f"the result is {values}")
+            return values
+        except (TrialPruned, ValueError) as e:
+            trial.set_user_attr(REASON, _one_line(e))
+            raise TrialPruned(_one_line(e)) from e
+
+    def say(_: optuna.Study, trial: FrozenTrial) -> None:
+        if trial.state in DONE:
+            text = describe(trial) if trial.state == TrialState.COMPLETE else f"pruned: {trial.user_attrs[REASON]}"
+            n_done = len(study.get_trials(deepcopy=False, states=DONE))
+            report(f"trial {trial.number}: {text} ({n_done}{'' if n_trials is None else f' of {n_trials}'} finished)")
+
+    is_waiting = False
+    while True:
+        number = None
+        try:
+            fail_stale_trials(study)
+            n = Counter(trial.state for trial in study.get_trials(deepcopy=False))
+            n_done, n_running = n[TrialState.COMPLETE] + n[TrialState.PRUNED], n[TrialState.RUNNING]
+            if n[TrialState.WAITING] or (n_trials is not None and n_done + n_running < n_trials):
+                is_waiting = False
+                study.optimize(attempt, n_trials=1, callbacks=[say])
+            elif n_running and (n_trials is None or n_done < n_trials):
+                if not is_waiting:
+                    report(f"waiting for {n_running} trials of other workers; those of dead workers will be run again")
+                is_waiting = True
+                time.sleep(1.0)
+            else:
+                return
+        except StorageInternalError as e:
+            raise ValueError(f"the storage does not answer: {_one_line(e)}") from e
+        except (Exception, KeyboardInterrupt) as e:
+            is_taken_over = number is not None and not _put_back(study, number, e)
+            if not is_taken_over or isinstance(e, KeyboardInterrupt):
+                raise
+            report(f"trial {number} was taken over by another worker: its result is dropped")
+
+
+def _is_to_be_run(study: optuna.Study, trial: optuna.Trial) -> bool:
+    """Return whether a trial has a job, and one that no earlier trial has except failed ones."""
+    job = trial.user_attrs.get(JOB)
+    earlier = study.get_trials(deepcopy=False)[: trial.number]
+    return job is not None and all(t.user_attrs.get(JOB) != job or t.state == TrialState.FAIL for t in earlier)
+
+
+def _put_back(study: optuna.Study, number: int, error: BaseException) -> bool:
+    """Put a failed trial back into the queue; return False if another worker has done so before."""
+    trials = study.get_trials()
+    if any(number in trial.system_attrs.get("retry_history", ()) for trial in trials):
+        return False
+    if trials[number].state == TrialState.FAIL:
+        # A trial may be interrupted any number of times.
+        retry = RetryHeartbeatStaleTrialCallback(None if isinstance(error, KeyboardInterrupt) else MAX_RETRIES)
+        retry(study, trials[number])
+    return True

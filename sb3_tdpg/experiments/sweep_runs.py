@@ -1,4 +1,4 @@
-"""One sweep over beta: which runs it has, where they lie, and what is measured of each."""
+"""The runs of a sweep over beta: settings, folders and measurements."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,13 @@ N_INFORMATION = 1000  # episodes
 @dataclass(frozen=True)
 class Sweep:
     """
-    What is trained and how it is evaluated.
+    The settings that all runs share.
 
     :param env_id: The training environment.
     :param block: Block of ``hyperparams/tdpg.yml``.
-    :param settings: What replaces settings of the block.
-    :param scenarios: What every run is evaluated on, the training scenario first.
-    :param n_eval_episodes: Episodes of each.
+    :param settings: Settings that replace those of the block.
+    :param scenarios: Scenarios of the evaluation, the training scenario first.
+    :param n_eval_episodes: Episodes of each scenario.
     """
 
     env_id: str
@@ -41,7 +42,7 @@ class Sweep:
     n_eval_episodes: int
 
     def run(self, inverse_beta: float, seed: int) -> Run:
-        """Name the run of one beta and one seed."""
+        """Return the run of one beta and one seed."""
         beta = math.inf if inverse_beta == 0 else 1 / inverse_beta
         overrides = {**self.settings, "beta": beta}
         if "cost_limit" in load_hyperparams(self.block):
@@ -49,15 +50,11 @@ class Sweep:
         return Run(f"beta {beta_label(inverse_beta)}", self.env_id, self.block, seed, overrides)
 
     def folder(self, out: Path, inverse_beta: float, seed: int) -> Path:
-        """Where a run lies."""
+        """Return the folder of a run."""
         return out / "runs" / self.run(inverse_beta, seed).folder_name
 
     def row(self, folder: Path, inverse_beta: float, seed: int) -> dict[str, Any]:
-        """
-        Measure a finished run: its cost in each scenario, and its information in the first.
-
-        :return: a row of ``runs.csv``; it is kept in the run's folder, too.
-        """
+        """Return a finished run's row of ``runs.csv``: its cost in each scenario and its information in the first."""
         path = folder / "sweep_row.json"
         if path.exists():
             return json.loads(path.read_text())
@@ -65,11 +62,8 @@ class Sweep:
         costs = records.groupby("scenario", sort=False)["cost"].agg(["mean", "std"])
         model = TDPG.load(folder / "model.zip", device="cpu")
         training = self.scenarios[0].with_kwargs(**self.run(inverse_beta, seed).settings.get("env_kwargs", {}))
-        upper, lower = information_bounds(
-            rollout_information(
-                model, training, min(N_INFORMATION, max(self.n_eval_episodes, model.policy.trv_dim + 2))
-            )
-        )
+        n_episodes = min(N_INFORMATION, max(self.n_eval_episodes, model.policy.trv_dim + 2))
+        upper, lower = information_bounds(rollout_information(model, training, n_episodes))
         row: dict[str, Any] = dict(
             label=beta_label(inverse_beta),
             inverse_beta=inverse_beta,
@@ -87,17 +81,15 @@ class Sweep:
 
     @property
     def columns(self) -> dict[str, str]:
-        """Column of ``runs.csv`` with the mean cost, by scenario."""
+        """Name of the column of ``runs.csv`` with the mean cost, by scenario."""
         return {scenario.name: f"cost: {scenario.name}" for scenario in self.scenarios}
 
     @property
     def config(self) -> dict[str, Any]:
-        """What makes one run comparable with another."""
-        first = self.run(1.0, 0).config
-        names = ("method", "seed", "start", "start_policy", "max_attempts")
-        config = {name: value for name, value in first.items() if name not in names}
-        config["settings"] = {name: value for name, value in first["settings"].items() if name != "beta"}
+        """Everything that makes one run comparable with another."""
+        settings = {name: value for name, value in self.run(1.0, 0).settings.items() if name != "beta"}
         rows = {row.name: dict(env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in self.scenarios}
+        config = dict(env_id=self.env_id, block=self.block, settings=settings)
         return {**config, "scenarios": rows, "n_eval_episodes": self.n_eval_episodes}
 
 
@@ -105,15 +97,13 @@ def parse_inverse_beta(beta: str | float) -> float:
     """
     Read a beta and return 1 / beta, the weight of the information; ``"inf"`` gives 0.
 
-    :raises ValueError: if it is no positive number.
+    :raises ValueError: if it is not a positive number.
     """
-    numerator, slash, denominator = str(beta).partition("/")
     try:
-        value = float(numerator) / float(denominator) if slash else float(numerator)
-        inverse = float(denominator) / float(numerator) if slash else 1 / value
-    except (ValueError, ZeroDivisionError):
-        value = inverse = math.nan
-    if not value > 0 or not math.isfinite(inverse):
+        inverse = 0.0 if str(beta) == "inf" else float(1 / Fraction(str(beta)))
+    except (ValueError, ArithmeticError):
+        inverse = -1.0
+    if inverse < 0:
         raise ValueError(f"beta={beta!r} must be a positive number (0.04), a fraction (1/25) or inf (policy gradient)")
     return round(inverse, 9)
 
@@ -129,18 +119,13 @@ def make_sweep(
     env_id: str, block: str, settings: Mapping[str, Any], n_timesteps: int | None, n_eval_episodes: int
 ) -> Sweep:
     """
-    Put a sweep together, and build a model of it, so that what does not fit is found before any training.
+    Describe a sweep, and build a model of it, so that errors in the settings are found before any training.
 
-    :param env_id: The training environment.
-    :param block: Block of ``hyperparams/tdpg.yml``.
-    :param settings: What replaces settings of the block.
-    :param n_timesteps: Likewise.
-    :param n_eval_episodes: Episodes of each scenario.
     :raises ValueError: if something does not fit.
     """
     for name in ("beta", "seed"):
         if name in settings:
-            raise ValueError(f"{name} is what the sweep varies: leave it out of the settings")
+            raise ValueError(f"{name} is varied by the sweep: leave it out of the settings")
     if n_timesteps is not None:
         settings = {**settings, "n_timesteps": n_timesteps}
     rows = PAPER_ROWS.get(env_id, (Scenario("Training", env_id),))

@@ -1,8 +1,8 @@
-"""The picture of a sweep: what the runs cost against how much their TRVs know, and how robust they are."""
+"""The figure of a sweep: the cost of the runs against the information in their TRVs, and their robustness."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 ABOUT_NOTHING = 0.01  # nats: differences below it mean nothing, though a logarithmic axis shows them
 FLOOR = 1e-5  # nats
-ORDERED = "Sensor noise"  # scenarios whose names begin so follow the reference in order
+ORDERED = "Sensor noise"  # prefix of the scenarios that follow the reference in order
+LIMIT_COLOR = "#D55E00"
 
 
 def tradeoff_figure(
@@ -28,14 +29,14 @@ def tradeoff_figure(
     quantity: str = "mean episode cost",
 ) -> Figure:
     """
-    Draw cost against information, a point for each run, and beside it the cost of each run in each scenario.
+    Draw cost against information, one point for each run, and beside it the cost of each run in each scenario.
 
-    :param runs: A row for each run: ``label``, ``seed``, ``cost``, ``information`` (nats) and the columns of ``rows``;
-        the labels in the order in which they are to be drawn.
+    :param runs: ``label``, ``seed``, ``cost``, ``information`` (nats) and the columns of ``rows`` for each run, in the
+        order of drawing.
     :param rows: Column of the mean cost by name of the scenario, the reference first.
     :param cost_limit: Drawn as a line.
-    :param selected: Label and seed of the run to be marked.
-    :param quantity: What the cost is.
+    :param selected: Label and seed of the run to mark.
+    :param quantity: Label of the cost axis.
     """
     matplotlib = _import_matplotlib()
     has_rows = len(rows) > 1
@@ -44,36 +45,21 @@ def tradeoff_figure(
     labels = list(runs["label"].unique())
     shades = matplotlib.colormaps["viridis_r"](np.linspace(0.12, 1.0, len(labels)))
     colors = {label: INK if label == "inf" else shade for label, shade in zip(labels, shades, strict=True)}
-    chosen = runs[[(row.label, row.seed) == selected for row in runs.itertuples()]]
-    at_selected: dict[str, Any] = dict(
-        marker="o", s=150, facecolors="none", edgecolors="#D55E00", linewidths=2, zorder=4
-    )
-
     scatter = panels[0]
     for label, group in runs.groupby("label", sort=False):
-        scatter.scatter(
-            group["information"],
-            group["cost"],
-            s=28,
-            color=colors[label],
-            label=_beta(str(label)),
-            alpha=0.85,
-            zorder=3,
-        )
-    scatter.scatter(
-        chosen["information"].clip(lower=FLOOR),
-        chosen["cost"],
-        label="selected" if len(chosen) else None,
-        **at_selected,
-    )
+        name = r"$\beta = \infty$ (PG)" if label == "inf" else rf"$\beta = {label}$"
+        points = group["information"], group["cost"]
+        scatter.scatter(*points, s=28, color=colors[label], label=name, alpha=0.85, zorder=3)
     information = runs["information"].clip(lower=FLOOR)
+    chosen = [(row.label, row.seed) == selected for row in runs.itertuples()]
+    ring: dict[str, Any] = dict(s=150, facecolors="none", edgecolors=LIMIT_COLOR, linewidths=2, zorder=4)
+    scatter.scatter(information[chosen], runs["cost"][chosen], label="selected" if any(chosen) else None, **ring)
     low, high = 0.6 * information.min(), 1.7 * information.max()
     _log_axis(scatter, "x", subs=(1,))
     scatter.set_xlim(low, max(high, 12 * low))  # at least one tick
     if low < ABOUT_NOTHING:
-        scatter.axvspan(
-            low, min(ABOUT_NOTHING, high), color="#EEEEEE", zorder=0, label="information of about 0", linewidth=0
-        )
+        span = low, min(ABOUT_NOTHING, high)
+        scatter.axvspan(*span, color="#EEEEEE", zorder=0, label="information of about 0", linewidth=0)
     scatter.set_xlabel("information in the TRVs (nat, logarithmic axis)", fontsize=9)
     scatter.set_ylabel(quantity, fontsize=9)
     costs = runs[list(rows.values())].to_numpy()
@@ -83,21 +69,14 @@ def tradeoff_figure(
         _draw_rows(panels[1], runs, rows, colors)
     for axes in panels:
         if cost_limit is not None:
-            axes.axhline(cost_limit, color="#D55E00", linestyle=(0, (4, 3)), linewidth=1, zorder=1)
+            axes.axhline(cost_limit, color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
         axes.grid(alpha=0.25)
         axes.margins(y=0.08)
         _tidy(axes)
     if cost_limit is not None:
-        where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points")
-        scatter.annotate(
-            f"cost limit {cost_limit:g}",
-            (0.99, cost_limit),
-            xytext=(0, 3),
-            ha="right",
-            fontsize=8,
-            color="#D55E00",
-            **where,
-        )
+        where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(0, 3))
+        style: dict[str, Any] = dict(ha="right", fontsize=8, color=LIMIT_COLOR)
+        scatter.annotate(f"cost limit {cost_limit:g}", (0.99, cost_limit), **where, **style)
     handles, names = scatter.get_legend_handles_labels()
     columns = min(len(names), 8)
     figure.legend(handles, names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
@@ -105,7 +84,7 @@ def tradeoff_figure(
 
 
 def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: Mapping[Any, Any]) -> None:
-    """Draw each run as a dot in each row, and the median over seeds as a bar; a line where the rows have an order."""
+    """Draw each run as a dot in each row, the median over seeds as a bar, and a line where the rows have an order."""
     names = list(rows)
     in_order = 1 + sum(name.startswith(ORDERED) for name in names)
     for i, (label, group) in enumerate(runs.groupby("label", sort=False)):
@@ -115,19 +94,7 @@ def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: 
         axes.plot(at, seeds.T, ".", color=colors[label], markersize=4, alpha=0.7)
         axes.plot(at, median, "_", color=colors[label], markersize=8, markeredgewidth=1.6)
         axes.plot(at[:in_order], median[:in_order], color=colors[label], linewidth=1.0, alpha=0.6)
-    texts = [_tick(name) for name in names]
+    texts = ["train" if name == "Training" else _short(name) for name in names]
+    kinds = dict.fromkeys(name.rsplit(" ", 1)[0].lower() for name in names[1:] if _short(name) != name)
     axes.set_xticks(range(len(names)), texts, rotation=30 if sum(map(len, texts)) > 36 else 0)
-    axes.set_xlabel(_what(names), fontsize=9)
-
-
-def _tick(name: str) -> str:
-    return "train" if name == "Training" else _short(name)
-
-
-def _what(names: Sequence[str]) -> str:
-    kinds = list(dict.fromkeys(name.rsplit(" ", 1)[0].lower() for name in names[1:] if _short(name) != name))
-    return f"{', then '.join(kinds)} (bar: median over seeds)" if kinds else "scenario (bar: median over seeds)"
-
-
-def _beta(label: str) -> str:
-    return r"$\beta = \infty$ (PG)" if label == "inf" else rf"$\beta = {label}$"
+    axes.set_xlabel(f"{', then '.join(kinds) or 'scenario'} (bar: median over seeds)", fontsize=9)

@@ -16,7 +16,7 @@ from sb3_tdpg.vec_env import make_episodes_env
 
 
 class Training(NamedTuple):
-    """A model, what is to be called while it learns, and for how long."""
+    """A model with the callbacks and the number of timesteps of its training."""
 
     model: TDPG
     callbacks: list[BaseCallback]
@@ -30,15 +30,15 @@ class Training(NamedTuple):
 
 def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Training:
     """
-    Build model and callbacks from a block of settings, read as rl-zoo3 reads it.
+    Build model and callbacks from a block of settings, as rl-zoo3 does.
 
     ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper``, ``normalize`` and ``callback`` are the zoo's keys;
     ``lin_1e-3`` is a learning rate that falls linearly to zero; every other key is an argument of
     :class:`~sb3_tdpg.tdpg.TDPG`.
 
     :param env_id: A registered id.
-    :param block: The settings, as :func:`sb3_tdpg.hyperparams.load_hyperparams` gives them.
-    :param overrides: Settings that replace those of the block, or arguments of :class:`~sb3_tdpg.TDPG` beside them.
+    :param block: The settings, for instance from :func:`sb3_tdpg.hyperparams.load_hyperparams`.
+    :param overrides: Settings that replace those of the block or add to them.
     """
     settings = {**block, **overrides}
     n_timesteps = int(settings.pop("n_timesteps"))
@@ -50,20 +50,18 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
 
 def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
     """
-    Make the environments of a training, and take what is about them out of its settings.
+    Make the environments of a training, and remove their settings from a block.
 
     :param env_id: A registered id.
     :param settings: ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of
         ``VecNormalize``, to which the zoo adds ``gamma``) are removed.
     """
-    env_kwargs = settings.pop("env_kwargs", {})
-    # In this process: runs are made side by side in processes of their own, and come out the same on any machine.
     env = make_episodes_env(
         env_id,
         settings.pop("n_envs", None),
         n_episodes=settings.get("n_episodes"),
-        env_kwargs=env_kwargs,
-        use_processes=False,
+        env_kwargs=settings.pop("env_kwargs", {}),
+        use_processes=False,  # runs are made side by side in processes of their own
     )
     for entry in settings.pop("vec_env_wrapper", []):
         env = _make(entry, env)
@@ -72,25 +70,20 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
 
 
 def read_schedule(settings: dict[str, Any]) -> None:
-    """Replace a learning rate that is given as a text by its schedule."""
+    """Replace a learning rate that is a text such as ``lin_1e-3`` by its schedule."""
     rate = settings.get("learning_rate")
     if isinstance(rate, str):
-        settings["learning_rate"] = _make_schedule(rate)
+        if not rate.startswith("lin_"):
+            raise ValueError(
+                f"learning_rate={rate!r} must be a number or 'lin_' and a number (YAML: write 1.0e-3, not 1e-3)"
+            )
+        settings["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
 
 
 def _make(entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:
-    """Make a callback or a wrapper: ``{"package.module.Class": {keywords}}`` or ``"package.module.Class"``."""
+    """Make a callback or a wrapper from ``{"package.module.Class": {keywords}}`` or ``"package.module.Class"``."""
     (path, keywords), *more = [(entry, {})] if isinstance(entry, str) else entry.items()
     if more:
         raise ValueError(f"a callback or a wrapper is one class with its keywords, not {entry}")
     module, _, name = path.rpartition(".")
     return getattr(import_module(module), name)(*arguments, **keywords)
-
-
-def _make_schedule(text: str) -> LinearSchedule:
-    kind, _, value = text.partition("_")
-    if kind != "lin":
-        raise ValueError(
-            f"learning_rate={text!r} must be a number or 'lin_' and a number (YAML: write 1.0e-3, not 1e-3)"
-        )
-    return LinearSchedule(float(value), 0.0, 1.0)

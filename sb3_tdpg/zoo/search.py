@@ -1,4 +1,4 @@
-"""The space of hyperparameters that ``tune`` searches: read from YAML, sampled by Optuna, put into a block."""
+"""The search space of ``tune``: read from YAML, sampled by Optuna, put into a block."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ from sb3_tdpg.tdpg import TDPG
 
 Space = Mapping[str, Mapping[str, Any]]
 
-# Stands for beta: see tdpg-search.yml.
-WEIGHT = "mi_coef"
+WEIGHT = "mi_coef"  # stands for beta, see tdpg-search.yml
 
 
 def read_space(path: Path | None = None) -> Space:
     """
     Read and check a search space.
 
-    :param path: A file like ``hyperparams/tdpg-search.yml``, which it is by default.
-    :raises ValueError: naming what is wrong with it.
+    :param path: A file; default: ``hyperparams/tdpg-search.yml``.
+    :raises ValueError: if the space is malformed.
     """
     file = resources.files(hyperparams).joinpath("tdpg-search.yml") if path is None else path
     try:
@@ -47,7 +46,8 @@ def _check_entry(where: str, name: str, entry: Any) -> None:
     owners: dict[str, Any] = {"": TDPG, "policy_kwargs": TRVPolicy}
     if prefix not in owners or (name != WEIGHT and argument not in inspect.signature(owners[prefix]).parameters):
         raise ValueError(f"{where} is no argument of TDPG, nor of its policy after 'policy_kwargs.', nor {WEIGHT}")
-    if not isinstance(entry, dict) or not (set(entry) == {"choices"} or {"low", "high"} <= set(entry) <= {*_KEYS}):
+    keys = set(entry) if isinstance(entry, dict) else set()
+    if keys != {"choices"} and not {"low", "high"} <= keys <= {"low", "high", "log"}:
         raise ValueError(f"{where} must have low and high, and may have log: true; or choices. It is {entry!r}")
     if "choices" in entry:
         if not isinstance(entry["choices"], list) or not entry["choices"]:
@@ -60,36 +60,32 @@ def _check_entry(where: str, name: str, entry: Any) -> None:
         raise ValueError(f"{where} has log: true, for which low={low} must be positive")
 
 
-_KEYS = ("low", "high", "log")
-
-
 def relevant(space: Space, block: Mapping[str, Any]) -> Space:
-    """Leave out of a space the weight of the information where a block's beta has none to be chosen."""
+    """Remove the weight of the information from a space if the block's beta leaves no choice of it."""
     is_fixed = block.get("beta") in (None, "auto", math.inf)
     return {name: entry for name, entry in space.items() if not (name == WEIGHT and is_fixed)}
 
 
 def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
-    """Draw a value for each name."""
-    return {name: _suggest(trial, name, entry) for name, entry in space.items()}
-
-
-def _suggest(trial: optuna.Trial, name: str, entry: Mapping[str, Any]) -> Any:
-    if "choices" in entry:
-        return trial.suggest_categorical(name, entry["choices"])
-    low, high, log = entry["low"], entry["high"], entry.get("log", False)
-    if isinstance(low, int) and isinstance(high, int):
-        return trial.suggest_int(name, low, high, log=log)
-    return trial.suggest_float(name, low, high, log=log)
+    """Sample a value for each name."""
+    values: dict[str, Any] = {}
+    for name, entry in space.items():
+        if "choices" in entry:
+            values[name] = trial.suggest_categorical(name, entry["choices"])
+        else:
+            is_integer = isinstance(entry["low"], int) and isinstance(entry["high"], int)
+            suggest: Any = trial.suggest_int if is_integer else trial.suggest_float
+            values[name] = suggest(name, **entry)
+    return values
 
 
 def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: float) -> dict[str, Any]:
     """
-    Return a block with sampled values in it. What ``policy_kwargs`` holds beside them stays.
+    Return a block with sampled values in it; the other ``policy_kwargs`` of the block stay.
 
-    :param block: Hyperparameters, as the YAML files have them.
+    :param block: Hyperparameters, as in the YAML files.
     :param values: From :func:`sample`, or the ``params`` of a trial.
-    :param cost_scale: What :data:`WEIGHT` is measured in: the size of the cost limit.
+    :param cost_scale: Unit of :data:`WEIGHT`: the absolute value of the cost limit.
     """
     block = {**block, "policy_kwargs": copy.deepcopy(dict(block.get("policy_kwargs") or {}))}
     for name, value in values.items():

@@ -1,9 +1,9 @@
 """
-Tuning with Optuna through the zoo, for what a bottleneck is for.
+Hyperparameter tuning with Optuna through the zoo.
 
-Reward alone would tune the bottleneck away: the penalty costs reward on the environment that is trained on. Hence there
-are two objectives. ``information`` is the least information under a limit on the expected cost (the paper's rule for
-choosing a policy), and ``shift`` the least expected cost in an environment that differs from the one trained on.
+Tuning on the reward alone would remove the bottleneck, since its penalty costs reward in the training environment.
+Hence there are two objectives: ``information`` is the least information under a limit on the expected cost (the paper's
+rule for selecting a policy), ``shift`` the least expected cost in an environment other than the training environment.
 """
 
 from __future__ import annotations
@@ -33,16 +33,14 @@ from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
 OBJECTIVES = ("information", "shift")
 N_EVALUATIONS = 10
-# What a study was made of, beside its results.
-RECORD = "study.json"
-# What a trial keeps beside its value. The cost above the limit is a constraint, too.
-COST, INFORMATION = "cost", "information"
+RECORD = "study.json"  # settings of a study, in the folder of its results
+COST, INFORMATION = "cost", "information"  # attributes of a trial; cost minus limit is also a constraint
 
 
 class TuningManager(TDPGExperimentManager):
-    """Tunes TDPG; any other algorithm is tuned as the zoo does it."""
+    """Tune TDPG. Other algorithms are tuned as the zoo does it."""
 
-    # Set by the program, as the zoo has no flags for them.
+    # Set by the program, since the zoo has no flags for them.
     objective_kind: str | None = None
     cost_limit: float | None = None
     space_path: Path | None = None
@@ -54,11 +52,11 @@ class TuningManager(TDPGExperimentManager):
         if self.objective_kind is None:
             self.objective_kind = "information" if self._eval_env_kwargs_args is None else "shift"
         if self.objective_kind == "shift" and self._eval_env_kwargs_args is None:
-            raise ValueError("--objective shift needs --eval-env-kwargs: what is other there than in training")
+            raise ValueError("--objective shift needs --eval-env-kwargs: how the environment differs from training")
         if self.n_jobs != 1:
             raise ValueError(
                 f"--n-jobs {self.n_jobs} would be threads of one process, which do not make TDPG faster: start the "
-                "same command several times instead, with --storage"
+                "same command several times instead"
             )
         self.n_evaluations = self.n_evaluations or N_EVALUATIONS
         self.study_name = self.study_name or f"{self.block or env_id}-{self.objective_kind}"
@@ -68,7 +66,7 @@ class TuningManager(TDPGExperimentManager):
         self.space: Space = read_space(self.space_path)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See the zoo."""
+        """Read the block and find the limit on the cost; see the zoo."""
         block, saved = super().read_hyperparameters()
         if self.algo == "tdpg":
             self.settings = copy.deepcopy(dict(saved))
@@ -82,11 +80,10 @@ class TuningManager(TDPGExperimentManager):
         return block, saved
 
     def _find_limit(self, block: dict[str, Any]) -> float:
-        threshold = gym.spec(self.env_name.gym_id).reward_threshold
-        selections = [c for c in get_callback_list(block) if isinstance(c, SelectionCallback)]
-        limits = [self.cost_limit, block.get("cost_limit"), *(c.cost_limit for c in selections)]
-        for limit in (*limits, None if threshold is None else -threshold):
-            if limit is not None and limit != 0 and math.isfinite(limit):
+        selections = [c.cost_limit for c in get_callback_list(block) if isinstance(c, SelectionCallback)]
+        threshold = gym.spec(self.env_name.gym_id).reward_threshold or 0.0
+        for limit in (self.cost_limit, block.get("cost_limit"), *selections, -threshold):
+            if limit and math.isfinite(limit):
                 return float(limit)
         raise ValueError(
             f"tuning needs a limit on the expected cost (minus the reward) of {self.env_name.gym_id}, a finite number "
@@ -94,12 +91,11 @@ class TuningManager(TDPGExperimentManager):
         )
 
     def objective(self, trial: optuna.Trial) -> float:
-        """Train with what the trial samples."""
+        """Train with the hyperparameters that a trial samples; return the value to be minimised."""
         if self.algo != "tdpg":
             return super().objective(trial)
         assert self.cost_limit is not None
-        values = sample(trial, self.space)
-        settings = put_in(self.settings, values, abs(self.cost_limit))
+        settings = put_in(self.settings, sample(trial, self.space), abs(self.cost_limit))
         sampled = {key: value for key, value in settings.items() if value != self.settings.get(key)}
         hyperparams = {**self._hyperparams, **self._preprocess_schedules(sampled)}
         with (
@@ -108,12 +104,11 @@ class TuningManager(TDPGExperimentManager):
         ):
             model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
             model.set_logger(Logger(None, []))  # SB3 would make a folder in /tmp for each trial
-            callbacks = get_callback_list({"callback": self.specified_callbacks})
             is_constrained = self.objective_kind == "information"
             limit = self.cost_limit if is_constrained else math.inf
             measuring = _Measuring(trial, eval_env, limit, self.n_timesteps // self.n_evaluations)
-            # What is judged is the last policy.
-            others = [callback for callback in callbacks if not isinstance(callback, SelectionCallback)]
+            callbacks = get_callback_list({"callback": self.specified_callbacks})
+            others = [c for c in callbacks if not isinstance(c, SelectionCallback)]  # the last policy is evaluated
             model.learn(self.n_timesteps, [*others, measuring])
             cost, information = measuring.last if measuring.is_pruned else measuring.measure()
             if self.optimization_log_path is not None:
@@ -125,7 +120,7 @@ class TuningManager(TDPGExperimentManager):
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
-        """Run trials, beside any number of other workers, until the study has as many as were asked for."""
+        """Run trials, side by side with other workers, until the study has as many as asked for."""
         if self.algo != "tdpg":
             super().hyperparameters_optimization()
             return
@@ -141,8 +136,9 @@ class TuningManager(TDPGExperimentManager):
             n_evaluations=self.n_evaluations,
             n_eval_episodes=self.n_eval_episodes,
         )
-        if Path(self.storage) != Path(self.save_path, "study.log"):  # of its own study the storage tells more
-            check_same_config(Path(self.save_path, RECORD), self._described(description), "study")
+        record = Path(self.save_path, RECORD)
+        if Path(self.storage) != record.with_name("study.log"):  # that one names the study in its message
+            check_same_config(record, dict(study=self.study_name, **description), "study")
         quiet_optuna()
         study = open_study(
             open_storage(self.storage),
@@ -151,18 +147,14 @@ class TuningManager(TDPGExperimentManager):
             pruner=self._create_pruner(self.pruner),
             space=description,
         )
-        # What every trial would fail of is told before the first one.
-        self.create_envs(1, eval_env=True).close()
+        self.create_envs(1, eval_env=True).close()  # errors that every trial would have come before the first one
         work(study, self.objective, self.max_total_trials or self.n_trials, describe=_result)
         self._write_results(study, description)
-
-    def _described(self, description: dict[str, Any]) -> dict[str, Any]:
-        return dict(study=self.study_name, **description)
 
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         if self.algo != "tdpg" or sampler_method != "tpe":
             return super()._create_sampler(sampler_method)
-        # As the zoo's, but for workers that choose at the same time: each counts the others' open trials as bad ones.
+        # As the zoo's, except that workers which choose at the same time avoid each other's running trials.
         return optuna.samplers.TPESampler(
             n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, constant_liar=True
         )
@@ -171,35 +163,32 @@ class TuningManager(TDPGExperimentManager):
         folder = Path(self.save_path)
         folder.mkdir(parents=True, exist_ok=True)
         write_frame_atomically(study.trials_dataframe(), folder / "trials.csv")
-        write_run_config(folder / RECORD, self._described(description))
+        write_run_config(folder / RECORD, dict(study=self.study_name, **description))
         best = best_trial(study)
         if best is None:
             print(
-                f"none of the finished trials of {self.study_name} keeps the expected cost below "
-                f"{self.cost_limit:g}: raise --cost-limit, train longer with -n, or try more with --n-trials"
+                f"no trial of {self.study_name} keeps the expected cost below {self.cost_limit:g}: raise --cost-limit, "
+                "train longer with -n, or run more trials with --n-trials"
             )
             return
         assert self.cost_limit is not None
-        settings = put_in(self.settings, best.params, abs(self.cost_limit))
-        settings["n_timesteps"] = self.n_timesteps
+        settings = {**put_in(self.settings, best.params, abs(self.cost_limit)), "n_timesteps": self.n_timesteps}
         text = yaml.safe_dump({self.block or self.env_name.gym_id: settings}, sort_keys=False)
         write_atomically(folder / "best.yml", f"# Trial {best.number} of {self.study_name}: {_result(best)}\n{text}")
         print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")
         for name, value in best.params.items():
             print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
-        print(
-            f"results are in {folder}; to train with them: sb3-tdpg train --env {self.env_name.gym_id} --conf-file ",
-            end="",
-        )
-        print(folder / "best.yml" if self.block is None else f"{folder / 'best.yml'} --block {self.block}")
+        block = "" if self.block is None else f" --block {self.block}"
+        command = f"sb3-tdpg train --env {self.env_name.gym_id} --conf-file {folder / 'best.yml'}{block}"
+        print(f"results are in {folder}; to train with them: {command}")
 
 
 class _Measuring(BaseCallback):
     """
-    Measures cost and information on fresh episodes now and then, and has the trial pruned where it falls behind.
+    Measure cost and information on fresh episodes at intervals, and stop a training that falls behind other trials.
 
-    :param limit: On the cost; infinite: the cost itself is minimised.
-    :param interval: Environment steps from one measurement to the next.
+    :param limit: Limit on the cost; infinite: the cost itself is minimised.
+    :param interval: Environment steps between two measurements.
     """
 
     def __init__(self, trial: optuna.Trial, env: VecEnv, limit: float, interval: int) -> None:
@@ -210,7 +199,7 @@ class _Measuring(BaseCallback):
         self._next = interval
 
     def measure(self) -> tuple[float, float]:
-        """Return the expected cost and the information in nats of the policy as it is now."""
+        """Return the expected cost and the information in nats of the current policy."""
         assert isinstance(self.model, TDPG)
         episodes = encode_episodes(self.model, self.env, seed=self.trial.number)
         self.last = (float(episodes.costs.mean()), max(0.0, information_bounds(episodes.batch).upper))
@@ -230,7 +219,7 @@ class _Measuring(BaseCallback):
 
 
 def _rank(cost: float, information: float, limit: float) -> float:
-    """Order policies: those that meet the limit come first, below 1, by their information; the others by their cost."""
+    """Order policies: those that meet the limit first, below 1, by their information; then the others by their cost."""
     if math.isinf(limit):
         return cost
     if cost <= limit:
@@ -239,7 +228,7 @@ def _rank(cost: float, information: float, limit: float) -> float:
 
 
 def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
-    """Return the complete trial with the least value, of those that meet the limit on the cost if there is one."""
+    """Return the complete trial with the least value among those that meet the limit on the cost."""
     complete = study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
     met = [trial for trial in complete if all(value <= 0 for value in trial.constraints.values())]
     return min(met, key=lambda trial: trial.value, default=None)  # type: ignore[arg-type, return-value]
@@ -247,11 +236,11 @@ def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
 
 def block_of_trial(storage: str, study_name: str, number: int | None = None) -> dict[str, Any]:
     """
-    Return the hyperparameters that a trial of :class:`TuningManager` was run with.
+    Return the hyperparameters of a trial of :class:`TuningManager`.
 
-    :param storage: Of the study.
-    :param study_name: Its name.
-    :param number: Of the trial; default: the best one.
+    :param storage: Storage of the study.
+    :param study_name: Name of the study.
+    :param number: Number of the trial; default: the best one.
     :raises ValueError: if there is no such study or trial.
     """
     try:

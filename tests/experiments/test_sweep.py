@@ -79,7 +79,7 @@ def test_if_no_run_is_below_the_limit_none_is_selected_and_an_earlier_one_is_rem
     quick_sweep(tmp_path, storage=storage, n_seeds=1)
     assert (tmp_path / "selected.zip").exists()
     text = quick_sweep(tmp_path, storage=storage, n_seeds=1, cost_limit=0.5)
-    assert "**No run costs less than 0.5, so that none is selected**" in text
+    assert "**No run costs less than 0.5, so none is selected**" in text
     assert not (tmp_path / "selected.zip").exists()
     assert not (tmp_path / "selected.json").exists()
 
@@ -94,7 +94,7 @@ def test_a_worker_that_is_killed_costs_no_run(tmp_path, postgres):  # noqa: F811
     worker = mp.get_context("forkserver").Process(target=run_sweep, args=(tmp_path, storage))
     worker.start()
     try:
-        deadline = time.monotonic() + 40
+        deadline = time.monotonic() + 120
         while not list(tmp_path.glob("runs/*/attempt0/*")):  # in the middle of a training
             assert time.monotonic() < deadline
             assert worker.is_alive()
@@ -110,7 +110,7 @@ def test_a_worker_that_is_killed_costs_no_run(tmp_path, postgres):  # noqa: F811
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
-    storage = f"sqlite:///{tmp_path}/study.db"
+    storage = str(tmp_path / "study.log")
     learn, calls = TDPG.learn, []
 
     def interrupted_learn(model, *args, **kwargs):
@@ -180,19 +180,15 @@ def test_a_job_of_another_worker_for_which_there_is_no_place_here_is_left_to_oth
     quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
     study = optuna.load_study(study_name="sweep-Lava-v0", storage=open_storage(storage))
     enqueue_once(study, [dict(inverse_beta=50.0, seed=0)])
-    with pytest.raises(ValueError, match="holds a run with other settings"):
+    with pytest.raises(FileExistsError, match="holds a run with other settings"):
         quick_sweep(tmp_path / "out", storage=storage, betas=["inf"], n_seeds=1)
     quick_sweep(tmp_path / "mine", storage=storage, betas=["inf"], n_seeds=1)
     assert_complete(tmp_path / "mine", 2)
 
 
-def test_workers_of_one_machine_tell_in_a_line_what_ends_them(tmp_path, capfd):
-    storage = str(tmp_path / "study.log")
-    with pytest.raises(ValueError, match="2 of 2 workers failed, see above"):
-        quick_sweep(tmp_path, storage=storage, jobs=2, grace_period=-1.0)
-    lines = capfd.readouterr().err.splitlines()
-    assert [line for line in lines if line.startswith("error: grace_period=-1.0 must be")] == lines
-    assert len(lines) == 2
+def test_several_workers_of_one_machine_run_each_job_once(tmp_path):
+    quick_sweep(tmp_path, storage=str(tmp_path / "study.log"), jobs=2)
+    assert_complete(tmp_path, 4)
 
 
 def runs_of(*rows):
@@ -232,7 +228,8 @@ def test_a_bad_beta_is_named(text):
     [
         (dict(betas=[]), "at least one beta"),
         (dict(block="Lava-v1"), "has no block 'Lava-v1'"),
-        (dict(storage="nowhere"), "storage='nowhere' is none of"),
+        (dict(storage="nowhere"), "storage='nowhere' must be"),
+        (dict(storage="study.log", grace_period=-1.0), "grace_period=-1.0 must be"),
         (dict(study_name="s"), "needs a storage"),
         (dict(cost_limit=math.nan), "NaN"),
     ],
@@ -246,7 +243,7 @@ def test_bad_input_is_named_before_anything_is_trained(tmp_path, kwargs, message
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"beta": 0.1}, "beta is what the sweep varies"),
+        ({"beta": 0.1}, "beta is varied by the sweep"),
         ({"learning_rat": 1.0}, "learning_rat"),
         ({"n_episodes": 1}, "2"),
     ],

@@ -19,6 +19,7 @@ from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
 from tests.zoo.test_zoo import here, start  # noqa: F401
 
 pytest.importorskip("rl_zoo3")
+from sb3_tdpg.experiments.studies import open_storage
 from sb3_tdpg.zoo.search import put_in, read_space, relevant, sample
 from sb3_tdpg.zoo.tuning import _Measuring, _rank, best_trial, block_of_trial
 
@@ -154,14 +155,14 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
                      "n_timesteps": 400}  # fmt: skip
 
     assert main([*command, "--n-trials", "5", "-n", "500"]) == 2  # TINY's -n comes first
-    assert "is there with other settings, n_timesteps: 400 there, 500 here" in capsys.readouterr().err
+    assert "exists with other settings, n_timesteps: 400 there, 500 here" in capsys.readouterr().err
 
     results = {path.name: path.read_bytes() for path in folder.iterdir()}
-    elsewhere = ["--storage", "sqlite:///another.db", "--cost-limit", "1e5"]  # of the same name
+    elsewhere = ["--storage", "another.log", "--cost-limit", "1e5"]  # of the same name
     assert main([*command, *elsewhere]) == 2
     assert "study with other settings, cost_limit: 1000000.0 there, 100000.0 here: choose" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == results
-    assert not (here / "another.db").exists()
+    assert not (here / "another.log").exists()
 
     train = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1"]
     assert main([*train, "--conf-file", str(folder / "best.yml")]) == 0
@@ -194,13 +195,13 @@ def test_trials_that_fall_behind_are_pruned(here):  # noqa: F811
 
 
 def test_two_workers_share_a_study(here):  # noqa: F811
-    command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "6", "--storage", "sqlite:///study.db"]
+    command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "6", "--storage", "study.log"]
     workers = [start(command, here) for _ in range(2)]
     outputs = [worker.communicate(timeout=300)[0] for worker in workers]
     assert [worker.returncode for worker in workers] == [0, 0], outputs
-    study = optuna.load_study(study_name="Lava-v0-logdet-information", storage="sqlite:///study.db")
-    finished = [trial for trial in study.trials if trial.state.is_finished() and trial.state.name != "FAIL"]
-    assert len(finished) == 6
+    study = optuna.load_study(study_name="Lava-v0-logdet-information", storage=open_storage("study.log"))
+    finished = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
+    assert 6 <= len(finished) <= 6 + 2
     assert all("best of" in output for output in outputs)
 
 
@@ -219,7 +220,7 @@ def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):  # noqa
 
 def test_a_limit_that_no_trial_meets_is_told(here, capsys):  # noqa: F811
     assert main(["tune", *TINY, "--cost-limit", "1e-6", "--n-trials", "2"]) == 0
-    assert "none of the finished trials" in capsys.readouterr().out
+    assert "keeps the expected cost below" in capsys.readouterr().out
     assert not list(here.rglob("best.yml"))
 
 
@@ -232,7 +233,7 @@ BAD = {
     "threads": (["--n-jobs", "2"], "--n-jobs 2 would be threads .* start the same command several times"),
     "keyword": (["--eval-env-kwargs", "foo:1"], "cannot be made with env_kwargs={'foo': 1}"),
     "space": (["--space", "none.yml"], "the search space none.yml cannot be read"),
-    "storage": (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db does not answer"),
+    "storage": (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db cannot be opened"),
 }
 
 

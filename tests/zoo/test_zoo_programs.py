@@ -17,6 +17,8 @@ import optuna
 from rl_zoo3.utils import get_trained_models
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_tdpg.experiments.studies import open_storage
+
 BLOCK = "policy: TRVPolicy, n_timesteps: 200, n_episodes: 2, n_envs: 1, mi_estimator: logdet, beta: 1.0"
 NO_EVALUATION = ["--eval-freq", "-1", "--verbose", "0"]
 
@@ -152,6 +154,6 @@ def test_workers_one_after_the_other_stop_at_the_total_of_trials(here):  # noqa:
     command = ["tune", "--env", "Pendulum-v1", "-n", "400", "-params", "n_envs:1", "n_episodes:2", "batch_size:2"]
     command += ["--n-evaluations", "1", "--seed", "12", "--eval-episodes", "40", "--max-total-trials", "3"]
     for n_trials in ("2", "2"):
-        assert main([*command, "--n-trials", n_trials, "--storage", "sqlite:///study.db", "--study-name", "a"]) == 0
-    study = optuna.load_study(study_name="a", storage="sqlite:///study.db")
+        assert main([*command, "--n-trials", n_trials, "--storage", "study.log", "--study-name", "a"]) == 0
+    study = optuna.load_study(study_name="a", storage=open_storage("study.log"))
     assert len(study.get_trials(states=(optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED))) == 3

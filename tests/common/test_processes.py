@@ -1,0 +1,92 @@
+"""Pools of worker processes: order, Ctrl-C, and what happens when the main process is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch as th
+
+from sb3_tdpg.common.processes import process_pool
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PROGRAM = """
+import sys, time
+from pathlib import Path
+from sb3_tdpg.common.processes import process_pool
+
+def work(path):
+    path.write_text("started")
+    time.sleep(60)
+    path.write_text("finished")
+
+if __name__ == "__main__":
+    with process_pool(2) as pool:
+        for future in [pool.submit(work, Path(name)) for name in "abc"]:
+            future.result()
+"""
+
+
+def append(path, text):
+    with open(path, "a") as file:
+        file.write(f"{text} {th.get_num_threads()} {_greeting}\n")
+    return text
+
+
+_greeting = None
+
+
+def greet(text):
+    global _greeting
+    _greeting = text
+
+
+def test_tasks_start_in_order_in_workers_with_one_thread_that_were_initialised(tmp_path):
+    with process_pool(1, greet, ("hello",)) as pool:
+        futures = [pool.submit(append, tmp_path / "log", i) for i in (3, 1, 2)]
+        assert [future.result() for future in futures] == [3, 1, 2]
+    assert (tmp_path / "log").read_text() == "3 1 hello\n1 1 hello\n2 1 hello\n"
+
+
+def test_an_exception_stops_the_workers_at_once():
+    begin = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), process_pool(1) as pool:
+        futures = [pool.submit(os.getpid), *(pool.submit(time.sleep, 600) for _ in range(4))]
+        pid = futures[0].result()
+        raise KeyboardInterrupt
+    assert time.monotonic() - begin < 60
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+def test_workers_end_with_the_main_process(name, tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM)
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    # Ctrl-C in a terminal reaches the workers as well: the whole group gets the signal.
+    process = subprocess.Popen(
+        [sys.executable, script],
+        cwd=tmp_path,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    with process:
+        deadline = time.monotonic() + 120
+        while not all((tmp_path / name).exists() for name in "ab"):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        if name == "SIGINT":
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.kill()
+        # The workers hold the pipe, too: it ends when the last of them has.
+        error = process.communicate(timeout=30)[1]
+    assert error.count("Traceback") == (name == "SIGINT")
+    assert [(tmp_path / name).exists() and (tmp_path / name).read_text() for name in "abc"] == ["started"] * 2 + [False]
