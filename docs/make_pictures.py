@@ -8,7 +8,7 @@ from PIL import Image
 
 from sb3_tdpg.certificates.lava import certificate_figure
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.envs.ball_view import enlarge
+from sb3_tdpg.envs.bullet import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture

@@ -24,7 +24,7 @@ from sb3_tdpg import TDPG, TrainingCheckpointCallback
 
 ray = pytest.importorskip("ray")
 
-from sb3_tdpg.distributed.ray_vec_env import DeadActorError, RayVecEnv  # noqa: E402
+from sb3_tdpg.distributed import DeadActorError, RayVecEnv  # noqa: E402
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 N = 3  # not a multiple of the number of actors: environment 0 is in actor 0, the others are in actor 1
@@ -448,7 +448,7 @@ import os
 import gymnasium as gym
 import ray
 from stable_baselines3.common.env_util import make_vec_env
-from sb3_tdpg.distributed.ray_vec_env import RayVecEnv
+from sb3_tdpg.distributed import RayVecEnv
 
 class Polite(gym.Wrapper):
     niceness = property(lambda self: os.nice(0))
