@@ -11,13 +11,14 @@ import numpy as np
 from gymnasium import spaces
 
 from . import checks
-from .ball_scene import IMAGE_SIZE, BallScene, Renderer
+from .ball_scene import IMAGE_SIZE, BallScene
 from .base import POMDPEnv
 from .noise import NOISE_MODES, noisy_pixels
 from .textures import TRAINING_TEXTURE, load_texture
 
 if TYPE_CHECKING:
-    from .ball_bullet import SideView
+    from .ball_bullet import BulletRenderer, SideView
+    from .ball_fast import FastRenderer
 
 Range = tuple[float, float]  # lowest and highest
 PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highest (x, y)
@@ -123,7 +124,8 @@ class BallCatchEnv(POMDPEnv):
         self.observation_space = spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
         module, name = RENDERERS[renderer]
-        self._renderer: Renderer = getattr(import_module(f".{module}", __package__), name)(self.scene)
+        renderer_class = getattr(import_module(f".{module}", __package__), name)
+        self._renderer: BulletRenderer | FastRenderer = renderer_class(self.scene)
         self._view: SideView | None = None
 
     # -- the POMDP ----------------------------------------------------------------------------------------------------

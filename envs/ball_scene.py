@@ -8,7 +8,7 @@ Coordinates: x forward, y to the left, z upward; the floor is z = 0, and the cam
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -46,18 +46,6 @@ class BallScene:
     camera_height: float
     camera_pitch: float
     fov: float
-
-
-class Renderer(Protocol):
-    """Draws what the camera sees."""
-
-    def __init__(self, scene: BallScene) -> None: ...
-
-    def images(self, state: np.ndarray) -> np.ndarray:
-        """Return one image for each state: ``(N, 3, 64, 64)`` uint8 from ``(N, 5)``."""
-
-    def close(self) -> None:
-        """Release what the renderer holds."""
 
 
 def floor_texture() -> np.ndarray:

@@ -92,12 +92,11 @@ class PandaGraspEnv(POMDPEnv):
             checks.between("frame_offset", frame_offset, -0.05, 0.05, " m"),
             checks.not_negative("friction", friction),
         )
-        self.camera_range = None if camera_range is None else _checked_camera(camera_range)
-        self.camera_shift = _checked_shift(camera_shift, self.camera_range)
-        if solver_iterations is not None and not (
-            isinstance(solver_iterations, (int, np.integer)) and solver_iterations >= 1
-        ):
-            raise ValueError(f"solver_iterations={solver_iterations!r} must be None or an integer of at least 1")
+        low, high = _check_camera(camera_range, camera_shift)
+        self.camera_range = None if camera_range is None else (low, high)
+        self.camera_shift = float(camera_shift)
+        if solver_iterations is not None:
+            checks.count("solver_iterations", solver_iterations, or_none="None or ")
         self.solver_iterations = solver_iterations
         self.motion = checks.one_of("motion", motion, MOTIONS)
         self.depth_noise_std = checks.not_negative("depth_noise_std", depth_noise_std, " (it is sigma, in m)")
@@ -244,24 +243,20 @@ class PandaGraspEnv(POMDPEnv):
             getattr(self, name).close()
 
 
-def _checked_camera(camera_range: tuple[float, float]) -> tuple[float, float]:
+def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float]:
+    """Return the lowest and the highest position of the camera without the shift."""
+    limit, why = MAX_CAMERA_SHIFT, "from further away the mug is not visible"
     try:
-        low, high = (float(height) for height in camera_range)
+        low, high = map(float, (0.0, 0.0) if camera_range is None else camera_range)
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
-    if not -MAX_CAMERA_SHIFT <= low <= high <= MAX_CAMERA_SHIFT:
+    if not -limit <= low <= high <= limit:
         raise ValueError(
-            f"camera_range={camera_range} must be None or (low, high) in m, {-MAX_CAMERA_SHIFT} <= low <= high <= "
-            f"{MAX_CAMERA_SHIFT}: from further away the mug is not visible"
+            f"camera_range={camera_range} must be None or (low, high) in m, {-limit} <= low <= high <= {limit}; {why}"
+        )
+    if not (low + shift >= -limit and high + shift <= limit):
+        raise ValueError(
+            f"camera_shift={shift} with camera_range={camera_range} must leave the camera within {limit} m of its "
+            f"usual height: {why}"
         )
     return low, high
-
-
-def _checked_shift(camera_shift: float, camera_range: tuple[float, float] | None) -> float:
-    low, high = camera_range or (0.0, 0.0)
-    if not (low + camera_shift >= -MAX_CAMERA_SHIFT and high + camera_shift <= MAX_CAMERA_SHIFT):
-        raise ValueError(
-            f"camera_shift={camera_shift} with camera_range={camera_range} must leave the camera within "
-            f"{MAX_CAMERA_SHIFT} m of its usual height: from further away the mug is not visible"
-        )
-    return float(camera_shift)

@@ -23,11 +23,8 @@ SIZE = 128  # S: 6.25 cm a texel on the wall, about a fifth of a pixel of the ca
 Pattern = Callable[[np.random.Generator], np.ndarray]  # draws a tileable picture (S, S), values in [0, 1]
 
 
-def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of each texel, as fractions of a side."""
-    fraction = (np.arange(SIZE) + 0.5) / SIZE
-    rows, columns = np.meshgrid(fraction, fraction, indexing="ij")
-    return rows, columns
+# Row and column of each texel, as fractions of a side.
+ROWS, COLUMNS = np.meshgrid(*[(np.arange(SIZE) + 0.5) / SIZE] * 2, indexing="ij")
 
 
 def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
@@ -41,35 +38,32 @@ def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
 def bricks(rng: np.random.Generator) -> np.ndarray:
     """Running bond: 8 courses of 4 bricks (1 m x 2 m each), every brick of its own shade, light mortar."""
     courses, per_course, mortar = 8, 4, 2 * 8 / SIZE  # the joint as a fraction of a course
-    rows, columns = _grid()
-    course = (rows * courses).astype(int)
-    along = columns * per_course + 0.5 * (course % 2)
+    course = (ROWS * courses).astype(int)
+    along = COLUMNS * per_course + 0.5 * (course % 2)
     brick = along.astype(int) % per_course
     shade = 0.55 * rng.random((courses, per_course))[course, brick]
-    joint = (rows * courses % 1 < mortar) | (along % 1 < mortar * per_course / courses)
+    joint = (ROWS * courses % 1 < mortar) | (along % 1 < mortar * per_course / courses)
     return np.where(joint, 1.0, shade)
 
 
 def tiles(rng: np.random.Generator) -> np.ndarray:
     """A chequerboard of squares with unequal shades."""
     per_side = 2 * int(rng.integers(2, 5))
-    rows, columns = ((axis * per_side).astype(int) for axis in _grid())
+    rows, columns = ((axis * per_side).astype(int) for axis in (ROWS, COLUMNS))
     return 0.3 * rng.random((per_side, per_side))[rows, columns] + 0.7 * ((rows + columns) % 2)
 
 
 def stripes(rng: np.random.Generator) -> np.ndarray:
     """Straight stripes: vertical, horizontal or slanted."""
     number, slant = int(rng.integers(3, 7)), int(rng.integers(-2, 3))
-    rows, columns = _grid()
-    if rng.random() < 0.5:
-        rows, columns = columns, rows
+    rows, columns = (COLUMNS, ROWS) if rng.random() < 0.5 else (ROWS, COLUMNS)
     return 0.5 + 0.5 * np.sin(2 * np.pi * (number * columns + slant * rows))
 
 
 def dots(rng: np.random.Generator) -> np.ndarray:
     """Round dots, each row shifted by half a distance."""
     per_side = 2 * int(rng.integers(2, 4))
-    rows, columns = (axis * per_side for axis in _grid())
+    rows, columns = ROWS * per_side, COLUMNS * per_side
     columns = columns + 0.5 * (rows.astype(int) % 2)
     radius = 0.28 + 0.1 * rng.random()
     return (np.hypot(rows % 1 - 0.5, columns % 1 - 0.5) < radius).astype(float)
@@ -78,11 +72,10 @@ def dots(rng: np.random.Generator) -> np.ndarray:
 def planks(rng: np.random.Generator) -> np.ndarray:
     """Vertical boards of unequal shades with a grain and dark gaps."""
     number = int(rng.integers(6, 11))
-    _, columns = _grid()
-    board = (columns * number).astype(int)
+    board = (COLUMNS * number).astype(int)
     grain = np.roll(_noise(rng, 6.0), rng.integers(SIZE), axis=0)
     shade = 0.35 + 0.45 * rng.random(number)[board] + 0.2 * grain
-    return np.where(columns * number % 1 < 0.12, 0.0, shade)
+    return np.where(COLUMNS * number % 1 < 0.12, 0.0, shade)
 
 
 def blobs(rng: np.random.Generator) -> np.ndarray:
@@ -92,8 +85,7 @@ def blobs(rng: np.random.Generator) -> np.ndarray:
 
 def waves(rng: np.random.Generator) -> np.ndarray:
     """Horizontal bands that a smooth noise bends, as in marble."""
-    rows, _ = _grid()
-    return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * rows + 1.2 * _noise(rng, 2.0)))
+    return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * ROWS + 1.2 * _noise(rng, 2.0)))
 
 
 def speckles(rng: np.random.Generator) -> np.ndarray:

@@ -88,7 +88,8 @@ class EnvActor:
 
     def close(self) -> tuple[None, None]:
         """Close the environments."""
-        return None, self._env.close()
+        self._env.close()
+        return None, None
 
 
 class RayVecEnv(VecEnv):
@@ -172,7 +173,7 @@ class RayVecEnv(VecEnv):
             config = {} if "RAY_worker_niceness" in os.environ else {"worker_niceness": 0}
             n_cpus = max(1, math.ceil(n_actors * num_cpus))
             local = dict(address="local", num_cpus=n_cpus, include_dashboard=False, _system_config=config)
-            ray.init(**(local if is_local else {}))
+            self._ray.init(**(local if is_local else {}))
         RayVecEnv._n_users += 1
 
     def _wait_for_start(self) -> tuple[gym.Space, gym.Space]:
@@ -256,8 +257,8 @@ class RayVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Wait for the result of the step; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
         parts, rests = self._receive_all(self._replies)
-        rewards, dones, infos, reset_infos = zip(*rests, strict=True)
-        infos = list(itertools.chain(*infos))
+        rewards, dones, infos_of_actors, reset_infos = zip(*rests, strict=True)
+        infos = list(itertools.chain(*infos_of_actors))
         for info, observation in zip(infos, self._last_observations, strict=True):
             if info.get("episode_lost"):
                 info["terminal_observation"] = observation
@@ -268,7 +269,8 @@ class RayVecEnv(VecEnv):
         """Join the observations of all actors, ``(B, *obs)`` each."""
         space = self.observation_space
         self._last_observations = list(itertools.chain(*(iterate(batch_space(space), part) for part in parts)))
-        return concatenate(space, self._last_observations, create_empty_array(space, self.num_envs))
+        out: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, self._last_observations, out)
 
     def close(self) -> None:
         """Close the environments and end the actors; closing twice is fine."""
@@ -277,7 +279,8 @@ class RayVecEnv(VecEnv):
         self._is_closed = True
         if self._ray.is_initialized() and self._actors:
             replies = [self._send(i, "close")[1] for i in range(len(self._actors))]
-            self._ray.wait(replies, num_returns=len(replies), timeout=CLOSE_TIMEOUT)
+            has_started = hasattr(self, "num_envs")  # otherwise an actor may still wait for its CPUs
+            self._ray.wait(replies, num_returns=len(replies), timeout=CLOSE_TIMEOUT if has_started else 0)
             for actor in self._actors:
                 self._ray.kill(actor)
         RayVecEnv._n_users -= 1
