@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.envs.ball_view import enlarge
+from sb3_tdpg.envs.bullet import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture

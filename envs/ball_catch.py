@@ -1,4 +1,4 @@
-"""The ball-catching problem (Section IV-B of the paper): be where the ball lands, with a camera as the only sensor."""
+"""The ball-catching problem (Section IV-B of the paper): a camera is the only sensor."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from .ball_scene import IMAGE_SIZE, BallScene, Renderer
+from . import checks
+from .ball_scene import IMAGE_SIZE, BallScene
 from .base import POMDPEnv
 from .noise import NOISE_MODES, noisy_pixels
 from .textures import TRAINING_TEXTURE, load_texture
 
 if TYPE_CHECKING:
-    from .ball_view import SideView
+    from .ball_bullet import BulletRenderer, SideView
+    from .ball_fast import FastRenderer
 
 Range = tuple[float, float]  # lowest and highest
 PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highest (x, y)
@@ -28,10 +30,10 @@ NOISE_CHUNK = 64  # images to which noise is added at once: bounds the memory
 
 class BallCatchEnv(POMDPEnv):
     r"""
-    Drive along a line to where the ball lands, in front of a brick wall.
+    Drive along a line, in front of a brick wall, to the place where a ball lands.
 
     State ``x = (d, b_x, b_y, v_x, v_y)``: the robot's position, the ball's position (``b_y`` is its height) and its
-    velocity, in m and m/s. Observation ``y``: what a camera on the robot sees, uint8 ``(3, 64, 64)``. Action ``u``:
+    velocity, in m and m/s. Observation ``y``: the image of a camera on the robot, uint8 ``(3, 64, 64)``. Action ``u``:
     the robot's speed in m/s. With ``T = 25`` controls,
 
     .. math::
@@ -39,15 +41,15 @@ class BallCatchEnv(POMDPEnv):
         b_{t+1} = b_t + \Delta t\, v_t, \qquad v_{t+1} = v_t - (0, \Delta t\, g), \\
         c_t &= 0.01\, |u_t|, \qquad c_T = 100\, |d_T - b^x_T|.
 
-    The defaults are the paper's text. The published numbers fit another reading better:
+    The defaults follow the paper's text. Another definition fits the published numbers better:
     ``BallCatchEnv(**sb3_tdpg.envs.scenarios.BALL_PUBLISHED_READING)``.
 
     :param control_gain: The robot moves by ``control_gain * u`` a step; ``None``: by ``dt * u``.
     :param dt: Time step in s.
     :param gravity: In m/s^2.
     :param horizon: Number of controls T.
-    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, SB3 needs bounds:
-        a large one, since an action beyond its bound gives no gradient. The task needs about 2 m/s.
+    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, but SB3 needs
+        bounds; it is large because an action beyond the bound gives no gradient. The task needs about 2 m/s.
     :param robot_range: The robot starts uniformly in ``(low, high)``, in m.
     :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m; the paper's
         is one point.
@@ -57,17 +59,16 @@ class BallCatchEnv(POMDPEnv):
     :param camera_height: Above the floor, in m.
     :param camera_pitch: Upward tilt in degrees, between -90 and 90.
     :param fov: The camera's field of view in degrees.
-    :param texture: What is on the wall: a built-in name, ``"random-<seed>"``, the path of an image file, or an
-        array; see :func:`~sb3_tdpg.envs.textures.load_texture`.
-    :param pixel_noise_std: Standard deviation of the noise that is added to every pixel of an image with values in
-        [0, 1]; 0: the image is left alone.
-    :param noise_mode: What is done with values outside [0, 1] then. ``"minmax"``, as in the paper: of each image its
-        minimum is subtracted, and it is divided by its maximum. ``"clip"``: they are cut off.
-    :param wall_stands_still: For diagnosis: the wall, the sky and the floor's edge look always as from d = 0, and only
-        the ball tells where the robot is.
+    :param texture: The wall's texture: a built-in name, ``"random-<seed>"``, the path of an image file, or an array;
+        see :func:`~sb3_tdpg.envs.textures.load_texture`.
+    :param pixel_noise_std: Standard deviation of the noise on every pixel of an image with values in [0, 1].
+    :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``; see
+        :func:`~sb3_tdpg.envs.noise.noisy_pixels`.
+    :param wall_stands_still: For diagnosis: wall, sky and floor always look as from d = 0, and only the ball shows
+        where the robot is.
     :param renderer: ``"pybullet"``, the reference (1 ms an image), or ``"fast"``, a batched ray caster that agrees
         with it in 99.8 % of the pixels.
-    :param render_mode: ``None``, ``"rgb_array"`` (the scene from the side, beside the camera's image) or ``"human"``
+    :param render_mode: ``None``, ``"rgb_array"`` (the scene from the side and the camera's image) or ``"human"``
         (PyBullet's window).
     """
 
@@ -98,39 +99,33 @@ class BallCatchEnv(POMDPEnv):
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=horizon, render_mode=render_mode)
-        self.dt = _positive("dt", dt)
-        self.control_gain = self.dt if control_gain is None else _positive("control_gain", control_gain)
-        self.gravity = _finite("gravity", gravity)
-        max_action = _positive("max_action", max_action)
-        self.robot_range = _range("robot_range", robot_range, "(low, high)", (2,))
+        self.dt = checks.positive("dt", dt)
+        self.control_gain = self.dt if control_gain is None else checks.positive("control_gain", control_gain)
+        self.gravity = checks.finite("gravity", gravity)
+        max_action = checks.positive("max_action", max_action)
+        self.robot_range = checks.low_high("robot_range", robot_range)
         corners = "((low_x, low_y), (high_x, high_y))"
-        self.ball_start_range = _range("ball_start_range", ball_start_range, corners, (2, 2))
-        self.ball_speed_range = _range("ball_speed_range", ball_speed_range, corners, (2, 2))
-        if not (np.isfinite(pixel_noise_std) and pixel_noise_std >= 0):
-            raise ValueError(
-                f"pixel_noise_std={pixel_noise_std} must be finite and not negative (it is sigma, for pixels in [0, 1])"
-            )
-        if noise_mode not in NOISE_MODES:
-            raise ValueError(f"noise_mode={noise_mode!r} must be one of {list(NOISE_MODES)}")
-        if renderer not in RENDERERS:
-            raise ValueError(f"renderer={renderer!r} must be one of {list(RENDERERS)}")
-        self.pixel_noise_std = float(pixel_noise_std)
-        self.noise_mode = noise_mode
+        self.ball_start_range = checks.low_high("ball_start_range", ball_start_range, corners, (2, 2))
+        self.ball_speed_range = checks.low_high("ball_speed_range", ball_speed_range, corners, (2, 2))
+        sigma = " (it is sigma, for pixels in [0, 1])"
+        self.pixel_noise_std = checks.not_negative("pixel_noise_std", pixel_noise_std, sigma)
+        self.noise_mode = checks.one_of("noise_mode", noise_mode, NOISE_MODES)
+        self.renderer = checks.one_of("renderer", renderer, RENDERERS)
         self.wall_stands_still = wall_stands_still
         self.scene = BallScene(
             texture=load_texture(texture),
             ball_color=_color(ball_color),
-            ball_radius=_positive("ball_radius", ball_radius),
-            camera_height=_positive("camera_height", camera_height),
-            camera_pitch=_between("camera_pitch", camera_pitch, -90.0, 90.0),
-            fov=_between("fov", fov, 0.0, 180.0),
+            ball_radius=checks.positive("ball_radius", ball_radius),
+            camera_height=checks.positive("camera_height", camera_height),
+            camera_pitch=checks.between("camera_pitch", camera_pitch, -90.0, 90.0, " degrees", strict=True),
+            fov=checks.between("fov", fov, 0.0, 180.0, " degrees", strict=True),
         )
         self.state_space = spaces.Box(-np.inf, np.inf, (5,), np.float64)
         self.observation_space = spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
         module, name = RENDERERS[renderer]
-        self.renderer = renderer
-        self._renderer: Renderer = getattr(import_module(f".{module}", __package__), name)(self.scene)
+        renderer_class = getattr(import_module(f".{module}", __package__), name)
+        self._renderer: BulletRenderer | FastRenderer = renderer_class(self.scene)
         self._view: SideView | None = None
 
     # -- the POMDP ----------------------------------------------------------------------------------------------------
@@ -144,22 +139,15 @@ class BallCatchEnv(POMDPEnv):
 
     def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         d, ball_x, ball_y, speed_x, speed_y = state.T
-        return np.stack(
-            [
-                d + self.control_gain * action[:, 0],
-                ball_x + self.dt * speed_x,
-                ball_y + self.dt * speed_y,
-                speed_x,
-                speed_y - self.dt * self.gravity,
-            ],
-            axis=1,
-        )
+        next_d = d + self.control_gain * action[:, 0]
+        next_x, next_y = ball_x + self.dt * speed_x, ball_y + self.dt * speed_y
+        return np.stack([next_d, next_x, next_y, speed_x, speed_y - self.dt * self.gravity], axis=1)
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
         return self._with_noise(self._renderer.images(self._seen_from(state)), self.np_random)
 
     def _seen_from(self, state: np.ndarray) -> np.ndarray:
-        """Return the state whose image is shown."""
+        """Return the state that the camera image shows."""
         if not self.wall_stands_still:
             return state
         shown = state.copy()
@@ -173,7 +161,7 @@ class BallCatchEnv(POMDPEnv):
         return 100.0 * np.abs(state[:, 0] - state[:, 1])
 
     def _with_noise(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Add pixel noise to images, ``(N, 3, 64, 64)``, and bring them back to [0, 1]."""
+        """Add pixel noise to images, ``(N, 3, 64, 64)``."""
         if self.pixel_noise_std == 0:
             return images
         for start in range(0, len(images), NOISE_CHUNK):
@@ -186,24 +174,22 @@ class BallCatchEnv(POMDPEnv):
 
     def render(self) -> np.ndarray | None:
         """
-        Draw the scene from the side, beside the camera's image: ``(256, 772, 3)`` uint8; or move it in the window.
+        Draw the scene from the side and the camera's image, ``(256, 772, 3)`` uint8, or update PyBullet's window.
 
-        The pixel noise in the picture has the distribution of the observation's, but is drawn anew, so that drawing
-        does not change an episode.
+        The pixel noise in the picture is a new sample, so that rendering does not change an episode.
         """
         if self.render_mode is None:
             return None
-        if self._state is None:
-            raise ValueError("there is nothing to render before the first reset()")
+        state = self._current_state()
         if self._view is None:
-            from .ball_view import SideView
+            from .ball_bullet import SideView
 
             self._view = SideView(self.scene, gui=self.render_mode == "human")
-        self._view.place(self._state[0])
+        self._view.place(state[0])
         if self.render_mode == "human":
             time.sleep(self.dt)
             return None
-        images = self._renderer.images(self._seen_from(self._state))
+        images = self._renderer.images(self._seen_from(state))
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)
 
@@ -212,34 +198,6 @@ class BallCatchEnv(POMDPEnv):
         self._renderer.close()
         if self._view is not None:
             self._view.close()
-
-
-# -- checks of the keywords -------------------------------------------------------------------------------------------
-
-
-def _finite(name: str, value: float) -> float:
-    if not np.isfinite(value):
-        raise ValueError(f"{name}={value} must be finite")
-    return float(value)
-
-
-def _positive(name: str, value: float) -> float:
-    if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name}={value} must be finite and positive")
-    return float(value)
-
-
-def _between(name: str, value: float, low: float, high: float) -> float:
-    if not low < value < high:
-        raise ValueError(f"{name}={value} must be between {low:g} and {high:g} degrees")
-    return float(value)
-
-
-def _range(name: str, value: Any, form: str, shape: tuple[int, ...]) -> np.ndarray:
-    low_high = np.asarray(value, dtype=np.float64)
-    if low_high.shape != shape or not np.isfinite(low_high).all() or (low_high[0] > low_high[1]).any():
-        raise ValueError(f"{name}={value} must be {form} of finite numbers, low <= high")
-    return low_high
 
 
 def _color(value: Any) -> tuple[float, float, float]:

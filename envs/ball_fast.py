@@ -1,13 +1,13 @@
 """
-The picture of the ball-catching camera in NumPy: the scene of PyBullet's TinyRenderer, all images in one call.
+A batched ray caster in NumPy that draws the ball-catching scene as PyBullet's TinyRenderer does.
 
-A ray caster that agrees with the reference in 99.8 % of the pixels and is tens of times faster. What it rests on:
+It agrees with TinyRenderer in 99.8 % of the pixels and is 65 times as fast, because:
 
 - A pixel's ray goes through its corner, not its centre.
-- The camera does not turn about the vertical, so that in a row of pixels depth and height on floor and wall are
-  constant. The rows of an image are sky, wall or floor as a whole, and only the ball is drawn pixel by pixel.
-- A texture's nearest texel counts, and a surface has one brightness, which is multiplied into its texels once.
-- TinyRenderer's sphere is a mesh inside the sphere: what is seen is a sphere of 0.965 times the radius.
+- The camera does not turn about the vertical, so that depth and height on floor and wall are constant in a row of
+  pixels. Each row of an image is sky, wall or floor; only the ball is drawn pixel by pixel.
+- Textures are not interpolated, and a flat surface has one brightness, which is multiplied into its texels once.
+- TinyRenderer's sphere is a mesh inside the sphere: it looks like a sphere of 0.965 times the radius.
 
 Dimension key: N images, K side of the window around a ball; images are ``(N, 3, 64, 64)``.
 """
@@ -33,7 +33,7 @@ from .ball_scene import (
     floor_texture,
 )
 
-MESH_RADIUS = 0.965  # what is seen of a sphere mesh, as a fraction of its radius
+MESH_RADIUS = 0.965  # visible radius of a sphere mesh, as a fraction of its radius
 WINDOWS = (4, 8, 16, 32, IMAGE_SIZE)  # K
 CHUNK = 64  # images whose walls are drawn at once
 WINDOW_PIXELS = 12_800  # pixels of balls drawn at once
@@ -43,7 +43,7 @@ TO_LIGHT = LIGHT / np.linalg.norm(LIGHT)
 
 
 def brightness(towards_light: np.ndarray, upward: np.ndarray) -> np.ndarray:
-    """Factor on a texel, from the normal's component towards the light and its upward one; see :mod:`.ball_scene`."""
+    """Compute the factor on a texel from the normal's components towards the light and upward."""
     reflected_up = 2 * upward * towards_light - TO_LIGHT[2]
     return AMBIENT + DIFFUSE * np.maximum(towards_light, 0) + SPECULAR * np.maximum(reflected_up, 0) ** 2
 
@@ -54,7 +54,7 @@ def shade(texture: np.ndarray, normal: tuple[float, float, float]) -> np.ndarray
 
 
 def pack(colours: np.ndarray) -> np.ndarray:
-    """Make one number ``(...)`` uint32 of each colour ``(..., 3)`` uint8: one look-up in place of three. Red is low."""
+    """Pack each colour, ``(..., 3)`` uint8, into one uint32 (red lowest), so that one look-up replaces three."""
     red, green, blue = np.moveaxis(colours.astype(np.uint32), -1, 0)
     return red | green << np.uint32(8) | blue << np.uint32(16)
 
@@ -93,7 +93,7 @@ class FastRenderer:
         self._up = np.array([-np.sin(pitch), np.cos(pitch)])
 
     def _prepare_wall(self) -> None:
-        """Shade the texture, and find the texture coordinates that a ray has on a wall 1 m ahead."""
+        """Shade the texture, and compute the texture coordinates of each ray on a wall 1 m ahead."""
         shaded = shade(self.scene.texture, (-1.0, 0.0, 0.0))
         self._texels_v, self._texels_u = shaded.shape[:2]
         # u (upward) is the slow index, v (to the left) the fast one.
@@ -144,7 +144,7 @@ class FastRenderer:
         return images
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there is nothing to release."""
 
     # -- wall ---------------------------------------------------------------------------------------------------------
 

@@ -1,28 +1,28 @@
 """
-What the ball-catching camera sees, as data: one description for every renderer.
+The ball-catching scene as data, for every renderer.
 
-Coordinates: x forward, y to the left, z upward; the floor is z = 0 and the camera stands at (d, 0, camera_height),
-looking along +x. Lengths are in metres.
+Coordinates: x forward, y to the left, z upward; the floor is z = 0, and the camera at (d, 0, camera_height) looks along
++x. Lengths are in metres.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 IMAGE_SIZE = 64  # pixels a side
 NEAR, FAR = 0.1, 20.0  # depth beyond which nothing is drawn; FAR cuts the top of the wall to white sky
 
-# A plane is a square mesh with half a side of 15 m and 15 copies of its texture a side, as PyBullet's plane had in
-# 2020. (The one of PyBullet 3.2.7 shifts the texture by half a copy.) The wall is four times as large.
+# A plane is a square mesh, 30 m and 15 copies of its texture a side, like PyBullet's plane in 2020. (That of PyBullet
+# 3.2.7 shifts the texture by half a copy.) The wall is four times as large.
 PLANE_HALF, PLANE_COPIES = 15.0, 15
 WALL_SCALE = 4.0
 WALL_X, WALL_CENTRE_Z = 10.0, 42.0
 
-# PyBullet's default light: a pixel is texel * (ambient + diffuse * max(0, n.l) + specular * max(0, r_z)^2), where n is
-# the normal, l the direction to the light and r that of its reflection.
+# PyBullet's default light: a pixel is texel * (ambient + diffuse * max(0, n.l) + specular * max(0, r_z)^2) with the
+# normal n, the direction l to the light and that of its reflection, r.
 LIGHT = np.array([-50.0, 30.0, 100.0])
 AMBIENT, DIFFUSE, SPECULAR = 0.6, 0.35, 0.05
 
@@ -46,18 +46,6 @@ class BallScene:
     camera_height: float
     camera_pitch: float
     fov: float
-
-
-class Renderer(Protocol):
-    """Draws what the camera sees."""
-
-    def __init__(self, scene: BallScene) -> None: ...
-
-    def images(self, state: np.ndarray) -> np.ndarray:
-        """Return one image for each state: ``(N, 3, 64, 64)`` uint8 from ``(N, 5)``."""
-
-    def close(self) -> None:
-        """Release what the renderer holds."""
 
 
 def floor_texture() -> np.ndarray:

@@ -13,6 +13,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from . import checks
+
 
 class BatchStep(NamedTuple):
     """What one step of N episodes returns."""
@@ -20,20 +22,20 @@ class BatchStep(NamedTuple):
     state: np.ndarray  # (N, X), x_{t+1}
     observation: np.ndarray  # (N, *obs), y_{t+1}
     cost: np.ndarray  # (N,), c_t, plus c_T on the last step
-    details: Sequence[Mapping[str, Any]] = ()  # N of them, or none: what else stands in the info of the step
+    details: Sequence[Mapping[str, Any]] = ()  # N of them, or none: further entries for the info of the step
 
 
 class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     """
     A finite-horizon POMDP (Section II of the paper) as a Gymnasium environment.
 
-    A subclass sets ``horizon``, ``state_space``, ``observation_space`` and ``action_space`` and writes the five
-    methods of the model, each for N episodes at once: :meth:`_initial_state`, :meth:`_dynamics`, :meth:`_sensor`,
-    :meth:`_cost`, :meth:`_terminal_cost`. Everything random must draw from ``self.np_random``.
+    A subclass sets ``state_space``, ``observation_space`` and ``action_space`` and implements five methods, each for N
+    episodes at once: :meth:`_initial_state`, :meth:`_dynamics`, :meth:`_sensor`, :meth:`_cost`, :meth:`_terminal_cost`.
+    All random numbers must come from ``self.np_random``.
 
-    This class turns them into ``reset``/``step`` for one episode; :class:`sb3_tdpg.vec_env.BatchedVecEnv` turns the
-    same methods into an SB3 ``VecEnv`` for many. The end of the horizon is ``terminated=True``: it is part of the
-    problem, so that nothing bootstraps there. The reward is the negative cost, negated here and nowhere else.
+    This class turns them into ``reset``/``step`` for one episode; :class:`sb3_tdpg.vec_env.BatchedVecEnv` turns them
+    into an SB3 ``VecEnv`` for many. The end of the horizon is ``terminated=True``: it is part of the problem, so that
+    algorithms do not bootstrap there. The reward is the negative cost; only this class negates it.
 
     ``info["state"]`` holds a copy of the true state (after ``reset`` x_0, after ``step`` x_{t+1}), ``info["cost"]``
     the cost of the step. A subclass may add to the info of a step by :meth:`_details`.
@@ -45,19 +47,15 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
-    #: Optional: what each component of the state is called in figures, with its unit: ``("d (m)", "v (m/s)")``.
+    #: Optional: names of the state's components in figures, with units: ``("d (m)", "v (m/s)")``.
     state_names: tuple[str, ...]
-    #: Whether the constructor has a keyword ``n_processes``: how many share the work of a batch.
+    #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
     shares_work: bool = False
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
-        if not (isinstance(horizon, (int, np.integer)) and horizon >= 1):
-            raise ValueError(
-                f"horizon={horizon!r} must be an integer of at least 1: the number of controls in an episode"
-            )
+        self.horizon = checks.count("horizon", horizon, ": the number of controls in an episode")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} must be None or one of {self.metadata['render_modes']}")
-        self.horizon = int(horizon)
         self.render_mode = render_mode
         self._state: np.ndarray | None = None  # (1, X)
         self._time = 0
@@ -83,8 +81,14 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         """c_T(x_T): ``(N,)``."""
 
     def _details(self) -> Sequence[Mapping[str, Any]]:
-        """Tell more of what the last :meth:`_dynamics` did, for the info of each of its N episodes; or nothing."""
+        """Return further entries for the info of each episode of the last :meth:`_dynamics`, or nothing."""
         return ()
+
+    def _current_state(self) -> np.ndarray:
+        """Return the state to render, ``(1, X)``."""
+        if self._state is None:
+            raise ValueError("there is nothing to render before the first reset()")
+        return self._state
 
     def reset_batch(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Start N episodes; return x_0 ``(N, X)`` and y_0 ``(N, *obs)``."""
@@ -96,15 +100,14 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         Advance N episodes by one control.
 
         :param state: x_t, ``(N, X)``
-        :param action: u_t, ``(N, U)``; clipped to the action space, as every SB3 algorithm does, too
+        :param action: u_t, ``(N, U)``; it is clipped to the action space
         :param is_last: Whether this is control T - 1, so that the terminal cost is due.
         :raises ValueError: if an action is NaN or infinite.
         """
         if not np.all(np.isfinite(action)):
+            bad = action[~np.isfinite(action).all(-1)][0]
             raise ValueError(
-                f"{type(self).__name__} received an action that is not finite: "
-                f"{action[~np.isfinite(action).all(-1)][0]}; "
-                "the policy that produced it has probably diverged"
+                f"{type(self).__name__} received an action that is not finite: {bad}; the policy has probably diverged"
             )
         box = self.action_space
         assert isinstance(box, spaces.Box)

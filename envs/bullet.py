@@ -1,4 +1,4 @@
-"""A connection to a Bullet world of one's own, with PyBullet's functions bound to it."""
+"""A connection to a Bullet world of its own, and what all pictures of such a world share."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ import numpy as np
 import pybullet
 from PIL import Image
 
+UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
+
 
 class BulletClient:
     """
     One Bullet world. ``client.createMultiBody(...)`` is ``pybullet.createMultiBody(..., physicsClientId=...)``.
 
-    Several clients live side by side and do not see each other's bodies. A client is closed once: by :meth:`close`,
-    or else when it is garbage-collected, or else when Python exits.
+    Several clients exist side by side and do not see each other's bodies. A client is closed by :meth:`close`, by
+    garbage collection, or when Python exits.
 
-    :param gui: Open PyBullet's window in place of a world without one. A process can have one such window.
+    :param gui: Open PyBullet's window; a process can have one.
     :raises RuntimeError: if there is no display for the window, or no connection is left.
     """
 
@@ -47,7 +49,7 @@ class BulletClient:
         return bool(self._close.alive)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # also keeps copy and pickle from asking for what __init__ has not set yet
+        if name.startswith("_"):  # copy and pickle ask before __init__ has run
             raise AttributeError(name)
         attribute = getattr(pybullet, name)
         if not callable(attribute):
@@ -58,16 +60,40 @@ class BulletClient:
 
     def upload_texture(self, image: np.ndarray) -> int:
         """
-        Hand over an image, ``(H, W, 3)`` uint8, and return its texture id.
+        Upload an image, ``(H, W, 3)`` uint8, and return its texture id.
 
-        PyBullet reads textures from files only. The file is written as RGB, since its renderer takes a grey one for
-        something else.
+        PyBullet reads textures from files only, and misreads grey ones: the file is RGB.
         """
         with tempfile.TemporaryDirectory(prefix="sb3_tdpg_") as folder:
             path = os.path.join(folder, "texture.png")
             Image.fromarray(image).save(path)
             return int(self.loadTexture(path))
 
+    def picture(self, height: int, width: int, **camera: Any) -> np.ndarray:
+        """
+        Draw the world with TinyRenderer: ``(height, width, 3)`` uint8.
+
+        :param camera: Keywords of ``getCameraImage``.
+        """
+        rgba = self.getCameraImage(width, height, renderer=pybullet.ER_TINY_RENDERER, **camera)[2]
+        return np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+
+    def show_window(self, distance: float, yaw: float, pitch: float, target: tuple[float, float, float]) -> None:
+        """Point the camera of PyBullet's window."""
+        self.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)
+        self.resetDebugVisualizerCamera(distance, yaw, pitch, target)
+
     def close(self) -> None:
         """Close the world; later calls do nothing."""
         self._close()
+
+
+def enlarge(image: np.ndarray, factor: int) -> np.ndarray:
+    """Repeat every pixel of an image ``(H, W, 3)``."""
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def beside(scene: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Put a picture of the scene and an enlarged observation side by side; images are ``(H, W, 3)`` uint8."""
+    gap = np.full((len(scene), 4, 3), 255, np.uint8)
+    return np.concatenate([scene, gap, enlarge(seen, len(scene) // len(seen))], axis=1)

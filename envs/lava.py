@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from . import checks
 from .base import POMDPEnv
 
 WALL = 0.0  # m
@@ -17,7 +18,7 @@ GOAL = np.array([3.0, 0.0])  # m, m/s
 
 class LavaEnv(POMDPEnv):
     r"""
-    Reach ``d = 3 m`` and stand still, without falling into the lava at ``d = 5 m``.
+    Reach ``d = 3 m`` and stop there, without falling into the lava at ``d = 5 m``.
 
     State ``x = (d, v)``: distance from the wall in metres, velocity in metres a step. Observation
     ``y ~ N(x, sensor_noise_std^2 I)``. Action ``u``: the change of velocity. With ``T = 5`` controls,
@@ -26,23 +27,22 @@ class LavaEnv(POMDPEnv):
         x_{t+1} = (d_t + v_t,\ v_t + u_t), \qquad
         c_t = \lVert x_t - g \rVert, \qquad c_T = 100 \lVert x_T - g \rVert, \qquad g = (3, 0).
 
-    A robot that would pass the wall stops there with ``v = 0``: the control of that step is lost. A robot that passes
-    5 m is in the lava and stays at ``(5, 0)`` for ever. It starts with ``v = 0`` and ``d`` uniform in [0, 5] m.
+    The robot starts with ``v = 0`` and ``d`` uniform in [0, 5] m. The wall stops it, ``v = 0``, and cancels the control
+    of that step. A robot that passes 5 m is in the lava and stays at ``(5, 0)`` for ever.
 
-    The defaults are the paper's text. The numbers in the paper's Table I fit another reading better:
+    The defaults follow the paper's text. Another cost definition fits the numbers of Table I better:
     ``LavaEnv(**sb3_tdpg.envs.scenarios.LAVA_TABLE_READING)``.
 
     :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
-    :param sensor_bias: Added to every observation, in m and m/s; ``None``: nothing.
+    :param sensor_bias: Added to every observation, in m and m/s.
     :param start_beta: ``(a, b)``: the robot starts at 5 m times a number from the Beta(a, b) distribution; ``None``:
-        uniformly, as (1, 1) would.
-    :param action_cost: Weight of ``|u_t|`` in the stage cost (0 in the text, 1 in the table's reading).
+        uniformly, as with (1, 1).
+    :param action_cost: Weight of ``|u_t|`` in the stage cost (0 in the text, 1 in the table's definition).
     :param lava_stage_cost: Stage cost once in the lava; ``None``: the distance to the goal, which is 2 there.
     :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
     :param horizon: Number of controls T.
-    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, SB3 needs
-        bounds: a large one, since the cost does not depend on how far beyond its bound an action lies and gives no
-        gradient there.
+    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, but SB3 needs
+        bounds; it is large because an action beyond the bound gives no gradient.
     :param render_mode: ``None`` or ``"rgb_array"``.
     """
 
@@ -63,26 +63,21 @@ class LavaEnv(POMDPEnv):
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=horizon, render_mode=render_mode)
-        if not (np.isfinite(sensor_noise_std) and sensor_noise_std >= 0):
-            raise ValueError(
-                f"sensor_noise_std={sensor_noise_std} must be finite and not negative (it is sigma, not sigma^2)"
-            )
+        sigma = " (it is sigma, not sigma^2)"
+        self.sensor_noise_std = checks.not_negative("sensor_noise_std", sensor_noise_std, sigma)
         if sensor_bias is not None and not (np.shape(sensor_bias) == (2,) and np.isfinite(sensor_bias).all()):
             raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, of m and m/s, or None")
         if start_beta is not None and not (
             np.shape(start_beta) == (2,) and np.isfinite(start_beta).all() and min(start_beta) > 0
         ):
             raise ValueError(f"start_beta={start_beta!r} must be two positive numbers, for instance (2, 1), or None")
-        if not (np.isfinite(max_action) and max_action > 0):
-            raise ValueError(f"max_action={max_action} must be finite and positive")
-        for name, value in (("action_cost", action_cost), ("lava_stage_cost", lava_stage_cost),
-                            ("lava_terminal_cost", lava_terminal_cost)):  # fmt: skip
-            if value is not None and not np.isfinite(value):
-                raise ValueError(f"{name}={value} must be finite")
-        self.sensor_noise_std = float(sensor_noise_std)
+        max_action = checks.positive("max_action", max_action)
+        for name, value in dict(lava_stage_cost=lava_stage_cost, lava_terminal_cost=lava_terminal_cost).items():
+            if value is not None:
+                checks.finite(name, value)
         self.sensor_bias = None if sensor_bias is None else np.array(sensor_bias, dtype=np.float64)
         self.start_beta = None if start_beta is None else (float(start_beta[0]), float(start_beta[1]))
-        self.action_cost = float(action_cost)
+        self.action_cost = checks.finite("action_cost", action_cost)
         self.lava_stage_cost = lava_stage_cost
         self.lava_terminal_cost = lava_terminal_cost
         self.state_space = spaces.Box(np.array([WALL, -np.inf]), np.array([LAVA, np.inf]), dtype=np.float64)
@@ -92,10 +87,10 @@ class LavaEnv(POMDPEnv):
     @property
     def cost_bound(self) -> float:
         """
-        What the cost of no episode can exceed.
+        Upper bound on the cost of an episode.
 
-        A robot that has not been stopped went from one place in [0, 5] m to another in the last step, so that its speed
-        was at most 5 m a step, and one control later it is at most that and ``max_action``.
+        A robot that is neither at the wall nor in the lava moved within [0, 5] m in the last step. So its speed was at
+        most 5 m a step, and the last control adds at most ``max_action``.
         """
         assert isinstance(self.action_space, spaces.Box)
         max_action = float(self.action_space.high[0])
@@ -115,7 +110,7 @@ class LavaEnv(POMDPEnv):
         d, v = state.T
         next_state = np.stack([d + v, v + action[:, 0]], axis=1)
         next_d = next_state[:, 0]
-        # Strictly beyond the wall: a robot that stands *at* the wall must be able to leave it.
+        # Strictly beyond the wall: a robot *at* the wall must be able to leave it.
         next_state[next_d < WALL] = (WALL, 0.0)
         next_state[(d >= LAVA) | (next_d >= LAVA)] = (LAVA, 0.0)
         return next_state
@@ -145,21 +140,20 @@ class LavaEnv(POMDPEnv):
         """
         if self.render_mode is None:
             return None
-        if self._state is None:
-            raise ValueError("there is nothing to render before the first reset()")
+        d, v = self._current_state()[0]
         height, width, margin = 96, 480, 40
         scale = (width - 2 * margin) / (LAVA - WALL)
 
-        def column(d: float) -> int:
-            return int(np.clip(margin + scale * d, 0, width - 1))
+        def column(distance: float) -> int:
+            return int(np.clip(margin + scale * distance, 0, width - 1))
 
         image = np.full((height, width, 3), 245, np.uint8)
         image[72:] = (150, 140, 130)  # ground
         image[20:, : column(WALL)] = (110, 110, 115)
         image[72:, column(LAVA) :] = (235, 90, 20)
-        goal, robot = column(GOAL[0]), column(self._state[0, 0])
+        goal, robot = column(GOAL[0]), column(d)
         image[40:72, goal - 2 : goal + 2] = (40, 150, 60)
         image[54:72, max(robot - 9, 0) : robot + 9] = (45, 90, 190)
-        tip = column(self._state[0, 0] + self._state[0, 1])
+        tip = column(d + v)
         image[61:65, min(robot, tip) : max(robot, tip)] = (20, 30, 70)
         return image

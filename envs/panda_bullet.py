@@ -1,18 +1,19 @@
 """
-The grasp itself: PyBullet moves the arm down, closes the gripper, and lifts.
+The simulation of a grasp: PyBullet moves the arm down, closes the gripper, and lifts.
 
-A *pose* is where the hand grasps, ``(x, y, z, yaw)``; a *state* that of the mug's frame, likewise ``(4,)``.
+A *pose* is that of the hand at the grasp, ``(x, y, z, yaw)``; a *state* is that of the mug's frame, also ``(4,)``.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from .bullet import BulletClient
-from .panda_scene import ROBOT_FILE, TABLE_FILE, TABLE_POSITION, UNTURNED, PandaScene, add_mug_body
+from .bullet import UNTURNED, BulletClient
+from .panda_scene import ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_body
 
 TIME_STEP = 1 / 240  # s
 HAND = 8  # link
@@ -24,15 +25,15 @@ ARM_FORCE, FINGER_FORCE = 70.0, 20.0
 FINGER_SPINNING_FRICTION = 0.1
 HAND_ABOVE_GRASP = 0.1  # m: the height of a grasp is that of a point between the fingers, near their tips
 FINGERTIPS_BELOW_HAND = 0.1123  # m
-# A gripper that is turned by half a turn is the same gripper: of the two ways to hold it, this one is in the middle of
-# the last joint's range, so that all yaws of a half circle to either side of the nominal one can be reached.
+# Half a turn does not change the gripper. This turn is in the middle of the last joint's range, so that the arm reaches
+# all yaws of a half circle to either side of the nominal one.
 HAND_TURN = np.pi / 4 - np.pi
 
 LIFTED = 0.05  # m: higher than this a mug counts as lifted
 
-# When the fast motion goes on before a phase's time is over; it looks whenever LOOK_EVERY steps are done.
+# Every LOOK_EVERY steps the fast motion checks whether a phase can end early.
 LOOK_EVERY = 8
-NEAR_TARGET = 0.01  # rad: the arm has arrived, since it comes nearer while the next phase begins
+NEAR_TARGET = 0.01  # rad: the arm has arrived
 FINGERS_STAND_STILL = 0.01  # m/s
 LIFTED_FOR_GOOD = 0.06  # m
 
@@ -54,11 +55,8 @@ class Motion(NamedTuple):
     approach: Phase
     close: Phase
     lift: Phase
-    start_height: float  # m, of the hand above where it grasps
-    clears_rim: bool  # it starts higher if it must for the fingertips to be above the rim
-    lift_by: float | None  # m; None: the hand goes to lift_to
-    lift_to: float
-    ends_early: bool  # a phase is over when nothing more is to come of it
+    start_height: float  # m, of the hand above the grasp
+    is_fast: bool  # start above the rim, lift by LIFT_BY instead of to LIFT_TO, and end each phase as early as possible
 
 
 MOTIONS = {
@@ -68,10 +66,7 @@ MOTIONS = {
         close=Phase(60, 1.0, 0.2),
         lift=Phase(90, 0.6, 0.2),
         start_height=0.01,
-        clears_rim=True,
-        lift_by=0.08,
-        lift_to=0.3,
-        ends_early=True,
+        is_fast=True,
     ),
     "reference": Motion(
         solver_iterations=150,
@@ -79,24 +74,22 @@ MOTIONS = {
         close=Phase(100, 0.15, 0.05),
         lift=Phase(500, 0.1, 0.05),
         start_height=0.2,
-        clears_rim=False,
-        lift_by=None,
-        lift_to=0.3,
-        ends_early=False,
+        is_fast=False,
     ),
 }
-ABOVE_RIM = 0.0167  # m between rim and fingertips where the fast motion starts
+ABOVE_RIM = 0.0167  # m between rim and fingertips at the start of the fast motion
+LIFT_BY, LIFT_TO = 0.08, 0.3  # m
 
 
 class Outcome(NamedTuple):
-    """What became of the mug."""
+    """The result of a grasp."""
 
     state: np.ndarray  # (4,)
-    contacts: int  # points in which the fingers touch the mug in the end
+    contacts: int  # points in which the fingers touch the mug at the end
 
 
 class Configuration(NamedTuple):
-    """Where everything that moves is at one instant."""
+    """Positions of everything that moves, at one instant."""
 
     joints: tuple[float, ...]  # seven of the arm, two of the fingers
     mug_position: tuple[float, ...]  # of its frame
@@ -105,10 +98,9 @@ class Configuration(NamedTuple):
 
 class GraspSimulation:
     """
-    Robot, table and mug in a Bullet world of their own, without anything that is only to be seen.
+    Robot, table and mug in a Bullet world of their own, without visual shapes.
 
-    Every grasp starts from the same state of the world, whatever has been simulated before, so that its outcome is a
-    function of state and pose alone.
+    Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone.
 
     :param scene: The mug.
     :param motion: How a grasp is carried out.
@@ -123,8 +115,8 @@ class GraspSimulation:
         client.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
             numSolverIterations=solver_iterations or motion.solver_iterations,
-            # Contacts are solved for one after the other. By default their order depends on what was simulated before,
-            # and with it the mug's final pose in one trial of fifteen.
+            # By default the order in which contacts are solved depends on earlier simulations, and changes the mug's
+            # final pose in one trial of fifteen.
             deterministicOverlappingPairs=1,
         )
         unseen = client.URDF_IGNORE_VISUAL_SHAPES
@@ -135,6 +127,7 @@ class GraspSimulation:
                 self._robot, finger, lateralFriction=scene.friction, spinningFriction=FINGER_SPINNING_FRICTION
             )
         self._mug = add_mug_body(client, scene)
+        self._watch: Callable[[Configuration], object] | None = None
         self._put_arm(HOME)
         self._start = client.saveState()
 
@@ -146,16 +139,16 @@ class GraspSimulation:
         """
         Carry out one grasp.
 
-        :param state: Where the mug stands, ``(4,)``.
-        :param pose: Where it is grasped, ``(4,)``.
-        :param watch: Is shown the scene 30 times a second. This does not change the outcome.
+        :param state: Of the mug, ``(4,)``.
+        :param pose: Of the hand, ``(4,)``.
+        :param watch: Called with the configuration 30 times a second. This does not change the outcome.
         """
-        motion, client = self.motion, self.client
+        motion, client, self._watch = self.motion, self.client, watch
         self._restore(state)
         x, y, z, yaw = pose.tolist()
         z += HAND_ABOVE_GRASP
         start_height = z + motion.start_height
-        if motion.clears_rim:
+        if motion.is_fast:
             start_height = max(start_height, self.scene.mug_height + ABOVE_RIM + FINGERTIPS_BELOW_HAND)
         orientation = client.multiplyTransforms(
             (0.0, 0.0, 0.0), client.getQuaternionFromEuler((np.pi, 0.0, 0.0)),
@@ -164,49 +157,40 @@ class GraspSimulation:
         low = self._joints_for((x, y, z), orientation)
         self._put_arm(low)
         start = self._joints_for((x, y, start_height), orientation)
-        lift_to = motion.lift_to if motion.lift_by is None else z + motion.lift_by
-        high = self._joints_for((x, y, lift_to), orientation)
+        high = self._joints_for((x, y, z + LIFT_BY if motion.is_fast else LIFT_TO), orientation)
         self._put_arm(start)
-        self._run(motion.approach, low, FINGER_OPEN, lambda: self._is_at(low), watch)
-        self._run(motion.close, low, 0.0, self._fingers_stand_still, watch)
-        self._run(motion.lift, high, 0.0, lambda: self._is_decided() or self._is_at(high), watch)
+        self._run(motion.approach, low, FINGER_OPEN, lambda: self._is_at(low))
+        self._run(motion.close, low, 0.0, self._fingers_stand_still)
+        self._run(motion.lift, high, 0.0, lambda: self._is_decided() or self._is_at(high))
         return Outcome(self._mug_state(state[3]), self._contacts())
 
-    def _run(
-        self,
-        phase: Phase,
-        joints: tuple[float, ...],
-        fingers: float,
-        is_over: Callable[[], bool],
-        watch: Callable[[Configuration], object] | None,
-    ) -> None:
-        """Move arm and fingers towards a goal for as long as a phase lasts."""
-        client, robot = self.client, self._robot
+    def _run(self, phase: Phase, joints: tuple[float, ...], fingers: float, is_over: Callable[[], bool]) -> None:
+        """Move arm and fingers towards a goal until a phase is over."""
+        control = functools.partial(self.client.setJointMotorControl2, self._robot)
+        position = self.client.POSITION_CONTROL
         for joint, goal in zip(ARM_JOINTS, joints, strict=True):
-            client.setJointMotorControl2(
-                robot, joint, client.POSITION_CONTROL, goal, force=ARM_FORCE, maxVelocity=phase.arm_speed
-            )
+            control(joint, position, goal, force=ARM_FORCE, maxVelocity=phase.arm_speed)
         for joint in FINGER_JOINTS:
-            client.setJointMotorControl2(
-                robot, joint, client.POSITION_CONTROL, fingers, force=FINGER_FORCE, maxVelocity=phase.finger_speed
-            )
-        step = client.stepSimulation
+            control(joint, position, fingers, force=FINGER_FORCE, maxVelocity=phase.finger_speed)
+        step = self.client.stepSimulation
         for i in range(phase.max_steps):
             if i % LOOK_EVERY == 0:
-                if watch is not None:
-                    watch(self._configuration())
-                if self.motion.ends_early and i > 0 and is_over():
+                self._show()
+                if self.motion.is_fast and i > 0 and is_over():
                     return
             step()
-        if watch is not None:
-            watch(self._configuration())
+        self._show()
+
+    def _show(self) -> None:
+        if self._watch is not None:
+            self._watch(self._configuration())
 
     # -- the world ----------------------------------------------------------------------------------------------------
 
     def _restore(self, state: np.ndarray) -> None:
-        """Bring the world back to its saved state, and put the mug where a state has it."""
+        """Restore the saved state of the world, and move the mug to its state."""
         client = self.client
-        # restoreState does not take away contacts of the last trial; a step in which nothing touches does.
+        # restoreState keeps the contacts of the last trial; a step in which nothing touches removes them.
         client.resetBasePositionAndOrientation(self._mug, FAR_AWAY, UNTURNED)
         client.stepSimulation()
         client.restoreState(self._start)
@@ -218,12 +202,12 @@ class GraspSimulation:
         client.resetBaseVelocity(self._mug, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def _put_arm(self, joints: tuple[float, ...]) -> None:
-        """Place the arm at once, with the gripper open."""
+        """Set the joints of the arm, and open the gripper."""
         for joint, angle in zip((*ARM_JOINTS, *FINGER_JOINTS), (*joints, FINGER_OPEN, FINGER_OPEN), strict=True):
             self.client.resetJointState(self._robot, joint, angle, 0.0)
 
     def _joints_for(self, position: tuple[float, ...], orientation: tuple[float, ...]) -> tuple[float, ...]:
-        """Solve for the arm's joints by inverse kinematics, from where the arm is."""
+        """Solve for the arm's joints by inverse kinematics, starting from the present ones."""
         joints = self.client.calculateInverseKinematics(
             self._robot, HAND, position, orientation,
             jointDamping=[1e-5] * 9, maxNumIterations=200, residualThreshold=1e-6,
@@ -235,13 +219,11 @@ class GraspSimulation:
         return all(abs(state[0] - goal) < NEAR_TARGET for state, goal in zip(states, joints, strict=True))
 
     def _fingers_stand_still(self) -> bool:
-        """Tell whether they hold something, or each other."""
-        return all(
-            abs(state[1]) < FINGERS_STAND_STILL for state in self.client.getJointStates(self._robot, FINGER_JOINTS)
-        )
+        states = self.client.getJointStates(self._robot, FINGER_JOINTS)
+        return all(abs(state[1]) < FINGERS_STAND_STILL for state in states)
 
     def _is_decided(self) -> bool:
-        """Tell whether the mug has been lost, or is so high that it counts as lifted."""
+        """Return whether the mug is lost, or high enough to count as lifted."""
         return not self._contacts() or self._mug_frame()[0][2] > LIFTED_FOR_GOOD
 
     def _contacts(self) -> int:
@@ -256,7 +238,7 @@ class GraspSimulation:
         return np.array(centre) - axes @ self.scene.centre_of_mass, axes, orientation
 
     def _mug_state(self, yaw_before: float) -> np.ndarray:
-        """Where the mug is; its yaw goes on from what it was, without a jump by a whole turn."""
+        """State of the mug; its yaw continues from the one before, without a jump by a whole turn."""
         origin, axes, _ = self._mug_frame()
         turned = np.arctan2(axes[1, 0], axes[0, 0]) - yaw_before
         return np.append(origin, yaw_before + (turned + np.pi) % (2 * np.pi) - np.pi)

@@ -1,4 +1,4 @@
-"""The depth camera of the grasping scene: PyBullet draws the mug alone; the depth of the table is known."""
+"""The depth camera of the grasping scene: PyBullet draws only the mug; the depth of the table is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .panda_scene import PandaScene, add_mug_picture
 
 IMAGE_SIZE = 128  # pixels a side
 
-TARGET, DISTANCE, YAW, PITCH = (0.5, 0.0, 0.02), 0.4, 225.0, -45.0  # m and degrees: where it looks, and from where
+TARGET, DISTANCE, YAW, PITCH = (0.5, 0.0, 0.02), 0.4, 225.0, -45.0  # m and degrees
 NEAR, FAR = 0.01, 1000.0  # m
 # Edges of the image at the depth NEAR: left, right, bottom, top.
 EDGES = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
@@ -17,10 +17,10 @@ EDGES = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
 
 class DepthCamera:
     """
-    A Bullet world of its own with nothing in it but the mug's mesh.
+    A Bullet world of its own that contains only the mug's mesh.
 
-    Drawing table and mug takes 5 ms an image. The table's depth is the same in every image and follows from geometry,
-    so that the mug alone is drawn, in 1.4 ms, and of the two the nearer one is seen: the same to 3e-6 m.
+    To draw table and mug takes 5 ms an image. The table's depth follows from geometry, so that PyBullet draws only the
+    mug, in 1.4 ms, and the smaller depth of the two counts: the same to 3e-6 m.
 
     :param scene: Size and frame of the mug.
     """
@@ -38,28 +38,25 @@ class DepthCamera:
             shadow=0,
             renderer=client.ER_TINY_RENDERER,
         )
-        # In single precision, which a projection matrix has, 1000 m are as much as 998.65 m.
+        # In the single precision of a projection matrix, 1000 m become 998.65 m.
         matrix = np.array(projection, np.float32)
         self._far = float(matrix[14] / (matrix[10] + np.float32(1)))
         turn_and_shift = np.array(view).reshape(4, 4).T
         self.rotation = turn_and_shift[:3, :3]  # from the world's axes to right, up and backward
         self.eye = -self.rotation.T @ turn_and_shift[:3, 3]
-        self._rays = self._rays_of_pixels()
-        self.table_depth = self._depth_of_plane(0.0)
-
-    def _rays_of_pixels(self) -> np.ndarray:
-        """Return what is seen at a depth of 1 m, from the eye: ``(128, 128, 3)``."""
+        # Each pixel's ray from the eye to a depth of 1 m. TinyRenderer samples a pixel at its lower left corner. The
+        # first row is the uppermost.
         left, right, bottom, top = EDGES
-        # TinyRenderer samples a pixel at its lower left corner. The first row is the uppermost.
         corner = np.arange(IMAGE_SIZE) / IMAGE_SIZE
         to_right = (left + (right - left) * corner) / NEAR
         upward = (bottom + (top - bottom) * corner[::-1]) / NEAR
-        rays: np.ndarray = np.stack(np.broadcast_arrays(to_right[None, :], upward[:, None], -1.0), axis=-1)
-        return rays @ self.rotation
+        rays = np.stack(np.broadcast_arrays(to_right[None, :], upward[:, None], -1.0), axis=-1)
+        self._rays_z = (rays @ self.rotation)[..., 2]  # (128, 128)
+        self.table_depth = self._depth_of_plane(0.0)
 
     def _depth_of_plane(self, z: float) -> np.ndarray:
-        """Depth of a level plane without end, ``(128, 128)``, along the axis of view as every depth here."""
-        return (z - self.eye[2]) / self._rays[..., 2]
+        """Depth of an infinite horizontal plane, ``(128, 128)``, along the optical axis."""
+        return (z - self.eye[2]) / self._rays_z
 
     def pixel(self, point: np.ndarray) -> tuple[float, float, float]:
         """Return row, column and depth of a point, ``(3,)``, of the world."""
@@ -72,15 +69,15 @@ class DepthCamera:
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """
-        Return one depth image for each state of the mug.
+        Draw one depth image for each state of the mug.
 
-        :param state: ``(N, 4)``, or ``(N, 5)`` with how much higher than usual the camera is, in m.
+        :param state: ``(N, 4)``, or ``(N, 5)`` with the height of the camera above its usual position, in m.
         :return: ``(N, 1, 128, 128)`` float32 in m
         """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client
         for image, (x, y, z, yaw, *raised) in zip(images, state.tolist(), strict=True):
-            # A camera that is higher sees what this one sees of a lower scene.
+            # A higher camera sees what this one sees of a lower scene.
             below = sum(raised)
             orientation = client.getQuaternionFromEuler((0, 0, yaw))
             client.resetBasePositionAndOrientation(self._mug, (x, y, z - below), orientation)

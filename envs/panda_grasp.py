@@ -1,4 +1,4 @@
-"""The grasping problem (Section IV-C of the paper): lift a mug by its rim, with one depth image as the only sensor."""
+"""The grasping problem (Section IV-C of the paper): lift a mug by its rim, from one depth image."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from . import checks
 from .base import POMDPEnv
 from .panda_bullet import LIFTED, MOTIONS, Configuration, Motion
 from .panda_camera import IMAGE_SIZE
@@ -19,11 +20,11 @@ from .panda_view import PandaView
 
 NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
 ACTION_SCALE = 0.1
-# In units of the action. x and y: what the arm reaches and the table's mugs need. z, between 0.05 and 0.16 m: lower
-# down the palm would press on the rim, which lifts nothing. yaw: 1 rad to either side.
+# In units of the action. x and y: the arm's reach. z, between 0.05 and 0.16 m: lower, the palm presses on the rim. yaw:
+# 1 rad to either side.
 LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
 HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
-# m; what the sensor tells apart. Table and mug are 0.31 to 0.61 m away.
+# m, the range of the sensor. Table and mug are 0.31 to 0.61 m away.
 MIN_DEPTH, MAX_DEPTH = 0.2, 0.7
 MAX_CAMERA_SHIFT = 0.1  # m
 WORKSPACE = np.array([0.5, 0.0])  # m, its middle
@@ -31,28 +32,28 @@ WORKSPACE = np.array([0.5, 0.0])  # m, its middle
 
 class PandaGraspEnv(POMDPEnv):
     r"""
-    Grasp a mug that stands anywhere on a table, and lift it.
+    Grasp a mug on a table, and lift it.
 
-    State ``x = (x, y, z, yaw)`` of the mug's frame, in m and rad; with a ``camera_range`` also its height.
-    Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``. Action ``u``: where the hand grasps,
-    ``(0.5, 0, 0.06, pi/6) + 0.1 u`` for its position in m and its yaw in rad. There is one control, ``T = 1``, and
-    PyBullet simulates what comes of it:
+    State ``x = (x, y, z, yaw)`` of the mug's frame, in m and rad; with a ``camera_range`` also the camera's height.
+    Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``. Action ``u``: the hand grasps at
+    ``(0.5, 0, 0.06, pi/6) + 0.1 u``, its position in m and its yaw in rad. There is one control, ``T = 1``, and
+    PyBullet simulates its result:
 
     .. math::
         c_0 = 0, \qquad c_1 = \begin{cases} 0 & \text{if the mug's frame is more than 5 cm above the table},\\
         1 & \text{otherwise.} \end{cases}
 
-    ``info`` has, after the step, ``success``, ``mug`` (its pose before the grasp), ``mug_height`` (m, after it),
-    ``grasp`` (its pose, after clipping), ``contacts`` (points in which the fingers touch the mug in the end), and
-    ``is_success``, the name under which Stable-Baselines3 looks for the success.
+    After the step, ``info`` has ``success`` (``is_success`` for SB3), ``mug`` (its pose before the grasp),
+    ``mug_height`` (in m, after it), ``grasp`` (the clipped pose of the hand) and ``contacts`` (points in which the
+    fingers touch the mug at the end).
 
-    An outcome is a function of state and action alone: it does not depend on the trials before it, nor on the process.
+    The outcome is a function of state and action alone: it depends neither on earlier trials nor on the process.
 
     :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
     :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
-    :param camera_range: ``(low, high)``: the camera is higher than usual by another distance between these two in every
-        trial, uniformly, in m. The distance is the fifth component of the state. ``None``: it is where it is.
-    :param camera_shift: The camera is higher by so much, in m, in every trial, and the state does not tell.
+    :param camera_range: ``(low, high)``: in every trial the camera is raised by a distance, uniform between these two,
+        in m. The distance is the fifth component of the state.
+    :param camera_shift: The camera is raised by this distance in every trial, in m. The state does not contain it.
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
@@ -60,8 +61,8 @@ class PandaGraspEnv(POMDPEnv):
         reference.
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
-    :param n_processes: Processes that share the grasps and the images of a batch; the results are the same.
-    :param render_mode: ``None``, ``"rgb_array"`` (the scene beside the depth image) or ``"human"`` (PyBullet's window).
+    :param n_processes: Number of processes that share a batch; the results are the same.
+    :param render_mode: ``None``, ``"rgb_array"`` (the scene and the depth image) or ``"human"`` (PyBullet's window).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
@@ -84,36 +85,22 @@ class PandaGraspEnv(POMDPEnv):
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=1, render_mode=render_mode)
-        if not 0 <= xy_half_width <= 0.2:
-            raise ValueError(f"xy_half_width={xy_half_width} must be between 0 and 0.2 m: what the arm reaches")
-        low_high = np.asarray(yaw_range, dtype=np.float64)
-        if low_high.shape != (2,) or not np.isfinite(low_high).all() or low_high[0] > low_high[1]:
-            raise ValueError(f"yaw_range={yaw_range} must be (low, high) of finite numbers in rad, low <= high")
-        if not 0.5 <= mug_scale <= 1.5:
-            raise ValueError(f"mug_scale={mug_scale} must be between 0.5 and 1.5: it is a multiple of the paper's size")
-        if not -0.05 <= frame_offset <= 0.05:
-            raise ValueError(f"frame_offset={frame_offset} must be between -0.05 and 0.05 m")
-        if not (np.isfinite(friction) and friction >= 0):
-            raise ValueError(f"friction={friction} must be finite and not negative")
-        if solver_iterations is not None and not (
-            isinstance(solver_iterations, (int, np.integer)) and solver_iterations >= 1
-        ):
-            raise ValueError(f"solver_iterations={solver_iterations!r} must be None or an integer of at least 1")
-        if motion not in MOTIONS:
-            raise ValueError(f"motion={motion!r} must be one of {list(MOTIONS)}")
-        if not (np.isfinite(depth_noise_std) and depth_noise_std >= 0):
-            raise ValueError(f"depth_noise_std={depth_noise_std} must be finite and not negative (it is sigma, in m)")
-        if not (isinstance(n_processes, (int, np.integer)) and n_processes >= 1):
-            raise ValueError(f"n_processes={n_processes!r} must be an integer of at least 1")
-        self.xy_half_width = float(xy_half_width)
-        self.yaw_range = low_high
-        self.scene = PandaScene(float(mug_scale), float(frame_offset), float(friction))
-        self.camera_range = None if camera_range is None else _checked_camera(camera_range)
-        self.camera_shift = _checked_shift(camera_shift, self.camera_range)
+        self.xy_half_width = checks.between("xy_half_width", xy_half_width, 0.0, 0.2, " m: the arm's reach")
+        self.yaw_range = checks.low_high("yaw_range", yaw_range, unit=" in rad")
+        self.scene = PandaScene(
+            checks.between("mug_scale", mug_scale, 0.5, 1.5, ": it is a multiple of the paper's size"),
+            checks.between("frame_offset", frame_offset, -0.05, 0.05, " m"),
+            checks.not_negative("friction", friction),
+        )
+        low, high = _check_camera(camera_range, camera_shift)
+        self.camera_range = None if camera_range is None else (low, high)
+        self.camera_shift = float(camera_shift)
+        if solver_iterations is not None:
+            checks.count("solver_iterations", solver_iterations, or_none="None or ")
         self.solver_iterations = solver_iterations
-        self.motion = motion
-        self.depth_noise_std = float(depth_noise_std)
-        self.n_processes = n_processes
+        self.motion = checks.one_of("motion", motion, MOTIONS)
+        self.depth_noise_std = checks.not_negative("depth_noise_std", depth_noise_std, " (it is sigma, in m)")
+        self.n_processes = checks.count("n_processes", n_processes)
         self.state_names = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
         if camera_range is not None:
             self.state_names += ("camera height (m)",)
@@ -122,32 +109,31 @@ class PandaGraspEnv(POMDPEnv):
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
         self._last_details: list[dict[str, Any]] = []
         self._is_closed = False
-        self._film: list[Configuration] = []  # of the last grasp, where something is rendered
+        self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
-    # -- Bullet worlds, each made when it is needed, and so in the process that uses it ------------------------------
+    # -- Bullet worlds, each made at its first use, and so in the process that uses it --------------------------------
 
     @cached_property
     def _world(self) -> GraspWorld:
-        self._check_open()
-        return GraspWorld(*self._world_arguments)
+        return GraspWorld(*self._world_arguments())
 
     @cached_property
     def _pool(self) -> GraspPool:
-        self._check_open()
-        return GraspPool(self.n_processes, *self._world_arguments)
-
-    @property
-    def _world_arguments(self) -> tuple[PandaScene, Motion, int | None]:
-        return self.scene, MOTIONS[self.motion], self.solver_iterations
-
-    def _workers(self, n: int) -> GraspWorld | GraspPool:
-        """Return what a batch of n mugs is left to."""
-        return self._pool if self.n_processes > 1 and n > 1 else self._world
+        return GraspPool(self.n_processes, *self._world_arguments())
 
     @cached_property
     def _view(self) -> PandaView:
-        self._check_open()
-        return PandaView(self.scene, gui=self.render_mode == "human")
+        scene, _, _ = self._world_arguments()
+        return PandaView(scene, gui=self.render_mode == "human")
+
+    def _world_arguments(self) -> tuple[PandaScene, Motion, int | None]:
+        if self._is_closed:  # perhaps before there was a BulletClient, which says the same
+            raise RuntimeError("this environment has been closed: make a new one")
+        return self.scene, MOTIONS[self.motion], self.solver_iterations
+
+    def _workers(self, n: int) -> GraspWorld | GraspPool:
+        """Return the processes for a batch of n mugs, or this process."""
+        return self._pool if self.n_processes > 1 and n > 1 else self._world
 
     # -- the POMDP ----------------------------------------------------------------------------------------------------
 
@@ -168,16 +154,10 @@ class PandaGraspEnv(POMDPEnv):
         else:
             outcomes = self._workers(len(state)).grasps(mugs, poses)
         next_state = np.concatenate([np.array([outcome.state for outcome in outcomes]), camera], axis=1)
+        heights, success = next_state[:, 2].tolist(), (next_state[:, 2] > LIFTED).tolist()
         self._last_details = [
-            dict(
-                success=bool(after[2] > LIFTED),
-                is_success=bool(after[2] > LIFTED),
-                mug=mug,
-                mug_height=float(after[2]),
-                grasp=pose,
-                contacts=outcome.contacts,
-            )
-            for mug, pose, after, outcome in zip(mugs, poses, next_state, outcomes, strict=True)
+            dict(success=lifted, is_success=lifted, mug=mug, mug_height=height, grasp=pose, contacts=outcome.contacts)
+            for mug, pose, height, lifted, outcome in zip(mugs, poses, heights, success, outcomes, strict=True)
         ]
         return next_state
 
@@ -188,7 +168,7 @@ class PandaGraspEnv(POMDPEnv):
         return self._with_noise(self._workers(len(state)).images(self._seen(state)), self.np_random)
 
     def _seen(self, state: np.ndarray) -> np.ndarray:
-        """Return what an image is drawn of: the mug, and how much higher than usual the camera is, if it is."""
+        """Return the states for the depth camera: the mug's, with the height of a raised camera."""
         if self.camera_shift == 0:
             return state
         raised = state[:, 4:] if self.camera_range is not None else np.zeros((len(state), 1))
@@ -201,7 +181,7 @@ class PandaGraspEnv(POMDPEnv):
         return np.where(state[:, 2] > LIFTED, 0.0, 1.0)
 
     def _with_noise(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Add noise to depth images, ``(N, 1, 128, 128)``, and cut off what is outside the observation space."""
+        """Add noise to depth images, ``(N, 1, 128, 128)``, and clip them to the observation space."""
         if self.depth_noise_std > 0:
             for image in images:
                 image += self.depth_noise_std * rng.standard_normal(image.shape)
@@ -211,50 +191,45 @@ class PandaGraspEnv(POMDPEnv):
 
     def render(self) -> np.ndarray | None:
         """
-        Show the scene as it is: before the grasp, or after it.
+        Show the scene before or after the grasp.
 
-        ``"rgb_array"``: the scene beside the depth image, ``(256, 644, 3)`` uint8, near points bright; see also
-        :meth:`film`. ``"human"``: in PyBullet's window, where the grasp is played at its speed; ``None`` is returned.
-        Sensor noise is drawn anew, so that drawing does not change an episode.
+        ``"rgb_array"``: return the scene beside the depth image, ``(256, 644, 3)`` uint8, near points bright; see also
+        :meth:`film`. ``"human"``: show the scene in PyBullet's window, and the grasp in real time. The sensor noise in
+        the picture is a new sample, so that rendering does not change an episode.
         """
         if self.render_mode is None:
             return None
-        if self._state is None:
-            raise ValueError("there is nothing to render before the first reset()")
+        state = self._current_state()
         if self.render_mode == "human":
             for configuration in self._shown():
                 self._view.place(configuration)
                 time.sleep(1 / self.metadata["render_fps"])
             return None
         self._view.place(self._shown()[-1])
-        return self._view.picture(self._depth_of(self._state[0]))
+        return self._view.picture(self._depth_of(state[0]))
 
     def film(self) -> Iterator[np.ndarray]:
         """
-        Draw the last grasp from beginning to end, 30 pictures for each second of it; see ``render``.
+        Draw the last grasp from beginning to end, 30 pictures a second, beside the depth image before it.
 
-        The depth image beside it stays the one that the grasp was chosen by.
-
-        :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or nothing has been grasped since ``reset``.
+        :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """
         if self.render_mode != "rgb_array":
             raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a film")
         if self._time == 0:
             raise ValueError("there is no grasp to show before step()")
-        assert self._state is not None
         _, _, to_z, to_w = self._film[0].mug_orientation
-        camera = self._state[0, 4:].tolist()
+        camera = self._current_state()[0, 4:].tolist()
         depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w), *camera])
         for configuration in self._film:
             self._view.place(configuration)
             yield self._view.picture(depth)
 
     def _shown(self) -> list[Configuration]:
-        """Return what there is to see: the last grasp, or the mug where it stands and the robot at rest."""
-        assert self._state is not None
+        """Return the last grasp, or the robot at rest before it."""
         if self._time > 0:
             return self._film
-        x, y, z, yaw = self._state[0, :4].tolist()
+        x, y, z, yaw = self._current_state()[0, :4].tolist()
         return [PandaView.at_rest((x, y, z), yaw)]
 
     def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
@@ -264,34 +239,24 @@ class PandaGraspEnv(POMDPEnv):
     def close(self) -> None:
         """Close the Bullet worlds and the window; closing twice is fine."""
         self._is_closed = True
-        for name in ("_world", "_pool", "_view"):
-            if name in self.__dict__:
-                getattr(self, name).close()
-
-    def _check_open(self) -> None:
-        # BulletClient says the same of a world that has been closed, but here there may have been none yet.
-        if self._is_closed:
-            raise RuntimeError("this environment has been closed: make a new one")
+        for name in {"_world", "_pool", "_view"} & set(self.__dict__):
+            getattr(self, name).close()
 
 
-def _checked_camera(camera_range: tuple[float, float]) -> tuple[float, float]:
+def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float]:
+    """Return the lowest and the highest position of the camera without the shift."""
+    limit, why = MAX_CAMERA_SHIFT, "from further away the mug is not visible"
     try:
-        low, high = (float(height) for height in camera_range)
+        low, high = map(float, (0.0, 0.0) if camera_range is None else camera_range)
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
-    if not -MAX_CAMERA_SHIFT <= low <= high <= MAX_CAMERA_SHIFT:
+    if not -limit <= low <= high <= limit:
         raise ValueError(
-            f"camera_range={camera_range} must be None or (low, high) in m, {-MAX_CAMERA_SHIFT} <= low <= high <= "
-            f"{MAX_CAMERA_SHIFT}: from further away the mug is out of sight"
+            f"camera_range={camera_range} must be None or (low, high) in m, {-limit} <= low <= high <= {limit}; {why}"
+        )
+    if not (low + shift >= -limit and high + shift <= limit):
+        raise ValueError(
+            f"camera_shift={shift} with camera_range={camera_range} must leave the camera within {limit} m of its "
+            f"usual height: {why}"
         )
     return low, high
-
-
-def _checked_shift(camera_shift: float, camera_range: tuple[float, float] | None) -> float:
-    low, high = camera_range or (0.0, 0.0)
-    if not (low + camera_shift >= -MAX_CAMERA_SHIFT and high + camera_shift <= MAX_CAMERA_SHIFT):
-        raise ValueError(
-            f"camera_shift={camera_shift} with camera_range={camera_range} must leave the camera within "
-            f"{MAX_CAMERA_SHIFT} m of its usual height: from further away the mug is out of sight"
-        )
-    return float(camera_shift)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import cached_property
+from itertools import chain, repeat
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +22,11 @@ SHARES = 8  # parts of a batch for each process, so that all end at about the sa
 
 class GraspWorld:
     """
-    Simulation and camera of one process, each made when it is first used.
+    Simulation and camera of one process; each is made when it is first used.
 
     :param scene: The mug.
     :param motion: How a grasp is carried out.
-    :param solver_iterations: ``None``: the motion's.
+    :param solver_iterations: ``None``: as the motion says.
     """
 
     def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None) -> None:
@@ -37,46 +39,38 @@ class GraspWorld:
 
     @cached_property
     def camera(self) -> DepthCamera:
-        """What draws the depth images."""
+        """The depth camera."""
         return DepthCamera(self._simulation_arguments[0])
 
     def grasps(
         self, states: np.ndarray, poses: np.ndarray, watch: Callable[[Configuration], object] | None = None
     ) -> list[Outcome]:
-        """
-        Carry out one grasp for each mug.
-
-        :param states: ``(N, 4)``
-        :param poses: ``(N, 4)``
-        :param watch: See :meth:`~sb3_tdpg.envs.panda_bullet.GraspSimulation.grasp`.
-        """
+        """Carry out one grasp for each mug, ``(N, 4)``, at its pose, ``(N, 4)``; ``watch`` as in ``grasp``."""
         return [self.simulation.grasp(mug, pose, watch) for mug, pose in zip(states, poses, strict=True)]
 
     def images(self, states: np.ndarray) -> np.ndarray:
-        """See :meth:`~sb3_tdpg.envs.panda_camera.DepthCamera.images`."""
+        """Draw the depth images; see :meth:`~sb3_tdpg.envs.panda_camera.DepthCamera.images`."""
         return self.camera.images(states)
 
     def close(self) -> None:
         """Close the Bullet worlds."""
-        for name in ("simulation", "camera"):
-            if name in self.__dict__:
-                getattr(self, name).close()
+        for name in {"simulation", "camera"} & set(self.__dict__):
+            getattr(self, name).close()
 
 
 class GraspPool:
     """
-    The same for whole batches, by several processes. What comes out is the same bit for bit.
+    Several processes with a :class:`GraspWorld` each, which share a batch. The results are the same bit for bit.
 
-    The processes neither hear Ctrl-C, which is for the one that they serve, nor outlive it. Should one of them die, the
-    next call raises :class:`concurrent.futures.process.BrokenProcessPool`.
+    The processes ignore Ctrl-C and end with this one. If one dies, the next call raises
+    :class:`concurrent.futures.process.BrokenProcessPool`.
 
     :param n_processes: At least 2.
     :param world_arguments: Of :class:`GraspWorld`.
     """
 
     def __init__(self, n_processes: int, *world_arguments: object) -> None:
-        # A forked process goes on where this one is. Any other start method imports the user's script once more, which
-        # must then guard what it does by `if __name__ == "__main__"`.
+        # Other start methods import the user's script, which then needs a guard `if __name__ == "__main__"`.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
         self._n_processes = n_processes
         self._executor = ProcessPoolExecutor(
@@ -84,20 +78,20 @@ class GraspPool:
         )
 
     def grasps(self, states: np.ndarray, poses: np.ndarray) -> list[Outcome]:
-        """See :meth:`GraspWorld.grasps`."""
-        return [outcome for part in self._map(_grasps, states, poses) for outcome in part]
+        """Carry out grasps as :meth:`GraspWorld.grasps` does."""
+        return list(chain(*self._map("grasps", states, poses)))
 
     def images(self, states: np.ndarray) -> np.ndarray:
-        """See :meth:`GraspWorld.images`."""
-        return np.concatenate(self._map(_images, states))
+        """Draw depth images as :meth:`GraspWorld.images` does."""
+        return np.concatenate(self._map("images", states))
 
-    def _map(self, function: Callable[..., object], *arrays: np.ndarray) -> list:
+    def _map(self, method: str, *arrays: np.ndarray) -> list[Any]:
         n_parts = min(len(arrays[0]), SHARES * self._n_processes)
-        parts: list[Sequence[np.ndarray]] = [np.array_split(array, n_parts) for array in arrays]
+        parts = [np.array_split(array, n_parts) for array in arrays]
         with warnings.catch_warnings():
-            # From Python 3.12 on a fork warns of the threads of PyTorch; the processes do not call PyTorch.
+            # Python 3.12 warns of PyTorch's threads in a forked process; these processes do not call PyTorch.
             warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
-            return list(self._executor.map(function, *parts))
+            return list(self._executor.map(_call, repeat(method), *parts))
 
     def close(self) -> None:
         """End the processes."""
@@ -107,15 +101,11 @@ class GraspPool:
 _world: GraspWorld  # of a process of a pool
 
 
-def _begin(*world_arguments: object) -> None:
+def _begin(*world_arguments: Any) -> None:
     global _world
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _world = GraspWorld(*world_arguments)  # type: ignore[arg-type]
+    _world = GraspWorld(*world_arguments)
 
 
-def _grasps(states: np.ndarray, poses: np.ndarray) -> list[Outcome]:
-    return _world.grasps(states, poses)
-
-
-def _images(states: np.ndarray) -> np.ndarray:
-    return _world.images(states)
+def _call(method: str, *arrays: np.ndarray) -> Any:
+    return getattr(_world, method)(*arrays)

@@ -1,7 +1,7 @@
 """
-The grasping scene as data: table, mug and camera, for the simulation as for every picture.
+The grasping scene as data, for the simulation and for every picture.
 
-Coordinates: the robot stands at the origin and looks along +x, y is to its left, z upward; the table's top is z = 0.
+Coordinates: the robot is at the origin and looks along +x, y is to its left, z upward; the table's top is z = 0.
 Lengths are in metres, angles in radians.
 """
 
@@ -23,16 +23,15 @@ MUG_FILE = os.path.join(ASSETS, "objects", "mug.obj")
 
 TABLE_POSITION = (0.4, 0.0, -0.625)  # puts the table's top at z = 0
 MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
-UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
 
-# The mug of PyBullet, made wider and lower: 93 mm across and 81 mm high as the paper's. It is wider than the gripper
-# opens, so that it can be grasped by its rim only, one finger inside.
+# PyBullet's mug, scaled to the size of the paper's: 93 mm across and 81 mm high. It is wider than the open gripper, so
+# that it can be grasped only by its rim, with one finger inside.
 MESH_SCALE = np.array([1.134, 1.134, 0.81])
 MESH_RADIUS, MESH_HEIGHT = 0.041, 0.1  # of the cup in the file
 N_STAVES = 12
 WALL_THICKNESS = 0.0075
 BASE_HEIGHT = 0.006
-# Ends (y, z) of the handle's three bars in the file, and their half width and thickness.
+# Ends (y, z) of the handle's three bars in the file, their half width and thickness.
 HANDLE_BARS = (
     ((0.0768, 0.0225), (0.0768, 0.0775)),
     ((0.039, 0.0775), (0.0768, 0.0775)),
@@ -42,16 +41,16 @@ BAR_HALF_WIDTH, BAR_THICKNESS = 0.0055, 0.0085
 MASS = 0.1  # kg
 INERTIA = 2e-4  # kg m^2, about each axis
 CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame: a little towards the handle
-MAX_SHAPES = 16  # PyBullet takes so many for a body, and drops any further without a word
+MAX_SHAPES = 16  # of a body; PyBullet drops any further silently
 
 
 @dataclass(frozen=True)
 class PandaScene:
     """
-    What can be varied in the scene.
+    The parameters of the scene.
 
-    The cup's frame has the cup's axis for its z axis and the handle along +y. The mug's frame, whose position and
-    rotation are the state, has its origin beside the axis.
+    The cup's frame has the cup's axis as z axis and the handle along +y. The origin of the mug's frame, whose position
+    and rotation are the state, is beside the axis.
 
     :param mug_scale: Size of the mug, as a multiple of the paper's.
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
@@ -64,7 +63,7 @@ class PandaScene:
 
     @property
     def mesh_scale(self) -> np.ndarray:
-        """What the mesh in the file is multiplied by, ``(3,)``."""
+        """Scale of the mesh in the file, ``(3,)``."""
         return self.mug_scale * MESH_SCALE
 
     @property
@@ -84,20 +83,20 @@ class PandaScene:
 
     @property
     def centre_of_mass(self) -> np.ndarray:
-        """In the mug's frame, ``(3,)``. Bullet's base position is that of the centre of mass."""
+        """Centre of mass in the mug's frame, ``(3,)``: the base position for Bullet."""
         return self.cup_origin + self.mug_scale * CENTRE_OF_MASS
 
     def collision_shapes(self) -> list[dict[str, Any]]:
         """
         Build the mug from a disc, twelve staves around it and three bars for the handle.
 
-        A mesh would not do: Bullet takes the convex hull of one that moves, and the hull of a cup is not hollow.
+        Bullet would replace a moving mesh by its convex hull, and the hull of a cup is not hollow.
 
-        :return: type, size, position and orientation in the mug's frame of each shape
+        :return: size, position and yaw of each shape in the cup's frame
         """
         radius, height, thickness = self.mug_radius, self.mug_height, self.mug_scale * WALL_THICKNESS
         base = self.mug_scale * BASE_HEIGHT
-        # Only the base touches the table: the staves begin in the middle of it.
+        # Only the base touches the table: the staves begin at half its height.
         shapes = [dict(radius=0.93 * radius, length=base, position=(0.0, 0.0, base / 2), yaw=0.0)]
         stave = (thickness / 2, radius * np.tan(np.pi / N_STAVES), (height - base / 2) / 2)
         for yaw in 2 * np.pi * np.arange(N_STAVES) / N_STAVES:
@@ -113,7 +112,7 @@ class PandaScene:
 
 
 def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
-    """Add the mug as it looks, the hollow mesh; return its body's id. Its base position is that of the mug's frame."""
+    """Add the mug's visual mesh; return its body's id. The base position is that of the mug's frame."""
     shape = client.createVisualShape(
         client.GEOM_MESH,
         fileName=MUG_FILE,
@@ -127,13 +126,13 @@ def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
 
 def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
     """
-    Add the mug as it is felt; return its body's id. Its base position is that of its centre of mass.
+    Add the mug's collision shapes; return its body's id. The base position is that of its centre of mass.
 
-    :raises RuntimeError: if there are more shapes than PyBullet takes.
+    :raises RuntimeError: if there are more shapes than PyBullet accepts.
     """
     shapes = scene.collision_shapes()
     if len(shapes) > MAX_SHAPES:
-        raise RuntimeError(f"the mug has {len(shapes)} shapes, PyBullet takes {MAX_SHAPES}")
+        raise RuntimeError(f"the mug has {len(shapes)} shapes; PyBullet accepts {MAX_SHAPES}")
     body = client.createCollisionShapeArray(
         [client.GEOM_BOX if "half_extents" in shape else client.GEOM_CYLINDER for shape in shapes],
         halfExtents=[shape.get("half_extents", (0.0, 0.0, 0.0)) for shape in shapes],

@@ -13,28 +13,27 @@ from .textures import TEST_TEXTURES
 LAVA_TABLE_READING: Mapping[str, Any] = MappingProxyType(
     dict(action_cost=1.0, lava_stage_cost=3.0, lava_terminal_cost=300.0)
 )
-"""Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv` that fit the numbers of Table I better than the paper's text."""
-
+"""Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv`: the cost definition that fits Table I better than the text."""
 
 BALL_PUBLISHED_READING: Mapping[str, Any] = MappingProxyType(dict(control_gain=0.1, gravity=9.8, horizon=24))
 """
-Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` that fit the numbers of Table II better than the paper's
-text does. In the 24 controls of this reading the ball goes from 8.0 m to 0.8 m.
+Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` that fit Table II better than the paper's text. In the 24
+controls of this definition the ball flies from 8.0 m to 0.8 m.
 """
 
 BALL_VARYING_LAUNCH: Mapping[str, Any] = MappingProxyType(
     dict(ball_start_range=((7.0, 1.0), (9.0, 1.0)), ball_speed_range=((-5.0, 7.85), (-4.0, 7.85)))
 )
 """
-Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` for a launch that varies, our own: the ball lands anywhere
-between -1.3 m and 2.3 m, so that a robot must see it. With the paper's fixed launch it need only know where it is.
+Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` for a launch that varies (not in the paper): the ball lands
+between -1.3 m and 2.3 m, so that the robot must see it. With the paper's fixed launch it needs only its own position.
 """
 
 
 @dataclass(frozen=True)
 class PaperResult:
     """
-    What the paper prints in a row.
+    The paper's numbers in a row of a table.
 
     :param mean: Mean cost over episodes.
     :param std: Standard deviation of the cost over episodes; ``None`` where the paper has none (Table II).
@@ -49,12 +48,12 @@ class PaperResult:
 @dataclass(frozen=True)
 class Scenario:
     """
-    One row of a results table: an environment with the keywords that make this variant.
+    One row of a results table: a variant of an environment.
 
     :param name: The row's title.
     :param env_id: A registered Gymnasium id.
     :param env_kwargs: Keywords of the environment's constructor.
-    :param paper: What the paper reports for this row, by method ("PG", "TDPG").
+    :param paper: The paper's numbers by method ("PG", "TDPG").
     """
 
     name: str
@@ -111,14 +110,14 @@ BALL_CATCH: tuple[Scenario, ...] = (
     ),
 )
 
-# Which of the two that show where to go does a policy look at? Ours.
+# Does a policy use the ball or the wall? Not in the paper.
 BALL_CATCH_DIAGNOSIS: tuple[Scenario, ...] = (
     Scenario("Ball and wall", "BallCatch-v0"),
     Scenario("Ball hidden", "BallCatch-v0", dict(ball_radius=1e-3)),
     Scenario("Wall stands still", "BallCatch-v0", dict(wall_stands_still=True)),
 )
 
-# The same rows where the launch varies: a comparison of our own, without numbers of the paper.
+# The same rows with a launch that varies; not in the paper.
 BALL_CATCH_VARYING_LAUNCH: tuple[Scenario, ...] = tuple(
     Scenario(row.name, row.env_id, {**BALL_VARYING_LAUNCH, **row.env_kwargs}) for row in BALL_CATCH
 )
@@ -137,11 +136,11 @@ PANDA_GRASP: tuple[Scenario, ...] = (
 
 PANDA_CAMERA: Mapping[str, Any] = MappingProxyType(dict(camera_range=(-0.03, 0.03)))
 """
-Keywords of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv` for a camera whose height varies from trial to trial, our
-own: every depth in the image tells of it, and to the grasp it does not matter.
+Keywords of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv` for a camera whose height varies from trial to trial (not
+in the paper): it changes every depth in the image, but not the best grasp.
 """
 
-# Within the heights of the training, twice as far up and down, and where the camera of Table III is.
+# The heights of the training, twice their range, and the height of Table III.
 PANDA_GRASP_CAMERA: tuple[Scenario, ...] = (
     Scenario("Training", "PandaGrasp-v0", dict(PANDA_CAMERA)),
     Scenario("Twice the range", "PandaGrasp-v0", dict(camera_range=(-0.06, 0.06))),

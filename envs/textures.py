@@ -1,10 +1,9 @@
 """
-The walls of the ball-catching problem: procedural textures, as many as one likes, and image files.
+The wall textures of the ball-catching problem: procedural ones and image files.
 
 Dimension key: S texels a side of a procedural texture, H and W rows and columns of any. A texture is an array
-``(H, W, 3)`` uint8 as an image file has it. One copy covers 8 m x 8 m of the wall. PyBullet's plane turns it: on the
-wall the image's columns run upwards and its rows to the right, so that procedural textures, drawn upright, are turned
-the other way at the end.
+``(H, W, 3)`` uint8 as in an image file. One copy covers 8 m x 8 m of the wall. PyBullet's plane turns it: on the wall
+its columns run upwards and its rows to the right. So procedural textures are drawn upright and turned back at the end.
 """
 
 from __future__ import annotations
@@ -24,11 +23,8 @@ SIZE = 128  # S: 6.25 cm a texel on the wall, about a fifth of a pixel of the ca
 Pattern = Callable[[np.random.Generator], np.ndarray]  # draws a tileable picture (S, S), values in [0, 1]
 
 
-def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of each texel, as fractions of a side."""
-    fraction = (np.arange(SIZE) + 0.5) / SIZE
-    rows, columns = np.meshgrid(fraction, fraction, indexing="ij")
-    return rows, columns
+# Row and column of each texel, as fractions of a side.
+ROWS, COLUMNS = np.meshgrid(*[(np.arange(SIZE) + 0.5) / SIZE] * 2, indexing="ij")
 
 
 def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
@@ -42,48 +38,44 @@ def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
 def bricks(rng: np.random.Generator) -> np.ndarray:
     """Running bond: 8 courses of 4 bricks (1 m x 2 m each), every brick of its own shade, light mortar."""
     courses, per_course, mortar = 8, 4, 2 * 8 / SIZE  # the joint as a fraction of a course
-    rows, columns = _grid()
-    course = (rows * courses).astype(int)
-    along = columns * per_course + 0.5 * (course % 2)
+    course = (ROWS * courses).astype(int)
+    along = COLUMNS * per_course + 0.5 * (course % 2)
     brick = along.astype(int) % per_course
     shade = 0.55 * rng.random((courses, per_course))[course, brick]
-    joint = (rows * courses % 1 < mortar) | (along % 1 < mortar * per_course / courses)
+    joint = (ROWS * courses % 1 < mortar) | (along % 1 < mortar * per_course / courses)
     return np.where(joint, 1.0, shade)
 
 
 def tiles(rng: np.random.Generator) -> np.ndarray:
     """A chequerboard of squares with unequal shades."""
     per_side = 2 * int(rng.integers(2, 5))
-    rows, columns = ((axis * per_side).astype(int) for axis in _grid())
+    rows, columns = ((axis * per_side).astype(int) for axis in (ROWS, COLUMNS))
     return 0.3 * rng.random((per_side, per_side))[rows, columns] + 0.7 * ((rows + columns) % 2)
 
 
 def stripes(rng: np.random.Generator) -> np.ndarray:
-    """Straight stripes: upright, level or slanted."""
+    """Straight stripes: vertical, horizontal or slanted."""
     number, slant = int(rng.integers(3, 7)), int(rng.integers(-2, 3))
-    rows, columns = _grid()
-    if rng.random() < 0.5:
-        rows, columns = columns, rows
+    rows, columns = (COLUMNS, ROWS) if rng.random() < 0.5 else (ROWS, COLUMNS)
     return 0.5 + 0.5 * np.sin(2 * np.pi * (number * columns + slant * rows))
 
 
 def dots(rng: np.random.Generator) -> np.ndarray:
     """Round dots, each row shifted by half a distance."""
     per_side = 2 * int(rng.integers(2, 4))
-    rows, columns = (axis * per_side for axis in _grid())
+    rows, columns = ROWS * per_side, COLUMNS * per_side
     columns = columns + 0.5 * (rows.astype(int) % 2)
     radius = 0.28 + 0.1 * rng.random()
     return (np.hypot(rows % 1 - 0.5, columns % 1 - 0.5) < radius).astype(float)
 
 
 def planks(rng: np.random.Generator) -> np.ndarray:
-    """Upright boards of unequal shades with a grain and dark gaps."""
+    """Vertical boards of unequal shades with a grain and dark gaps."""
     number = int(rng.integers(6, 11))
-    _, columns = _grid()
-    board = (columns * number).astype(int)
+    board = (COLUMNS * number).astype(int)
     grain = np.roll(_noise(rng, 6.0), rng.integers(SIZE), axis=0)
     shade = 0.35 + 0.45 * rng.random(number)[board] + 0.2 * grain
-    return np.where(columns * number % 1 < 0.12, 0.0, shade)
+    return np.where(COLUMNS * number % 1 < 0.12, 0.0, shade)
 
 
 def blobs(rng: np.random.Generator) -> np.ndarray:
@@ -92,9 +84,8 @@ def blobs(rng: np.random.Generator) -> np.ndarray:
 
 
 def waves(rng: np.random.Generator) -> np.ndarray:
-    """Level bands that a smooth noise bends, as in marble."""
-    rows, _ = _grid()
-    return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * rows + 1.2 * _noise(rng, 2.0)))
+    """Horizontal bands that a smooth noise bends, as in marble."""
+    return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * ROWS + 1.2 * _noise(rng, 2.0)))
 
 
 def speckles(rng: np.random.Generator) -> np.ndarray:
@@ -144,7 +135,7 @@ def built_in_texture(name: str) -> np.ndarray:
 
 
 def random_texture(seed: int) -> np.ndarray:
-    """Draw a texture ``(S, S, 3)`` of any pattern and hue; the same seed gives the same texture."""
+    """Draw a texture ``(S, S, 3)`` of random pattern and hue; the same seed gives the same texture."""
     rng = np.random.default_rng([seed, 8])  # not the streams of the built-in ones
     pattern = PATTERNS[rng.integers(len(PATTERNS))]
     hue, shift = rng.random(), 0.1 * rng.standard_normal()
@@ -155,11 +146,11 @@ def random_texture(seed: int) -> np.ndarray:
 
 def blended_texture(share: float, name: str) -> np.ndarray:
     """
-    Lay a built-in or random texture over the training texture: ``(S, S, 3)``.
+    Blend a built-in or random texture with the training texture: ``(S, S, 3)``.
 
-    :param share: Opacity of the upper one, in [0, 1].
-    :param name: Of the upper one.
-    :raises ValueError: if the share is out of its range, or the name none of a built-in or random texture.
+    :param share: Opacity of the texture over the training texture, in [0, 1].
+    :param name: ``"random-<seed>"`` or the name of a built-in texture.
+    :raises ValueError: if the share is out of its range or the name is unknown.
     """
     is_random = re.fullmatch(r"random-\d+", name)
     if not (0 <= share <= 1 and (name in _BUILT_IN or is_random)):
@@ -173,13 +164,13 @@ def blended_texture(share: float, name: str) -> np.ndarray:
 
 def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
     """
-    Turn a name, a path or an array into a texture.
+    Load a texture from a name, a path or an array.
 
     :param texture: A built-in name (``"brick"`` or one of ``TEST_TEXTURES``), ``"random-<seed>"`` for
-        :func:`random_texture`, ``"<percent>%-<name>"`` for one of these laid over the brick with this opacity
+        :func:`random_texture`, ``"<percent>%-<name>"`` for one of these over the brick with this opacity
         (``"40%-violet_dots"``), the path of an image file, or an array ``(H, W, 3)`` uint8.
     :return: ``(H, W, 3)`` uint8
-    :raises FileNotFoundError: if a path leads to no file.
+    :raises FileNotFoundError: if there is no such file.
     :raises ValueError: if a name is unknown, or if a file or an array is not an image.
     """
     if isinstance(texture, np.ndarray):
@@ -202,7 +193,7 @@ def _load_image(texture: str | os.PathLike[str]) -> np.ndarray:
     path = Path(texture).expanduser()
     if not path.is_file():
         if path.suffix or path != Path(path.name):
-            raise FileNotFoundError(f"texture={str(texture)!r}: there is no such image file; mend the path")
+            raise FileNotFoundError(f"texture={str(texture)!r}: there is no such image file")
         raise ValueError(
             f"texture={str(texture)!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', '<percent>%-<name>', "
             "or the path of an image file"

@@ -1,5 +1,5 @@
 """Environments on many cores or machines."""
 
-from sb3_tdpg.distributed.ray_vec_env import RayVecEnv
+from sb3_tdpg.distributed.ray_vec_env import DeadActorError, RayVecEnv
 
-__all__ = ["RayVecEnv"]
+__all__ = ["DeadActorError", "RayVecEnv"]

@@ -1,64 +1,129 @@
 """
-Environments that are spread over the machines of a Ray cluster, or over the cores of this one.
+Environments on the machines of a Ray cluster, or on the cores of this machine.
 
-Dimension key: N environments, in the order of ``env_fns``; each actor has a contiguous share of them.
+Dimension key: N environments in the order of ``env_fns``; each actor has a contiguous share B of them.
 """
 
 from __future__ import annotations
 
-import copy
+import itertools
+import math
+import os
+import pickle
+import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import cloudpickle
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from stable_baselines3.common.env_util import unwrap_wrapper
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_tdpg.distributed.ray_actor import Resets, Setting, Start, Steps, Taken, join
-from sb3_tdpg.distributed.ray_pool import ActorPool, Call, DeadActorError
 from sb3_tdpg.settings import check_count
+from sb3_tdpg.common.processes import usable_cores
+from sb3_tdpg.common.threads import set_threads
 
-__all__ = ["DeadActorError", "RayVecEnv"]
+CLOSE_TIMEOUT = 10.0  # s, after which an actor is killed although its environments are not closed
+
+
+class DeadActorError(RuntimeError):
+    """An actor died or did not answer, and Ray does not restart it: its running episodes are lost."""
+
+
+class EnvActor:
+    """Hold B environments in a ``DummyVecEnv``; its methods return the observations (or None) and the rest."""
+
+    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
+        set_threads(1)
+        self._env_fns = list(env_fns)
+        self._has_begun = False
+        self._life = uuid.uuid4().hex  # changes when Ray restarts the actor
+
+    @cached_property
+    def _env(self) -> DummyVecEnv:
+        # Made by the first call, because Ray does not pass on exceptions of an actor's constructor.
+        return DummyVecEnv(self._env_fns)
+
+    def call(self, message: bytes) -> tuple[bytes, bytes]:
+        """Call another method. All is pickled here: Ray takes 0.1 ms longer for an array, and makes it read-only."""
+        name, *arguments = cloudpickle.loads(message)
+        observations, rest = getattr(self, name)(*arguments)
+        return pickle.dumps(observations, pickle.HIGHEST_PROTOCOL), cloudpickle.dumps((self._life, rest))
+
+    def spaces(self, may_restart: bool) -> tuple[None, tuple[gym.Space, gym.Space]]:
+        """Return the observation and the action space."""
+        monitor = unwrap_wrapper(self._env.envs[0], Monitor)
+        if may_restart and isinstance(monitor, Monitor) and monitor.results_writer is not None:
+            raise ValueError(
+                "max_restarts must be 0 if Monitor writes a file, because a restarted actor would overwrite it: leave "
+                "out the file (monitor_dir) and wrap the RayVecEnv in VecMonitor(env, filename)"
+            )
+        return None, (self._env.observation_space, self._env.action_space)
+
+    def reset(self, seeds: list[int | None], options: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
+        """Reset the environments."""
+        self._env._seeds, self._env._options = seeds, options
+        self._has_begun = True
+        return self._env.reset(), self._env.reset_infos
+
+    def step(self, actions: np.ndarray) -> tuple[Any, Sequence[Any]]:
+        """Step the environments, or start new episodes if a restart has lost the running ones."""
+        if self._has_begun:
+            observations, *rest = self._env.step(actions)
+            return observations, (*rest, self._env.reset_infos)
+        n = len(actions)
+        observations, reset_infos = self.reset([None] * n, [{}] * n)
+        infos = [{"episode_lost": True, "TimeLimit.truncated": True} for _ in range(n)]
+        return observations, (np.zeros(n, np.float32), np.ones(n, bool), infos, reset_infos)
+
+    def ask(self, indices: list[int], method: str, args: Sequence[Any], kwargs: dict[str, Any]) -> tuple[None, Any]:
+        """Call a method of the ``DummyVecEnv`` that takes ``indices``."""
+        return None, getattr(self._env, method)(*args, indices=indices, **kwargs)
+
+    def close(self) -> tuple[None, None]:
+        """Close the environments."""
+        self._env.close()
+        return None, None
 
 
 class RayVecEnv(VecEnv):
     """
-    An SB3 ``VecEnv`` over Ray actors, each of which steps a batch of environments one after the other.
+    An SB3 ``VecEnv`` whose environments are in Ray actors, a ``DummyVecEnv`` in each.
 
-    It takes what ``SubprocVecEnv`` takes, and gives the same numbers for the same seeds; for where one machine has too
-    few cores, or a process for each environment is too many::
+    It gives the results of ``SubprocVecEnv`` for the same seeds, on the cores of several machines::
 
         make_vec_env("PandaGrasp-v0", n_envs=32, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=8))
 
-    If Ray has not been initialised (``ray.init``), the cluster that the variable ``RAY_ADDRESS`` names is joined;
-    without one, an instance is started on this machine, and shut down with the last ``RayVecEnv`` that uses it. Its
-    actors have the priority of this process, unless the variable ``RAY_worker_niceness`` is set; elsewhere Ray lets
-    all other programs go first (nice 15). Every machine of a cluster needs this package.
+    If Ray is not initialised (``ray.init``), this class joins the cluster of the environment variable ``RAY_ADDRESS``,
+    or starts Ray on this machine until the last ``RayVecEnv`` is closed. Every machine of a cluster needs this package.
 
-    An exception of an environment is raised here as it is. An actor that dies (killed, crashed, its machine lost) never
-    makes a call wait for ever: it is reported by a :class:`DeadActorError`, or, with ``max_restarts``, replaced, of
-    which a warning tells. The new actor makes its environments anew, and each repeats its unfinished episode from the
-    ``np_random`` at its beginning, with the attributes set so far and the same actions. So come the numbers that would
-    have come without the loss, provided that an episode depends on nothing else. Rewards and last observations are
-    compared; if they differ, or if ``env_method`` may have changed the environments, the death is reported after
-    all. (Ray's own restart would make new episodes pass for the old ones.)
+    Exceptions of an environment are raised as they are. If an actor dies (killed, crashed, machine lost), the next call
+    raises :class:`DeadActorError`. With ``max_restarts`` Ray restarts the actor instead, which makes its environments
+    anew: attributes that were set and the running episodes are lost. The next step warns and ends these episodes as a
+    time limit does: reward 0, the last observation as ``info["terminal_observation"]``, and True for ``done``,
+    ``info["TimeLimit.truncated"]`` and ``info["episode_lost"]``.
 
     :param env_fns: Each makes an environment.
-    :param n_actors: Number of actors, each with about as many environments; default: one for each CPU of the cluster,
-        but not more than environments.
-    :param max_restarts: How often each actor may be replaced. Not for environments that carry something from one
-        episode to the next, as a curriculum does: it is lost.
-    :param actor_options: Options of Ray for each actor, ``dict(num_cpus=2)`` or ``dict(num_gpus=0.1)`` for instance;
-        default: one CPU. On an instance started here CPUs are not counted unless they are asked for.
-    :param start_timeout: Seconds to wait for the actors to start, and for their environments to be made.
-    :param step_timeout: Seconds to wait for an answer after which an actor counts as dead; None: as long as it lives.
+    :param n_actors: Number of actors; default: one for each CPU of the cluster, but not more than environments.
+    :param max_restarts: How often Ray may restart each actor.
+    :param actor_options: Options of Ray for each actor, for instance ``dict(num_cpus=2)`` or ``dict(num_gpus=0.1)``;
+        default: one CPU, or none if this class has started Ray.
+    :param start_timeout: Seconds to wait until all actors have made their environments.
+    :param step_timeout: Seconds to wait for an answer before the actor is killed, as if it had died; None: no limit. It
+        must be longer than a restart takes.
     :raises ValueError: if an argument is out of its range.
-    :raises TimeoutError: if the actors did not start in time, for instance because the cluster has too few CPUs.
+    :raises TimeoutError: if the actors do not start in time, for instance because the cluster has too few CPUs.
     :raises ImportError: without Ray (``pip install sb3_tdpg[ray]``).
     """
+
+    # All objects share the connection to Ray: how many use it, whether this class made it, and whether Ray runs here.
+    _n_users, _is_ours, _is_local = 0, False, False
 
     def __init__(
         self,
@@ -72,133 +137,193 @@ class RayVecEnv(VecEnv):
     ) -> None:
         env_fns = list(env_fns)
         options = dict(actor_options or {})
-        _check_arguments(len(env_fns), n_actors, max_restarts, options)
-        for name, timeout in (("start_timeout", start_timeout), ("step_timeout", step_timeout)):
-            if timeout is not None and not timeout > 0:
-                raise ValueError(f"{name}={timeout!r} must be a positive number of seconds")
-        self._pool = ActorPool(
-            env_fns,
-            n_actors,
-            max_restarts=max_restarts,
-            actor_options=options,
-            start_timeout=start_timeout,
-            step_timeout=step_timeout,
-        )
-        self._keeps_histories = max_restarts > 0
-        self._actions: Any = None
-        self._calls: list[Call] = []
+        _check_arguments(len(env_fns), n_actors, max_restarts, options, (start_timeout, step_timeout))
+        self._max_restarts, self._start_timeout, self._step_timeout = max_restarts, start_timeout, step_timeout
+        self._actors: list[Any] = []
+        self._is_closed = False
+        self._connect(n_actors or min(len(env_fns), usable_cores()), options.get("num_cpus", 1))
         try:
-            super().__init__(len(env_fns), *self._pool.spaces)
+            n_actors = n_actors or min(len(env_fns), max(1, int(self._ray.cluster_resources().get("CPU", 1))))
+            bounds = [len(env_fns) * i // n_actors for i in range(n_actors + 1)]
+            self._shares = list(itertools.starmap(slice, itertools.pairwise(bounds)))
+            # On an instance of our own a second RayVecEnv, for evaluation, would wait for free CPUs for ever. Task
+            # events go to Ray's dashboard and cost 0.1 ms a step.
+            self._actor_options = {"num_cpus": 0 if self._is_local else 1, "enable_task_events": False, **options}
+            actor_class = self._ray.remote(EnvActor).options(
+                max_restarts=max_restarts, max_task_retries=-1 if max_restarts else 0, **self._actor_options
+            )
+            self._actors = [actor_class.remote(env_fns[share]) for share in self._shares]
+            self._lives: list[str | None] = [None] * n_actors
+            super().__init__(len(env_fns), *self._wait_for_start())
         except BaseException:
             self.close()
             raise
 
+    def _connect(self, n_actors: int, num_cpus: float) -> None:
+        """Connect to Ray, or start it on this machine if there is no cluster."""
+        try:
+            import ray
+        except ImportError as e:
+            raise ImportError("RayVecEnv needs Ray: pip install sb3_tdpg[ray]") from e
+        self._ray: Any = ray
+        if not ray.is_initialized():
+            is_local = not os.environ.get("RAY_ADDRESS")
+            RayVecEnv._n_users, RayVecEnv._is_ours, RayVecEnv._is_local = 0, True, is_local
+            # By default Ray lets every other program go first (nice 15).
+            config = {} if "RAY_worker_niceness" in os.environ else {"worker_niceness": 0}
+            n_cpus = max(1, math.ceil(n_actors * num_cpus))
+            local = dict(address="local", num_cpus=n_cpus, include_dashboard=False, _system_config=config)
+            self._ray.init(**(local if is_local else {}))
+        RayVecEnv._n_users += 1
+
+    def _wait_for_start(self) -> tuple[gym.Space, gym.Space]:
+        replies = [self._send(i, "spaces", self._max_restarts > 0) for i in range(len(self._actors))]
+        made = [rest for _, rest in replies]
+        _, late = self._ray.wait(made, num_returns=len(made), timeout=self._start_timeout)
+        if late:
+            raise TimeoutError(
+                f"{len(late)} of {len(made)} actors did not start within start_timeout={self._start_timeout:g} s. Each "
+                f"asks for {self._actor_options}; free are {self._ray.available_resources()}: use fewer actors "
+                "(n_actors), ask for less (actor_options), add machines, or wait longer (start_timeout)"
+            )
+        return self._receive_all(replies)[1][0]
+
+    # -- the actors ---------------------------------------------------------------------------------------------------
+
+    def _send(self, actor: int, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of an actor; return Ray's references to the observations and to the rest."""
+        # Ray needs 1 ms longer for an object of more than 100 kB: the terminal image must not travel with the next.
+        call = self._actors[actor].call.options(num_returns=2)
+        return call.remote(cloudpickle.dumps((method, *arguments)))
+
+    def _receive_all(self, replies: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
+        """Wait for the replies of all actors; return a tuple of the observations and one of the rest."""
+        return tuple(zip(*itertools.starmap(self._receive, enumerate(replies)), strict=True))
+
+    def _receive(self, actor: int, reply: list[Any]) -> tuple[Any, Any]:
+        share, timeout = self._shares[actor], self._step_timeout
+        name = f"actor {actor} of {len(self._shares)} (environments {share.start} to {share.stop - 1})"
+        while True:
+            try:
+                observations, rest = self._ray.get(reply, timeout=timeout)
+                break
+            except self._ray.exceptions.RayTaskError as error:
+                # Callers want the exception of the environment, for instance an AttributeError.
+                raise (error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))) from error
+            except self._ray.exceptions.GetTimeoutError:
+                self._ray.kill(self._actors[actor], no_restart=False)
+                timeout = self._start_timeout + (timeout or 0.0)
+            except self._ray.exceptions.RayError as error:
+                raise DeadActorError(
+                    f"{name} has died, or did not answer within step_timeout={self._step_timeout}: "
+                    f"{str(error).strip().partition(chr(10))[0]} Make a new RayVecEnv and continue from the last "
+                    f"checkpoint; max_restarts={self._max_restarts} is how often Ray restarts an actor"
+                ) from error
+        life, result = cloudpickle.loads(rest)
+        if self._lives[actor] not in (None, life):
+            warnings.warn(f"Ray has restarted {name}: its running episodes and attributes are lost", stacklevel=2)
+        self._lives[actor] = life
+        return pickle.loads(observations), result
+
+    def _ask(self, indices: VecEnvIndices, method: str, *args: Any, **kwargs: Any) -> list[Any]:
+        """Call a method of the actors' ``DummyVecEnv`` for some environments; return one result for each."""
+        wanted = [range(self.num_envs)[i] for i in self._get_indices(indices)]
+        replies = [
+            (actor, self._send(actor, "ask", [i - share.start], method, args, kwargs))
+            for i in wanted
+            for actor, share in enumerate(self._shares)
+            if share.start <= i < share.stop
+        ]
+        return [(self._receive(actor, reply)[1] or [None])[0] for actor, reply in replies]
+
+    # -- VecEnv -------------------------------------------------------------------------------------------------------
+
     def reset(self) -> VecEnvObs:
         """Start N episodes: observations, ``(N, *obs)``."""
-        calls = [
-            self._pool.send(i, "reset", self._seeds[share.start : share.stop], self._options[share.start : share.stop])
-            for i, share in enumerate(self._pool.shares)
-        ]
-        rests: list[Resets] = self._pool.observe(calls)
-        self.reset_infos = [info for rest in rests for info in rest.infos]
-        for i, start in enumerate(start for rest in rests for start in rest.starts):
-            self._pool.histories[i].begin_episode(start)
+        replies = [self._send(i, "reset", self._seeds[s], self._options[s]) for i, s in enumerate(self._shares)]
+        parts, infos = self._receive_all(replies)
+        self.reset_infos = list(itertools.chain(*infos))
         # Seeds and options are used once.
         self._reset_seeds()
         self._reset_options()
-        return self._observations()
+        return self._join(parts)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Send each actor the actions of its environments, ``(N, U)`` in all."""
         if len(actions) != self.num_envs:
             raise ValueError(f"{len(actions)} actions were given: {self.num_envs} environments need as many")
-        self._actions = copy.deepcopy(actions) if self._keeps_histories else actions
-        self._calls = [
-            self._pool.send(i, "step", self._actions[share.start : share.stop])
-            for i, share in enumerate(self._pool.shares)
-        ]
+        self._replies = [self._send(i, "step", actions[share]) for i, share in enumerate(self._shares)]
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Gather what the actors return; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
-        rests: list[Steps] = self._pool.observe(self._calls)
-        rewards = np.concatenate([rest.rewards for rest in rests])
-        dones = np.concatenate([rest.dones for rest in rests])
-        infos = [info for rest in rests for info in rest.infos]
-        reset_infos, starts = list(self.reset_infos), {}
-        for share, rest in zip(self._pool.shares, rests, strict=True):
-            for i, info in rest.reset_infos.items():
-                reset_infos[share[i]] = info
-            starts.update({share[i]: start for i, start in rest.starts.items()})
-        self.reset_infos = reset_infos
-        if self._keeps_histories:
-            self._record_step(rewards, starts)
-        return self._observations(), rewards, dones, infos
+        """Wait for the result of the step; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
+        parts, rests = self._receive_all(self._replies)
+        rewards, dones, infos_of_actors, reset_infos = zip(*rests, strict=True)
+        infos = list(itertools.chain(*infos_of_actors))
+        for info, observation in zip(infos, self._last_observations, strict=True):
+            if info.get("episode_lost"):
+                info["terminal_observation"] = observation
+        self.reset_infos = list(itertools.chain(*reset_infos))
+        return self._join(parts), np.concatenate(rewards), np.concatenate(dones), infos
 
-    def _record_step(self, rewards: np.ndarray, starts: Mapping[int, Start]) -> None:
-        for i, (history, action, reward) in enumerate(zip(self._pool.histories, self._actions, rewards, strict=True)):
-            if i in starts:
-                history.begin_episode(starts[i])
-            else:
-                history.events.append(Taken(action, reward))
-
-    def _observations(self) -> VecEnvObs:
-        # A copy, also of one: what comes from Ray's object store cannot be written to.
-        return join(self._pool.last_observations, self.observation_space, np.concatenate)
+    def _join(self, parts: Sequence[Any]) -> VecEnvObs:
+        """Join the observations of all actors, ``(B, *obs)`` each."""
+        space = self.observation_space
+        self._last_observations = list(itertools.chain(*(iterate(batch_space(space), part) for part in parts)))
+        out: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, self._last_observations, out)
 
     def close(self) -> None:
         """Close the environments and end the actors; closing twice is fine."""
-        self._pool.close()
-
-    # -- single environments ------------------------------------------------------------------------------------------
-
-    def _indices(self, indices: VecEnvIndices) -> list[int]:
-        return [range(self.num_envs)[i] for i in self._get_indices(indices)]
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if self._ray.is_initialized() and self._actors:
+            replies = [self._send(i, "close")[1] for i in range(len(self._actors))]
+            has_started = hasattr(self, "num_envs")  # otherwise an actor may still wait for its CPUs
+            self._ray.wait(replies, num_returns=len(replies), timeout=CLOSE_TIMEOUT if has_started else 0)
+            for actor in self._actors:
+                self._ray.kill(actor)
+        RayVecEnv._n_users -= 1
+        if RayVecEnv._n_users == 0 and RayVecEnv._is_ours:
+            self._ray.shutdown()
+            RayVecEnv._is_ours = RayVecEnv._is_local = False
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment."""
-        return self._pool.ask(self._indices(indices), "get_attr", attr_name)
-
-    def has_attr(self, attr_name: str) -> bool:
-        """Tell whether all environments have an attribute."""
-        return all(self._pool.ask(self._indices(None), "has_attr", attr_name))
+        return self._ask(indices, "get_attr", attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of each environment."""
-        setting = Setting(attr_name, cloudpickle.dumps(value))
-        self._pool.ask(self._indices(indices), "set_attr", setting)
-        if self._keeps_histories:
-            for i in self._indices(indices):
-                self._pool.histories[i].events.append(setting)
+        self._ask(indices, "set_attr", attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of each environment."""
-        results = self._pool.ask(self._indices(indices), "env_method", method_name, method_args, method_kwargs)
-        if method_name != "render":
-            self._pool.unrecorded = method_name
-        return results
+        return self._ask(indices, "env_method", method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Tell of each environment whether it has a wrapper of this class."""
-        return self._pool.ask(self._indices(indices), "env_is_wrapped", wrapper_class)
+        """Return for each environment whether it has a wrapper of this class."""
+        return self._ask(indices, "env_is_wrapped", wrapper_class)
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render each environment."""
-        if self.render_mode != "rgb_array":
-            warnings.warn(f"render_mode={self.render_mode!r} must be 'rgb_array' for images", stacklevel=2)
-            return [None] * self.num_envs
-        return self._pool.ask(self._indices(None), "render")
+        return self.env_method("render")
 
 
-def _check_arguments(n_envs: int, n_actors: int | None, max_restarts: int, options: Mapping[str, Any]) -> None:
+def _check_arguments(
+    n_envs: int, n_actors: int | None, max_restarts: int, options: Mapping[str, Any], timeouts: Sequence[float | None]
+) -> None:
     if n_envs == 0:
         raise ValueError("env_fns is empty: give one function for each environment")
     if n_actors is not None:
         check_count("n_actors", n_actors)
-        if n_actors > n_envs:
-            raise ValueError(f"n_actors={n_actors} must be at most the number of environments: {n_envs}")
+    if n_actors is not None and n_actors > n_envs:
+        raise ValueError(f"n_actors={n_actors} must be at most the number of environments: {n_envs}")
     if not (isinstance(max_restarts, (int, np.integer)) and max_restarts >= 0):
         raise ValueError(f"max_restarts={max_restarts!r} must be an integer of at least 0")
     if taken := {"max_restarts", "max_task_retries"} & set(options):
         raise ValueError(f"actor_options has {sorted(taken)}: give max_restarts to RayVecEnv itself")
+    for name, timeout in zip(("start_timeout", "step_timeout"), timeouts, strict=True):
+        if timeout is not None and not timeout > 0:
+            raise ValueError(f"{name}={timeout!r} must be a positive number of seconds")

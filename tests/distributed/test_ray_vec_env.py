@@ -1,4 +1,4 @@
-"""Environments in Ray's actors give SubprocVecEnv's numbers, and a dead actor is replaced or reported."""
+"""Environments in Ray actors give the results of SB3's VecEnvs, and a dead actor is restarted or reported."""
 
 import multiprocessing
 import os
@@ -18,13 +18,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import CSVOutputFormat, Logger
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_tdpg import TDPG, TrainingCheckpointCallback
 
 ray = pytest.importorskip("ray")
 
-from sb3_tdpg.distributed.ray_vec_env import DeadActorError, RayVecEnv  # noqa: E402
+from sb3_tdpg.distributed import DeadActorError, RayVecEnv  # noqa: E402
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 N = 3  # not a multiple of the number of actors: environment 0 is in actor 0, the others are in actor 1
@@ -101,26 +101,6 @@ class WanderEnv(gym.Env):
         raise KeyError("lost key")
 
 
-class OwnNoiseEnv(WanderEnv):
-    """Draws from a generator of its own, which no seed reaches, where it begins or for its rewards."""
-
-    def __init__(self, kind, name, noise_in):
-        super().__init__(kind, name)
-        self.noise_in = noise_in
-
-    def reset(self, *, seed=None, options=None):
-        _, info = super().reset(seed=seed, options=options)
-        if self.noise_in == "reset":
-            self.x += np.random.default_rng().standard_normal(3)
-        return self._observe(), info
-
-    def step(self, action):
-        observation, reward, *rest = super().step(action)
-        if self.noise_in == "reward":
-            reward += np.random.default_rng().standard_normal()
-        return observation, reward, *rest
-
-
 class CrashingEnv(WanderEnv):
     """Takes its process along, each time it is told to."""
 
@@ -187,8 +167,7 @@ def assert_same(first, second):
 
 def kill(env, index):
     """Kill -9 the process of the actor that an environment is in."""
-    # Not env_method: after it nothing is replaced.
-    (pid,) = env._pool.ask([index], "env_method", "pid", (), {})
+    (pid,) = env.env_method("pid", indices=index)
     assert pid != os.getpid()
     os.kill(pid, signal.SIGKILL)
 
@@ -205,14 +184,14 @@ def trace(env, n_steps=15, *, seed=3, before_step=None):
     return seen
 
 
-# -- the same as SubprocVecEnv ----------------------------------------------------------------------------------------
+# -- the same as DummyVecEnv and SubprocVecEnv ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "kind", ["box", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("dict", "tuple", "discrete"))]
 )
-def test_it_gives_what_subproc_vec_env_gives(kind, make):
-    ours, theirs = make(wanderers(kind)), SubprocVecEnv(wanderers(kind))
+def test_it_gives_what_dummy_vec_env_gives(kind, make):
+    ours, theirs = make(wanderers(kind)), DummyVecEnv(wanderers(kind))
     seen = trace(ours)
     assert_same(seen, trace(theirs))
     ends = {info["ends"] for step in seen[1:] for info in step[3]}
@@ -324,35 +303,33 @@ def test_a_dead_actor_is_reported_by_name_at_every_call_and_the_rest_can_be_clos
     env.close()
 
 
-def test_a_replaced_actor_goes_on_as_if_nothing_had_happened(make):
-    lengths = []
-
-    def settings_and_deaths(env, deaths):
-        def before_step(t):
-            if t == 2:
-                env.set_attr("gain", 0.5)  # in mid-episode
-            if t == 9:
-                env.set_attr("gain", 0.25, indices=[1])
-            if t == 11:  # in mid-episode, too
-                lengths.append(env.get_attr("t", indices=[1, 2]))
-            if t in deaths:
-                kill(env, deaths[t])
-
-        return before_step
-
-    undisturbed = make(wanderers("dict"))
-    expected = trace(undisturbed, before_step=settings_and_deaths(undisturbed, {}))
-    undisturbed.close()
-    env = make(wanderers("dict"), max_restarts=2)
-    with pytest.warns(UserWarning, match=r"actor . of 2 .* is replaced \(restart . of at most 2\)") as warned:
-        seen = trace(env, before_step=settings_and_deaths(env, {0: 2, 11: 1}))
-    assert_same(seen, expected)
-    assert len(warned) == 2
-    assert lengths[0] == lengths[1]
-    assert 0 not in lengths[0]
-    kill(env, 1)
-    with pytest.raises(DeadActorError, match=r"max_restarts=2"):
-        env.step(actions(0))
+@pytest.mark.parametrize("kind", ["box", pytest.param("dict", marks=pytest.mark.slow)])
+def test_a_restarted_actor_ends_its_lost_episodes_like_a_time_limit_and_starts_new_ones(kind, make):
+    undisturbed = DummyVecEnv(wanderers(kind))
+    expected = trace(undisturbed)
+    env = make(wanderers(kind), max_restarts=2)
+    env.seed(3)
+    last_observations = env.reset()
+    kill(env, 2)
+    with pytest.warns(UserWarning, match=r"restarted actor 1 of 2 \(environments 1 to 2\).*episodes.*lost"):
+        observations, rewards, dones, infos = env.step(actions(0))
+    assert list(dones) == [False, True, True]
+    np.testing.assert_array_equal(rewards[1:], 0.0)
+    for i in (1, 2):
+        assert infos[i]["TimeLimit.truncated"]
+        assert infos[i]["episode_lost"]
+        one = {key: value[i] for key, value in last_observations.items()} if kind == "dict" else last_observations[i]
+        assert_same(infos[i]["terminal_observation"], one)
+        begins_at = env.reset_infos[i]["begins_at"]
+        np.testing.assert_array_equal((observations["walk"] if kind == "dict" else observations)[i], begins_at)
+    # Nothing happens to the other actor, and the new episodes go on.
+    assert_same(infos[0], expected[1][3][0])
+    assert env.get_attr("t") == [1, 0, 0]
+    _, _, dones, infos = env.step(actions(1))
+    assert env.get_attr("t", indices=[1, 2]) == [0 if done else 1 for done in dones[1:]]
+    assert not any("episode_lost" in info for info in infos)
+    # With the same seed, environments that were made anew give the same episodes.
+    assert_same(trace(env)[1:], expected[1:])
 
 
 class Lava(gym.Wrapper):
@@ -377,14 +354,11 @@ def killing_at(*steps):
     return AtEveryStep(strike)
 
 
-def test_a_training_that_loses_actors_ends_with_the_parameters_of_one_that_does_not(make, tmp_path):
-    undisturbed = lava_model(make([Lava] * 2))
-    train_epochs(undisturbed, 4)
-    undisturbed.env.close()
-    replaced = lava_model(make([Lava] * 2, max_restarts=2))
-    with pytest.warns(UserWarning, match="is replaced"):
-        train_epochs(replaced, 4, callback=killing_at(7, 23))
-    assert_same_parameters(parameters(replaced.policy), parameters(undisturbed.policy))
+def test_a_training_goes_on_after_an_actor_was_restarted(make):
+    model = lava_model(make([Lava] * 2, max_restarts=1))
+    with pytest.warns(UserWarning, match="Ray has restarted actor 1 of 2"):
+        train_epochs(model, 4, callback=killing_at(7))
+    assert model.epoch == 4
 
 
 def test_a_training_goes_on_from_its_checkpoint_after_a_dead_actor_was_reported(make, tmp_path):
@@ -402,36 +376,15 @@ def test_a_training_goes_on_from_its_checkpoint_after_a_dead_actor_was_reported(
     assert_same_parameters(parameters(resumed.policy), parameters(undisturbed.policy))
 
 
-@pytest.mark.parametrize("noise_in, n_steps", [("reset", 0), ("reward", 2)])
-def test_an_actor_whose_environments_do_not_come_out_as_before_is_reported_not_replaced(noise_in, n_steps, make):
-    env = make(wanderers(env_class=OwnNoiseEnv, noise_in=noise_in), max_restarts=3)
-    env.seed(1)
-    env.reset()
-    for t in range(n_steps):
-        env.step(actions(t))
-    assert env.get_attr("t", indices=[0]) == [n_steps]  # still the first episode
-    kill(env, 0)
-    for _ in range(2):  # nothing goes on with other episodes
-        with pytest.warns(UserWarning), pytest.raises(DeadActorError, match="more than np_random and the actions"):
-            env.step(actions(1))
-
-
-def test_an_actor_is_not_replaced_after_a_method_that_may_have_changed_its_environments(make):
-    env = make(wanderers(), max_restarts=3)
-    env.reset()
-    env.env_method("double", 1)
-    kill(env, 0)
-    with pytest.raises(DeadActorError, match=r"env_method\('double'\) may have changed"):
-        env.step(actions(0))
-
-
 @pytest.mark.slow
-def test_an_action_that_kills_every_replacement_is_reported_in_the_end(make):
-    env = make(wanderers(n=2, env_class=CrashingEnv), max_restarts=2)
+def test_an_action_that_kills_every_restarted_actor_is_reported_in_the_end(make):
+    env = make(wanderers(n=2, env_class=CrashingEnv), max_restarts=1)
     env.reset()
-    with pytest.warns(UserWarning) as warned, pytest.raises(DeadActorError, match=r"actor 1 of 2.*max_restarts=2"):
-        env.step(np.array([[0, 0], [1, 0]], np.float32))
-    assert len(warned) == 2
+    action = np.array([[0, 0], [1, 0]], np.float32)
+    with pytest.warns(UserWarning, match="restarted"):
+        env.step(action)
+    with pytest.raises(DeadActorError, match=r"actor 1 of 2.*max_restarts=1"):
+        env.step(action)
 
 
 @pytest.mark.parametrize("max_restarts", [0, 1])
@@ -440,14 +393,17 @@ def test_an_actor_that_does_not_answer_counts_as_dead(max_restarts, make, tmp_pa
     env.reset()
     action = np.array([[1, 0]], np.float32)
     if max_restarts == 0:
-        with pytest.raises(DeadActorError, match=r"actor 0 of 1 .*timed out"):
+        with pytest.raises(DeadActorError, match=r"actor 0 of 1 .*did not answer within step_timeout=2\.0"):
             env.step(action)
     else:
-        with pytest.warns(UserWarning, match="is replaced"):
-            env.step(action)
+        with pytest.warns(UserWarning, match="has restarted actor 0"):
+            _, _, dones, infos = env.step(action)
+        assert dones[0]
+        assert infos[0]["episode_lost"]
+        assert not env.step(action)[2][0]
 
 
-def test_files_of_monitor_are_not_begun_anew_by_a_replacement(make, tmp_path):
+def test_files_of_monitor_are_not_overwritten_by_a_restarted_actor(make, tmp_path):
     env_fns = [lambda: Monitor(WanderEnv(), str(tmp_path / "log"))]
     with pytest.raises(ValueError, match=r"VecMonitor\(env, filename\)"):
         make(env_fns, 1, max_restarts=1)
@@ -492,7 +448,7 @@ import os
 import gymnasium as gym
 import ray
 from stable_baselines3.common.env_util import make_vec_env
-from sb3_tdpg.distributed.ray_vec_env import RayVecEnv
+from sb3_tdpg.distributed import RayVecEnv
 
 class Polite(gym.Wrapper):
     niceness = property(lambda self: os.nice(0))

@@ -12,7 +12,6 @@ from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_bullet import BulletRenderer
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.ball_fast import FastRenderer
-from sb3_tdpg.envs.ball_scene import Renderer
 from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
 
 
@@ -51,7 +50,7 @@ def bench_camera(sizes: Sizes) -> Iterable[Row]:
     fast, reference = FastRenderer(env.scene), BulletRenderer(env.scene)
     some = max(1, n // 50)  # of the images by PyBullet, which draws them one by one anyway
 
-    def draw(renderer: Renderer, n_images: int) -> None:
+    def draw(renderer: FastRenderer | BulletRenderer, n_images: int) -> None:
         for state in states:  # as in a rollout, images are let go before the next ones are drawn
             renderer.images(state[:n_images])
 

@@ -121,7 +121,7 @@ def grasping_of_two(vec_env_class: Callable[..., VecEnv], n_steps: int) -> tuple
 def bench_processes(sizes: Sizes) -> Iterable[Row]:
     """Compare Ray's actors with SB3's processes, two of each, in the same trials."""
     try:
-        from sb3_tdpg.distributed.ray_vec_env import RayVecEnv
+        from sb3_tdpg.distributed import RayVecEnv
 
         ours, run_ours = grasping_of_two(RayVecEnv, sizes.n_episodes // 100)
     except ImportError as e:
