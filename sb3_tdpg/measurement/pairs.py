@@ -7,9 +7,9 @@ variables, D components of either or both, J = 4 features of each: its normal sc
 
 from __future__ import annotations
 
-import math
+import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from torch import nn
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator, Scores
-from sb3_tdpg.information.flat_adam import AveragedAdam
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.measurement.copula_start import (
@@ -30,13 +29,14 @@ from sb3_tdpg.measurement.copula_start import (
     degrees_of_freedom,
     t_scores,
 )
-from sb3_tdpg.networks import BatchedLinear, BatchedMLP, ELUGradient
+from sb3_tdpg.networks import BatchedMLP, ELUGradient, flatten_parameters
 
 STEPS_PER_CHECK = 50
 MIN_VARIANCE = 1e-2  # of what is brought to variance 1
 MARGINAL_SAMPLES = 16  # partners of others that x is also read with
 MIN_PAIRS_PER_FOLD = 10
 N_WAVES = 3
+AVERAGE_DECAY = 0.98  # weight on the past, after the first steps: averages over about 50 steps
 PAIRS_AT_ONCE = 800
 
 
@@ -202,44 +202,21 @@ def _inputs(features: th.Tensor, train: th.Tensor, n_x: int) -> th.Tensor:
     return th.stack(brought).flatten(4).flatten(0, 3).float()
 
 
-def _elu_(x: th.Tensor) -> th.Tensor:
-    """ELU in place, to within 1e-7: ``max(x, exp(min(x, 0)) - 1)``, by a power of 2, which is faster than that of e."""
-    exponential = x.clamp(max=0).mul_(math.log2(math.e)).exp2_()
-    return th.maximum(x, exponential.sub_(1), out=x)
-
-
-def _to_one(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
-    """Map to one output, ``(M, N, I) -> (M, N, 1)``, in the order that takes a fifth of the time."""
-    return th.baddbmm(bias, weight.mT, x.mT).mT
-
-
-class _QuickELU(nn.ELU):
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return _elu_(x)
-
-
 class StartedMLP(BatchedMLP):
     """
     Networks that are added to a fixed critic, and are zero at first.
 
-    They are given pairs as places in a table, and look up what x and z bring to their inputs and to the start. What is
-    drawn, repeated and put together for a minibatch is then numbers alone.
+    Their inputs are pairs of places in a table that holds what each x and each z adds to the inputs and to the start.
     """
 
     start: Start
-    table: th.Tensor  # see `add_up`: what is brought to the J * (X + Z) inputs, then to the start
+    table: th.Tensor  # see `add_up`: what is added to the J * (X + Z) inputs, then to the start
 
     def forward(self, pairs: th.Tensor) -> th.Tensor:
         """``(rows, n, 2) -> (rows, n, 1)``."""
-        # Not all at once: what the layers make of so many is to stay in the processor's cache.
+        # In parts, so that the values of the hidden layers stay in the processor's cache.
         parts = (self.prepare(part) for part in pairs.split(PAIRS_AT_ONCE, dim=1))
-        return th.cat([start + self._outputs(inputs) for inputs, start in parts], 1)
-
-    def _outputs(self, inputs: th.Tensor) -> th.Tensor:
-        *hidden, last = cast("list[BatchedLinear]", list(self.layers))
-        for layer in hidden:
-            inputs = self.activation(layer(inputs))
-        return _to_one(inputs, last.weight, last.bias)
+        return th.cat([start + super(StartedMLP, self).forward(inputs) for inputs, start in parts], 1)
 
     def prepare(self, pairs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Inputs of the networks, ``(rows, n, J * (X + Z))``, and what is added to their outputs, ``(rows, n, 1)``."""
@@ -248,24 +225,18 @@ class StartedMLP(BatchedMLP):
         return sums[..., :n_inputs], self.start.of_sums(sums[..., n_inputs:])
 
     def gradient_by_hand(self) -> ELUGradient:
-        """Return the means to evaluate and differentiate this critic; see :class:`ELUGradient`."""
-        return _StartedGradient(self, super().gradient_by_hand())
+        """Return a faster way than autograd to evaluate and differentiate this critic; see :class:`ELUGradient`."""
+        return _StartedGradient(self)
 
 
 class _StartedGradient(ELUGradient):
-    def __init__(self, critic: StartedMLP, network: ELUGradient) -> None:
-        self.__dict__.update(network.__dict__)
-        self._critic = critic
+    def __init__(self, critic: StartedMLP) -> None:
+        super().__init__(critic)
+        self._prepare = critic.prepare
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """As that of the base class, with kernels that take half the time but round in another way."""
-        inputs, start = self._critic.prepare(x)
-        *hidden, (last_weight, last_bias) = self._layers
-        self._inputs = [inputs]
-        for weight, bias in hidden:
-            inputs = _elu_(th.baddbmm(bias, inputs, weight))
-            self._inputs.append(inputs)
-        return start.add_(_to_one(inputs, last_weight, last_bias))
+        inputs, start = self._prepare(x)
+        return start + super().forward(inputs)
 
 
 # -- folds ----------------------------------------------------------------------------------------------------
@@ -316,8 +287,8 @@ def _cross_fit(
 
     th.manual_seed(seed)
     critic = _new_critic(estimator, start, _inputs(_features(ranks), train, n_x), n_folds)
-    optimizer = AveragedAdam(estimator.learning_rate)
-    optimizer.attach(critic)
+    optimizer = estimator.make_optimizer(critic)
+    averaged = _average(critic, optimizer)
     first = read(start, fresh)
     choice = _Choice(estimator.refit_below, estimator.refit_above, first, read(start, seen))
     best = first.mean(-1)
@@ -327,13 +298,30 @@ def _cross_fit(
         n_steps = min(STEPS_PER_CHECK, max_gradient_steps - n_done)
         estimator._ascend(critic, optimizer, *samples, n_steps)
         n_done += n_steps
-        with optimizer.averaged():
-            current = read(critic, fresh)
-            choice.consider(current, lambda: read(critic, seen), training)
+        current = read(averaged, fresh)
+        choice.consider(current, lambda: read(averaged, seen), training)
         improved = current.mean(-1) > best
         n_stale = th.where(training & improved, 0.0, n_stale + 1)
         best = best.fmax(current.mean(-1))
     return choice.held_out.mean(-1), choice.trained_on.mean(-1)
+
+
+def _average(critic: StartedMLP, optimizer: th.optim.Adam) -> StartedMLP:
+    """
+    Return a copy whose weights are the moving average of the critic's (Polyak and Juditsky, 1992).
+
+    The average is free of most of the noise of minibatches, so that the learning rate can be large. (The
+    ``AveragedModel`` of PyTorch takes longer for a step than all else.)
+    """
+    averaged = copy.deepcopy(critic)
+    average, (weights,) = flatten_parameters(averaged), optimizer.param_groups[0]["params"]
+
+    def update(*_: object) -> None:
+        n = optimizer.state[weights]["step"].item()
+        average.lerp_(weights, 1 - min(AVERAGE_DECAY, n / (n + 10)))
+
+    optimizer.register_step_post_hook(update)
+    return averaged
 
 
 def _level(estimator: CriticEstimator) -> float:
@@ -348,8 +336,6 @@ def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_f
     with th.random.fork_rng(devices=[]):  # what is drawn here is overwritten
         critic = StartedMLP(len(start.factor), sizes, estimator.activation_fn)
     critic.start, critic.table = start, th.cat([inputs, start.table], -1)
-    if estimator.activation_fn is nn.ELU:
-        critic.activation = _QuickELU()
     for parameter, fold in zip(critic.parameters(), networks.parameters(), strict=True):
         parameter.copy_(fold.repeat(len(parameter) // n_folds, 1, 1))
     last = critic.layers[-1]
