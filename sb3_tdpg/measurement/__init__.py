@@ -4,9 +4,9 @@ Measure the information of a trained policy: confidence intervals, checks of the
 Only ``callback`` imports Stable-Baselines3.
 """
 
+from sb3_tdpg.measurement.checks import TrustBadge, TrustCheck, trust_checks
 from sb3_tdpg.measurement.interval import InformationInterval, information_interval
 from sb3_tdpg.measurement.pairs import InformationEstimate, estimate_information
-from sb3_tdpg.measurement.trust import TrustBadge, TrustCheck, trust_checks
 
 __all__ = [
     "InformationEstimate",
