@@ -16,9 +16,7 @@ from sb3_tdpg.measurement.interval import LOWER_BOUNDS, InformationInterval, inf
 
 NEAR_THE_CAP = 0.9  # share of ln N
 FALSE_ALARM = 0.01  # probability that a check of a sound interval fails, over all time steps
-ADDED_VARIANCE = (
-    3.0  # variance of the added noise in the data-processing check, relative to the encoder's mean variance
-)
+ADDED_VARIANCE = 3.0  # of the noise added for data processing, relative to the encoder's mean variance
 
 
 @dataclass(frozen=True)

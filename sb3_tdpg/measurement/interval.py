@@ -209,7 +209,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     horizon, _, trv_dim = batch.trvs.shape
     estimates, errors = ({name: np.full(horizon, np.nan) for name in names} for _ in range(2))
     limits = np.full((2, horizon), np.nan)
-    lower_names, upper_names = [""] * horizon, [""] * horizon
+    lower_by, upper_by = [""] * horizon, [""] * horizon
     n_episodes = np.zeros(horizon, dtype=int)
     for t in range(horizon):
         at_t = batch.at(t)
@@ -231,15 +231,13 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
         miss_below, miss_above = (
             miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)
         )
-        lower_names[t], lower = limit(below, miss_below, sign=-1)
-        upper_names[t], upper = limit(above, miss_above, sign=1)
+        lower_by[t], lower = limit(below, miss_below, sign=-1)
+        upper_by[t], upper = limit(above, miss_above, sign=1)
         if lower <= 0:
-            lower_names[t], lower = "zero", 0.0
+            lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
         limits[:, t] = min(lower, upper), upper
-    return InformationInterval(
-        *limits, tuple(lower_names), tuple(upper_names), estimates, errors, n_episodes, confidence
-    )
+    return InformationInterval(*limits, tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes, confidence)
 
 
 def component_estimates(
