@@ -92,7 +92,7 @@ class ELUGradient:
     """
     Evaluate and differentiate a :class:`BatchedMLP` with ELU layers without autograd.
 
-    A whole training with MINE takes about 1.3 times as long with autograd. Use it under ``torch.no_grad()``; the
+    With autograd a whole training with MINE takes 1.3 to 1.5 times as long. Use it under ``torch.no_grad()``; the
     parameters must have a ``grad``, which :meth:`backward` overwrites.
 
     :param network: The network.
