@@ -17,6 +17,7 @@ from torch.nn.functional import elu
 
 # Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
 MAX_TIME_VARYING_HORIZON = 50
+VECTOR = 64  # a multiple of the numbers that any processor handles at a time
 
 
 class BatchedLinear(nn.Module):
@@ -75,9 +76,8 @@ class BatchedMLP(nn.Module):
         return x
 
     def gradient_by_hand(self) -> ELUGradient:
-        """Return the means to evaluate and differentiate this network without autograd; see :class:`ELUGradient`."""
-        assert isinstance(self.activation, nn.ELU), "only the derivative of ELU is written out"
-        return ELUGradient([(layer.weight, layer.bias) for layer in cast("list[BatchedLinear]", list(self.layers))])
+        """Return a faster way than autograd to evaluate and differentiate this network; see :class:`ELUGradient`."""
+        return ELUGradient(self)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
         """Evaluate the network of one index: ``(N, I) -> (N, O)``."""
@@ -92,18 +92,20 @@ class BatchedMLP(nn.Module):
 
 class ELUGradient:
     """
-    A :class:`BatchedMLP` with ELU layers, evaluated and differentiated by hand.
+    Evaluate and differentiate a :class:`BatchedMLP` with ELU layers without autograd.
 
-    For so small a network this takes a third of the time that modules and autograd take. To be used under
-    ``torch.no_grad()``. The gradients are written into the parameters' ``grad``, which must exist.
+    With autograd a whole training with MINE takes 1.3 to 1.5 times as long. Use it under ``torch.no_grad()``; the
+    parameters must have a ``grad``, which :meth:`backward` overwrites.
 
-    :param layers: weight ``(M, I, O)`` and bias ``(M, 1, O)`` of each layer
+    :param network: The network.
     """
 
-    def __init__(self, layers: Sequence[tuple[nn.Parameter, nn.Parameter]]) -> None:
+    def __init__(self, network: BatchedMLP) -> None:
+        assert isinstance(network.activation, nn.ELU), "only the derivative of ELU is written out"
+        layers = cast("list[BatchedLinear]", list(network.layers))
         # Plain tensors on the same memory: calls on parameters are slower.
-        self._layers = [(weight.data, bias.data) for weight, bias in layers]
-        self._gradients = [(cast(th.Tensor, weight.grad), cast(th.Tensor, bias.grad)) for weight, bias in layers]
+        self._layers = [(layer.weight.data, layer.bias.data) for layer in layers]
+        self._gradients = [(cast(th.Tensor, layer.weight.grad), cast(th.Tensor, layer.bias.grad)) for layer in layers]
         self._inputs: list[th.Tensor] = []
 
     def forward(self, x: th.Tensor) -> th.Tensor:
@@ -121,7 +123,7 @@ class ELUGradient:
 
         :param grad: derivative of a scalar with respect to the last output, ``(M, N, O)``
         """
-        for i in range(len(self._layers) - 1, -1, -1):
+        for i in reversed(range(len(self._layers))):
             (weight, _), (weight_grad, bias_grad), x = self._layers[i], self._gradients[i], self._inputs[i]
             is_column = grad.shape[2] == 1
             if is_column:  # a product of matrices is slow at this shape
@@ -132,7 +134,29 @@ class ELUGradient:
             if i > 0:
                 grad = grad * weight.mT if is_column else th.bmm(grad, weight.mT)
                 # d elu(z) / dz in terms of h = elu(z): 1 where h > 0, and exp(z) = h + 1 elsewhere.
-                th.ops.aten.elu_backward.grad_input(grad, 1.0, 1.0, 1.0, True, x, grad_input=grad)
+                grad.mul_((x + 1).clamp_(max=1))
+
+
+def flatten_parameters(module: nn.Module) -> nn.Parameter:
+    """
+    Lay out the parameters of a module, and their gradients, as views of one vector each.
+
+    An optimiser's step on one vector takes a fraction of the time of a step on many small tensors. Call it again after
+    the parameters may have been moved or replaced (``to``, ``copy.deepcopy``).
+
+    :return: the vector, whose ``grad`` is the vector of all gradients
+    """
+    parameters = list(module.parameters())
+    sizes = [parameter.numel() for parameter in parameters]
+    # PyTorch rounds the last few numbers of a vector differently. With the padding a network makes the same steps
+    # alone as in a larger vector.
+    sizes.append(-sum(sizes) % VECTOR)
+    vector = nn.Parameter(th.cat([*(x.detach().flatten() for x in parameters), parameters[0].new_zeros(sizes[-1])]))
+    vector.grad = th.zeros_like(vector)
+    values, gradients = vector.data.split(sizes), vector.grad.split(sizes)
+    for parameter, value, gradient in zip(parameters, values, gradients, strict=False):  # all but the padding
+        parameter.data, parameter.grad = value.view_as(parameter), gradient.view_as(parameter)
+    return vector
 
 
 class TimeMLP(nn.Module):

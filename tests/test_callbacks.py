@@ -19,7 +19,6 @@ from small_problems import (
 
 from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback, TrainingDivergedError
 from sb3_tdpg.envs.lava import LavaEnv
-from sb3_tdpg.information.flat_adam import FlatAdam
 
 
 class Scripted(AtEveryEpoch):
@@ -163,7 +162,7 @@ def test_ctrl_c_in_mid_rollout_leaves_a_model_that_predicts_saves_and_learns_on(
 
 def test_ctrl_c_while_the_critics_are_fitted_leaves_a_usable_model(tmp_path, monkeypatch):
     model = train_epochs(tiny_tdpg(mi_estimator="mine"), 1)
-    before, steps, original = parameters(model.policy), [], FlatAdam.step
+    before, steps, original = parameters(model.policy), [], th.optim.Adam.step
 
     def interrupt_the_second_step(optimizer):
         steps.append(optimizer)
@@ -172,7 +171,7 @@ def test_ctrl_c_while_the_critics_are_fitted_leaves_a_usable_model(tmp_path, mon
         original(optimizer)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(FlatAdam, "step", interrupt_the_second_step)
+        patch.setattr(th.optim.Adam, "step", interrupt_the_second_step)
         train_epochs(model, 2, reset_num_timesteps=False)
     assert_same_parameters(parameters(model.policy), before)
     model.save(tmp_path / "model")

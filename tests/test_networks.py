@@ -4,8 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_tdpg.information.flat_adam import AveragedAdam, FlatAdam
-from sb3_tdpg.networks import BatchedLinear, BatchedMLP, TimeMLP
+from sb3_tdpg.networks import BatchedLinear, BatchedMLP, TimeMLP, flatten_parameters
 
 T, N = 3, 5
 
@@ -71,23 +70,22 @@ def test_a_network_without_hidden_layers_is_affine():
 
 
 @pytest.mark.parametrize("by_hand", [True, False])
-def test_flat_adam_makes_the_steps_of_torchs_adam(by_hand):
+def test_one_flat_parameter_makes_the_steps_of_many(by_hand):
     th.manual_seed(0)
     ours = BatchedMLP(T, (2, 8, 4, 1))
     theirs = BatchedMLP(T, (2, 8, 4, 1))
     theirs.load_state_dict(ours.state_dict())
-    flat, adam = FlatAdam(0.01), th.optim.Adam(theirs.parameters(), lr=0.01)
+    adam = th.optim.Adam(theirs.parameters(), lr=0.01)
+    flat = th.optim.Adam([flatten_parameters(ours)], lr=0.01, fused=True)
+    gradient = ours.gradient_by_hand()
     target = th.randn(T, N, 1)
-    for step in range(20):
+    for _ in range(20):
         x = th.randn(T, N, 2)
-        if step in (0, 10):  # the second time the moments must be kept
-            flat.attach(ours)
-            gradient = ours.gradient_by_hand()
         if by_hand:
             with th.no_grad():
                 gradient.backward(2 * (gradient.forward(x) - target))
         else:
-            flat.zero_grad()
+            flat.zero_grad(set_to_none=False)
             (ours(x) - target).square().sum().backward()
         flat.step()
         adam.zero_grad()
@@ -95,22 +93,3 @@ def test_flat_adam_makes_the_steps_of_torchs_adam(by_hand):
         adam.step()
     for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
         th.testing.assert_close(one, other)
-
-
-def test_averaged_adam_lends_the_average_of_the_parameters_and_goes_on_with_its_own():
-    th.manual_seed(0)
-    linear = nn.Linear(1, 1, bias=False)
-    averaged = AveragedAdam(0.1, decay=0.5)
-    values, average = [], None
-    for step in range(20):
-        if step in (0, 10):  # the second time the average must be kept
-            averaged.attach(linear)
-        average = linear.weight.item() if average is None else average
-        linear.weight.grad.fill_((-1.0) ** (step // 3))
-        averaged.step()
-        values.append(linear.weight.item())
-        past = min(0.5, (step + 1) / (step + 11))
-        average = past * average + (1 - past) * values[-1]
-        with averaged.averaged():
-            assert linear.weight.item() == pytest.approx(average, abs=1e-5)
-        assert linear.weight.item() == values[-1]

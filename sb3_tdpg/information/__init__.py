@@ -1,7 +1,7 @@
 """
-Mutual-information estimators and bounds; knows nothing of Stable-Baselines3.
+Mutual-information estimators and bounds; independent of Stable-Baselines3.
 
-A new estimator is a file of its own here and a row in :data:`ESTIMATORS`.
+To add an estimator, add a file here and a row to :data:`ESTIMATORS`.
 """
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
@@ -27,10 +27,10 @@ ESTIMATORS: dict[str, type[InformationEstimator]] = {
 
 def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[InformationEstimator]:
     """
-    Look up an estimator.
+    Return the class of an estimator.
 
-    :param estimator: A name in :data:`ESTIMATORS` or a class of one's own.
-    :raises ValueError: if the name is unknown or the class is no :class:`InformationEstimator`.
+    :param estimator: A name in :data:`ESTIMATORS`, or a subclass of :class:`InformationEstimator`.
+    :raises ValueError: if it is neither.
     """
     if isinstance(estimator, str) and estimator in ESTIMATORS:
         return ESTIMATORS[estimator]

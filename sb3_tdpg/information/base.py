@@ -14,7 +14,7 @@ from torch import nn
 
 
 class InformationBatch(NamedTuple):
-    """Samples of x_t and of the TRVs, with the encoder's density at each."""
+    """Samples of x_t and of the TRVs, with the parameters of the encoder's density."""
 
     states: th.Tensor  # (T, N, X)
     trvs: th.Tensor  # (T, N, Z), x~_t = means + stds * noise
@@ -23,12 +23,12 @@ class InformationBatch(NamedTuple):
     alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
 
     def at(self, t: int) -> InformationBatch:
-        """Only step t, and there only the episodes that are still alive: ``(1, n, ...)``."""
+        """Select step t and its living episodes: ``(1, n, ...)``."""
         keep = slice(None) if self.alive is None else self.alive[t]
         return InformationBatch(*(x[t, keep][None] for x in self[:4]))
 
     def select(self, episodes: th.Tensor) -> InformationBatch:
-        """Only some episodes, given by their columns: ``(T, n, ...)``."""
+        """Select episodes by their indices: ``(T, n, ...)``."""
         alive = None if self.alive is None else self.alive[:, episodes]
         return InformationBatch(*(x[:, episodes] for x in self[:4]))._replace(alive=alive)
 
@@ -43,7 +43,7 @@ class InformationEstimator(nn.Module):
     """
 
     bound: ClassVar[Literal["lower", "upper", "neither"]]
-    """Whether the expectation of the estimate is a lower or an upper bound on I[x_t; x~_t], or neither."""
+    """Whether the expected estimate is a lower or an upper bound on I[x_t; x~_t], or neither."""
 
     def __init__(self, horizon: int, state_dim: int, trv_dim: int) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class InformationEstimator(nn.Module):
 
     def fit(self, batch: InformationBatch) -> dict[str, float]:
         """
-        Fit what the estimator learns to detached samples; nothing for a critic-free bound.
+        Fit the estimator to detached samples; does nothing for a bound without parameters.
 
         :return: diagnostics for the log
         """
@@ -63,7 +63,7 @@ class InformationEstimator(nn.Module):
         """
         Estimate I[x_t; x~_t], differentiable in ``trvs``, ``means`` and ``stds``.
 
-        A step at which fewer than :meth:`min_episodes` episodes are alive counts as 0: nothing can be said of it.
+        The estimate is 0 at steps with fewer than :meth:`min_episodes` living episodes.
 
         :return: ``(T,)``, nats
         """
@@ -75,13 +75,13 @@ class InformationEstimator(nn.Module):
         return th.cat([self._estimate(batch.at(t), t) if n >= enough else zero for t, n in enumerate(alive)])
 
     def min_episodes(self, n_episodes: int) -> int:
-        """Return the number of living episodes that an estimate needs, out of a batch of ``n_episodes``."""
+        """Return the number of living episodes that an estimate needs in a batch of ``n_episodes``."""
         return min(self.trv_dim + 2, n_episodes)
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         """
-        Estimate for all steps (``t=None``, ``(T, N, ...) -> (T,)``) or for step t alone (``(1, n, ...) -> (1,)``).
+        Estimate all steps (``t=None``, ``(T, N, ...) -> (T,)``) or only step t (``(1, n, ...) -> (1,)``).
 
-        Every episode of the batch is alive.
+        All episodes of the batch are alive.
         """

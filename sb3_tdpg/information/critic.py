@@ -1,5 +1,5 @@
 """
-What the estimators with a trained critic F^theta have in common.
+The base class of the estimators with a trained critic F^theta.
 
 Dimension key: T time steps, N episodes, B minibatch, K marginal samples for each state, X state, Z TRVs.
 """
@@ -14,10 +14,10 @@ import torch as th
 from torch import nn
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
-from sb3_tdpg.information.flat_adam import FlatAdam
-from sb3_tdpg.networks import BatchedMLP
+from sb3_tdpg.networks import BatchedMLP, flatten_parameters
 
 MIN_EPISODES = 2  # for an estimate: a state is paired with the TRVs of another episode
+MOMENTS = ("exp_avg", "exp_avg_sq", "step")  # of Adam, in the order in which they are saved
 
 
 class Scores(NamedTuple):
@@ -28,8 +28,8 @@ class Scores(NamedTuple):
 
 
 def derange(n: int, device: th.device) -> th.Tensor:
-    """Give each of n episodes another one, each once: ``(n,)``."""
-    # A random cyclic order makes a derangement: no state is paired with its own TRVs.
+    """Draw a permutation of n episodes without fixed points: ``(n,)``."""
+    # A random cycle: no state is paired with its own TRVs.
     order = th.randperm(n, device=device)
     other = th.empty_like(order)
     other[order] = order.roll(1)
@@ -40,8 +40,7 @@ class CriticEstimator(InformationEstimator):
     """
     T critics F^theta_t(x_t, x~_t) as one batched network (Algorithm 1), fitted to each epoch's rollouts.
 
-    A subclass says which bound the scores make (:meth:`_bound`), and, where the critic is trained on something else
-    than the bound itself, on what (:meth:`_objective`).
+    A subclass defines the bound (:meth:`_bound`), and the critics' objective (:meth:`_objective`) if it is another one.
 
     :param horizon: Number of time steps T.
     :param state_dim: X
@@ -49,20 +48,20 @@ class CriticEstimator(InformationEstimator):
     :param hidden_sizes: Hidden layers of each critic.
     :param activation_fn: Nonlinearity of the critics.
     :param learning_rate: Adam's learning rate.
-    :param batch_size: Minibatch size B; at most half of the episodes is used, since the joint and the marginal samples
-        of a step come from different episodes.
-    :param gradient_steps: Optimiser steps ("MINE epochs") for each policy epoch.
-    :param warmup_gradient_steps: The same for the first epoch.
-    :param refit_below: A critic whose estimate on the batch is not finite or is below this value (in nats; the truth is
-        never negative) has diverged: it starts anew and is fitted for ``refit_gradient_steps``. A frozen critic's bound
-        is unbounded below, and without this guard a policy learns to exploit it.
-    :param refit_above: Likewise for an estimate above this value: no encoder in use carries as many nats.
+    :param batch_size: Minibatch size B; at most half of the episodes, since joint and marginal samples of a step come
+        from different episodes.
+    :param gradient_steps: Optimiser steps ("MINE epochs") in each policy epoch.
+    :param warmup_gradient_steps: Optimiser steps in the first policy epoch.
+    :param refit_below: Critics with an estimate on the batch below this value, in nats, or one that is not finite, have
+        diverged. They are fitted from new weights for ``refit_gradient_steps``. Without this guard a policy can exploit
+        a frozen critic, whose bound has no lower limit.
+    :param refit_above: Likewise for estimates above this value.
     :param refit_gradient_steps: See ``refit_below``.
-    :param reset_moments: Whether Adam's moments start from zero at each epoch: the data have moved.
-    :param standardize: Whether each component of the state is brought to mean 0 and variance 1 at each time step.
-    :param held_out: Share of the episodes, drawn anew at each fit, that the critics are not trained on. :meth:`fit`
-        then also reports the estimate on these, summed over the time steps, as ``"held_out"``, and that on the others
-        as ``"trained_on"``. Where the second is far above the first, the critics have learnt their samples by heart.
+    :param reset_moments: Whether Adam's moments start from zero in each epoch, since the data have changed.
+    :param standardize: Whether to standardise each component of the state at each time step.
+    :param held_out: Share of the episodes, drawn in each fit, that the critics are not trained on. :meth:`fit` reports
+        the estimates on these and on the others, summed over the time steps, as ``"held_out"`` and ``"trained_on"``. If
+        the latter is much larger, the critics overfit.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class CriticEstimator(InformationEstimator):
         self.standardize = standardize
         self.held_out = held_out
         self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
-        self.optimizer = FlatAdam(learning_rate)
+        self.moments: dict[str, th.Tensor] = {}  # of Adam; none before the first fit
         self.is_warm = False
         self.register_buffer("state_mean", th.zeros(horizon, 1, state_dim))
         self.register_buffer("state_std", th.ones(horizon, 1, state_dim))
@@ -117,24 +116,24 @@ class CriticEstimator(InformationEstimator):
 
     @abstractmethod
     def _bound(self, scores: Scores) -> th.Tensor:
-        """The estimate that these scores make: ``(T,)``, nats."""
+        """Compute the estimate from the scores: ``(T,)``, nats."""
 
     def _objective(self, scores: Scores, steps: th.Tensor) -> th.Tensor:
         """
-        What the critic's gradient ascends: ``(T,)``.
+        Compute the critics' objective, which is maximised: ``(T,)``.
 
-        :param scores: scores of a minibatch for the time steps in ``steps``
+        :param scores: scores of a minibatch at the time steps in ``steps``
         :param steps: indices of these time steps
         """
         return self._bound(scores)
 
     def _pair(self, states: th.Tensor, trvs: th.Tensor, other_trvs: th.Tensor) -> th.Tensor:
         """
-        Lay out the critic's inputs for one call: the joint samples, then the marginal ones.
+        Build the critic's inputs: the joint samples, then the marginal ones.
 
         :param states: ``(..., B, X)``
-        :param trvs: ``(..., B, Z)`` of the same episodes
-        :param other_trvs: ``(..., B, Z)`` of other episodes
+        :param trvs: TRVs of the same episodes, ``(..., B, Z)``
+        :param other_trvs: TRVs of other episodes, ``(..., B, Z)``
         :return: ``(..., B + B * K, X + Z)``
         """
         return th.cat([th.cat([states, trvs], -1), th.cat([states, other_trvs], -1)], dim=-2)
@@ -157,28 +156,36 @@ class CriticEstimator(InformationEstimator):
         if len(steps) == 0:
             return self._report(0, train, held_out, steps)
 
-        if self.reset_moments:
-            self.optimizer.forget()
+        optimizer = self.make_optimizer(self.critic)
+        (vector,) = optimizer.param_groups[0]["params"]
+        if self.moments and not self.reset_moments:
+            optimizer.state[vector] = {name: moment.to(vector.device) for name, moment in self.moments.items()}
         n_steps = self.gradient_steps if self.is_warm else max(self.warmup_gradient_steps, self.gradient_steps)
-        self._ascend(self.critic, self.optimizer, states, trvs, train.alive, steps, n_steps)
+        self._ascend(self.critic, optimizer, states, trvs, train.alive, steps, n_steps)
+        self.moments = optimizer.state[vector]
         self.is_warm = True
 
-        # On all episodes, as the policy's loss is.
-        broken = steps[self._is_broken(batch)[steps]]
+        with th.no_grad():
+            estimate = self(batch)[steps]  # on all episodes, like the policy's loss
+        broken = steps[~((estimate >= self.refit_below) & (estimate <= self.refit_above))]  # NaN compares false
         if len(broken) > 0:
             self._refit(states, trvs, train.alive, broken)
         return self._report(len(broken), train, held_out, steps)
 
+    def make_optimizer(self, critic: BatchedMLP) -> th.optim.Adam:
+        """Make an Adam that moves all parameters of a network as one vector, which is much faster."""
+        return th.optim.Adam([flatten_parameters(critic)], lr=self.learning_rate, fused=True)
+
     def _hold_out(self, batch: InformationBatch) -> tuple[InformationBatch, InformationBatch | None]:
-        """Divide the episodes at random into those that are trained on and those that are not, if there are any."""
+        """Divide the episodes at random into those to train on and those to hold out, if any."""
         if self.held_out == 0:
             return batch, None
         n = batch.trvs.shape[1]
         n_held_out = round(self.held_out * n)
         if min(n_held_out, n - n_held_out) < MIN_EPISODES:
             raise ValueError(
-                f"mi_kwargs: held_out={self.held_out} of {n} episodes keeps {n_held_out} from the critics and leaves "
-                f"them {n - n_held_out}: each needs at least {MIN_EPISODES}; change the share, or use more episodes"
+                f"mi_kwargs: held_out={self.held_out} of {n} episodes holds out {n_held_out} and trains on "
+                f"{n - n_held_out}: each needs at least {MIN_EPISODES}; change the share, or use more episodes"
             )
         order = th.randperm(n, device=batch.trvs.device)
         return batch.select(order[n_held_out:]), batch.select(order[:n_held_out])
@@ -187,7 +194,7 @@ class CriticEstimator(InformationEstimator):
     def _report(
         self, n_refits: int, train: InformationBatch, held_out: InformationBatch | None, steps: th.Tensor
     ) -> dict[str, float]:
-        """What :meth:`fit` returns; ``steps`` are those whose critics were trained."""
+        """Build the result of :meth:`fit`; ``steps`` are the trained ones."""
         report = {"critic_refits": float(n_refits)}
         if held_out is not None:
             report["trained_on"] = self._total(train, steps)
@@ -195,7 +202,7 @@ class CriticEstimator(InformationEstimator):
         return report
 
     def _total(self, batch: InformationBatch, steps: th.Tensor) -> float:
-        """Sum the estimates of some steps, each from the episodes that live there, if there are enough."""
+        """Sum the estimates of some steps over those with enough living episodes."""
         living = ((t, batch.at(t)) for t in steps.tolist())
         return float(sum(self._estimate(at, t).item() for t, at in living if at.trvs.shape[1] >= MIN_EPISODES))
 
@@ -203,25 +210,24 @@ class CriticEstimator(InformationEstimator):
     def _ascend(
         self,
         critic: BatchedMLP,
-        optimizer: FlatAdam,
+        optimizer: th.optim.Optimizer,
         states: th.Tensor,
         trvs: th.Tensor,
         alive: th.Tensor | None,
         steps: th.Tensor,
         n_gradient_steps: int,
     ) -> None:
-        """Gradient ascent on the objective; ``critic`` has one network for each row of ``states`` and ``trvs``."""
+        """Maximise the objective; ``critic`` has one network for each row of ``states`` and ``trvs``."""
         n_rows, n_episodes = trvs.shape[:2]
         n = min(self.batch_size, n_episodes // 2)
-        # Without a critic for every row (a refit) the rows are those of `steps`; otherwise `steps` picks rows.
+        # In a refit the rows are those of `steps`; otherwise `steps` selects rows.
         rows = slice(None) if len(steps) == n_rows else steps
-        optimizer.attach(critic)
         by_hand = critic.gradient_by_hand() if self.activation_fn is nn.ELU else None
         for inputs in self._minibatches(states, trvs, alive, n, n_gradient_steps):
             if by_hand is not None:
                 by_hand.backward(self._objective_gradient(by_hand.forward(inputs), n, rows, steps))
             else:
-                optimizer.zero_grad()
+                optimizer.zero_grad(set_to_none=False)
                 with th.enable_grad():
                     values = critic(inputs)
                 values.backward(self._objective_gradient(values.detach(), n, rows, steps))
@@ -230,9 +236,9 @@ class CriticEstimator(InformationEstimator):
     def _minibatches(
         self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, n: int, n_gradient_steps: int
     ) -> Iterator[th.Tensor]:
-        """Draw the critics' inputs for each gradient step: n joint samples, and TRVs of n other episodes."""
+        """Draw the critics' inputs for each gradient step from n joint samples and the TRVs of n other episodes."""
         n_rows, n_episodes = trvs.shape[:2]
-        # Many steps are drawn at a time, as far as memory allows: one call costs as much as one step of the network.
+        # Draw as many steps at once as memory allows: a call takes as long as a gradient step.
         per_step = n_rows * (n_episodes + self._n_pairs(n) * sum(self.sizes[:1]))
         chunk = max(1, min(n_gradient_steps, 4_000_000 // per_step))
         for start in range(0, n_gradient_steps, chunk):
@@ -240,10 +246,10 @@ class CriticEstimator(InformationEstimator):
             if alive is None:
                 chosen = th.rand(size, 1, n_episodes, device=trvs.device).topk(2 * n, dim=2).indices
             else:
-                # Dead episodes sort to the end; steps with fewer than 2n living ones are not trained on.
+                # Dead episodes come last; steps with fewer than 2n living ones are not trained.
                 priority = th.rand(size, *alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
                 chosen = priority.topk(2 * n, dim=2, largest=False).indices
-            # Whole rows of (T * N, .), which is faster than two indices for each number.
+            # Selecting rows of (T * N, .) is faster than indexing two dimensions.
             index = (chosen + n_episodes * th.arange(n_rows, device=trvs.device)[:, None]).flatten()
             chosen_states, chosen_trvs = (
                 x.flatten(0, 1).index_select(0, index).view(size, n_rows, 2 * n, -1) for x in (states, trvs)
@@ -251,16 +257,16 @@ class CriticEstimator(InformationEstimator):
             yield from self._pair(chosen_states[..., :n, :], chosen_trvs[..., :n, :], chosen_trvs[..., n:, :])
 
     def _n_pairs(self, n: int) -> int:
-        """How many samples a minibatch of n makes for the critic."""
+        """Return the number of the critic's inputs for a minibatch of n."""
         return 2 * n
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
         """
-        Differentiate minus the objective with respect to the critic's outputs.
+        Differentiate the negative objective with respect to the critic's outputs.
 
-        :param values: outputs for the inputs that :meth:`_pair` laid out, ``(T, B + B * K, 1)``
+        :param values: outputs for the inputs of :meth:`_pair`, ``(T, B + B * K, 1)``
         :param n: minibatch size B
-        :param rows: the rows of ``values`` that count
+        :param rows: the rows of ``values`` to train
         :param steps: their time steps
         :return: ``(T, B + B * K, 1)``
         """
@@ -270,26 +276,20 @@ class CriticEstimator(InformationEstimator):
             loss = -self._objective(Scores(scores.joint[rows], scores.marginal[rows]), steps).sum()
             return th.autograd.grad(loss, values)[0]
 
-    @th.no_grad()
-    def _is_broken(self, batch: InformationBatch) -> th.Tensor:
-        estimate = self(batch)
-        return ~((estimate >= self.refit_below) & (estimate <= self.refit_above))  # NaN compares false
-
     def _refit(self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, broken: th.Tensor) -> None:
-        """Give the critics of the steps ``broken`` new weights and fit them, leaving the others alone."""
+        """Fit the critics of the steps ``broken`` from new weights."""
         fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(trvs)
         self._forget(broken)
-        self.optimizer.forget()  # the old moments may not be finite, either
+        self.moments = {}  # the old moments may not be finite, either
         rows = None if alive is None else alive[broken]
-        self._ascend(
-            fresh, FlatAdam(self.learning_rate), states[broken], trvs[broken], rows, broken, self.refit_gradient_steps
-        )
+        optimizer = self.make_optimizer(fresh)
+        self._ascend(fresh, optimizer, states[broken], trvs[broken], rows, broken, self.refit_gradient_steps)
         with th.no_grad():
             for parameter, fresh_parameter in zip(self.critic.parameters(), fresh.parameters(), strict=True):
                 parameter[broken] = fresh_parameter
 
     def _forget(self, steps: th.Tensor) -> None:
-        """Drop what a subclass remembers of these steps beside the weights."""
+        """Reset what a subclass stores for these steps in addition to the weights."""
 
     @th.no_grad()
     def _update_scaling(self, batch: InformationBatch) -> None:
@@ -297,7 +297,7 @@ class CriticEstimator(InformationEstimator):
         total = weight.sum(1, keepdim=True).clamp(min=1)
         self.state_mean = (batch.states * weight).sum(1, keepdim=True) / total
         variance = (weight * (batch.states - self.state_mean) ** 2).sum(1, keepdim=True) / total
-        # A component that is constant at this step carries no information: leave it at 0 instead of dividing by 0.
+        # A constant component carries no information and becomes 0.
         self.state_std = th.where(variance > 1e-12, variance.sqrt(), th.ones_like(variance))
 
     def _scale(self, states: th.Tensor, t: int | None = None) -> th.Tensor:
@@ -305,7 +305,7 @@ class CriticEstimator(InformationEstimator):
         return (states - self.state_mean[rows]) / self.state_std[rows]
 
     def min_episodes(self, n_episodes: int) -> int:
-        """Return twice the minibatch: below that no step of gradient ascent is made."""
+        """Return twice the minibatch size, which a gradient step needs."""
         return 2 * min(self.batch_size, n_episodes // 2)
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
@@ -317,10 +317,13 @@ class CriticEstimator(InformationEstimator):
         return self._bound(self._split(values, n))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what is not a tensor of the module: Adam's moments and whether the warm-up is done."""
-        return {"optimizer": self.optimizer.state_dict(), "is_warm": self.is_warm}
+        """Return Adam's moments and whether the warm-up is done."""
+        moments = tuple(self.moments[name] for name in MOMENTS) if self.moments else None
+        return {"optimizer": {"moments": moments}, "is_warm": self.is_warm}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
-        self.optimizer.load_state_dict(state["optimizer"])
+        """Restore what :meth:`get_extra_state` returned."""
+        moments = state["optimizer"]["moments"] or ()
+        # Copies, since Adam changes its moments in place.
+        self.moments = {name: moment.clone() for name, moment in zip(MOMENTS, moments, strict=False)}
         self.is_warm = state["is_warm"]

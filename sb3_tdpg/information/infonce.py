@@ -12,18 +12,18 @@ from sb3_tdpg.information.critic import CriticEstimator, Scores
 
 class InfoNCE(CriticEstimator):
     r"""
-    Tell each state's own TRVs from those of the other states in a minibatch:
+    The contrastive bound, which distinguishes each state's TRVs from those of the other states in a minibatch:
 
     .. math::
         E\left[F(x_i, \tilde x_i) - \log \frac{1}{B} \sum_j e^{F(x_i, \tilde x_j)}\right].
 
-    A lower bound with little variance that can never exceed ``ln B``: ``batch_size=50`` reads 3.9 nats at the most.
+    A lower bound with low variance that cannot exceed ``ln B``: 3.9 nats with ``batch_size=50``.
     """
 
     bound = "lower"
 
     def _pair(self, states: th.Tensor, trvs: th.Tensor, other_trvs: th.Tensor) -> th.Tensor:
-        """Every state with its own TRVs first, then with every TRVs of the minibatch: ``(..., B + B * B, X + Z)``."""
+        """Pair every state with its own TRVs, then with all TRVs of the minibatch: ``(..., B + B * B, X + Z)``."""
         n = states.shape[-2]
         grid_states = states.unsqueeze(-2).expand(*states.shape[:-1], n, states.shape[-1]).flatten(-3, -2)
         grid_trvs = trvs.unsqueeze(-3).expand(*trvs.shape[:-2], n, *trvs.shape[-2:]).flatten(-3, -2)
@@ -42,7 +42,7 @@ class InfoNCE(CriticEstimator):
         n_steps, n = trvs.shape[:2]
         size = min(self.batch_size, n)
         n_groups = n // size
-        # The bound is defined for groups of B samples: average it over the groups that the batch makes.
+        # The bound is defined for groups of B samples: average it over the groups in the batch.
         states, trvs = (x[:, : n_groups * size].unflatten(1, (n_groups, size)) for x in (states, trvs))
         inputs = self._pair(states, trvs, trvs)  # (T, G, B + B * B, X + Z)
         flat = inputs.flatten(1, 2)

@@ -9,15 +9,15 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 class LogDet(InformationEstimator):
     r"""
-    The Gaussian has the largest entropy of all densities with the same covariance, hence with e_t = (x~_{t-1}, y_t)
+    A Gaussian has the largest entropy of all densities with the same covariance. With e_t = (x~_{t-1}, y_t),
 
     .. math::
         I[x_t; \tilde x_t] \le I[e_t; \tilde x_t] = h(\tilde x_t) - h(\tilde x_t | e_t)
         \le \tfrac12 \log\det \mathrm{Cov}(\tilde x_t) - E[\textstyle\sum_i \log \sigma_i(e_t)].
 
-    The first step is the data-processing inequality: x_t tells no more of x~_t than the encoder's input does.
-    Exact when x~_t is Gaussian, loose when it has several modes. The covariance is taken by the law of total
-    covariance, ``Cov(mean) + E[diag(std^2)]``: without the sampling noise of the TRVs, and never negative.
+    The first step is the data-processing inequality. The second is exact for a Gaussian x~_t, and loose for one with
+    several modes. The covariance follows from the law of total covariance, ``Cov(mean) + E[diag(std^2)]``: without the
+    sampling noise of the TRVs, and never singular.
     """
 
     bound = "upper"
@@ -26,7 +26,7 @@ class LogDet(InformationEstimator):
         means, stds = batch.means, batch.stds
         centred = means - means.mean(dim=1, keepdim=True)
         covariance = centred.mT @ centred / (means.shape[1] - 1) + th.diag_embed(stds.square().mean(dim=1))
-        # Divided by the mean log std first: the determinant of the quotient stays representable.
+        # Dividing by the geometric mean of the stds first keeps the determinant representable.
         log_std = stds.log().mean(dim=1)  # (T, Z)
         scale = th.exp(-log_std)
         return 0.5 * th.logdet(covariance * scale[:, :, None] * scale[:, None, :])

@@ -18,8 +18,7 @@ class LeaveOneOut(InformationEstimator):
         \frac{q(\tilde x_i | e_i)}{\frac{1}{N-1} \sum_{j \ne i} q(\tilde x_i | e_j)}\right],
         \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    An upper bound in expectation. It makes no assumption about the shape of q(x~_t), and becomes loose above about
-    ln N.
+    An upper bound in expectation, for any shape of q(x~_t). It is loose above about ln N.
     """
 
     bound = "upper"
@@ -34,14 +33,14 @@ class LeaveOneOut(InformationEstimator):
 
 def own_sample_bound(batch: InformationBatch) -> th.Tensor:
     r"""
-    Bound the information from below with the mixture of all episodes' encoder densities, its own among them.
+    Bound the information from below with the mixture of the encoder densities of all episodes.
 
     .. math::
         I[e_t; \tilde x_t] \ge E\left[\frac1N \sum_i \log
         \frac{q(\tilde x_i | e_i)}{\frac1N \sum_j q(\tilde x_i | e_j)}\right], \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    This is InfoNCE with the best critic that there is, and at most ln N. Where the encoder's input is a function of the
-    state (no memory, T = 1, and no sensor noise), it bounds :math:`I[x_t; \tilde x_t]`, too.
+    This is InfoNCE with the optimal critic, and at most ln N. Where the encoder's input is a function of the state (no
+    memory, T = 1, and no sensor noise), it also bounds :math:`I[x_t; \tilde x_t]`.
 
     :return: ``(T,)``, nats
     """
@@ -52,14 +51,14 @@ def own_sample_bound(batch: InformationBatch) -> th.Tensor:
 
 def log_density_matrix(batch: InformationBatch) -> th.Tensor:
     """
-    Log q(x~_i | e_j) of every sample under every episode's encoder, up to a constant: ``(T, i, j)``.
+    Return log q(x~_i | e_j) of every sample for every episode, up to a constant: ``(T, i, j)``.
 
-    :param batch: Every episode of it is alive.
+    :param batch: A batch whose episodes are all alive.
     """
     trvs, means, stds = batch.trvs, batch.means, batch.stds
     precision = stds.square().reciprocal()  # (T, N, Z)
-    # sum_z (x_iz - m_jz)^2 / s_jz^2 as products of matrices: (T, N, N) without a (T, N, N, Z) intermediate. Centred
-    # first, since the expansion of the square loses digits far from the origin.
+    # sum_z (x_iz - m_jz)^2 / s_jz^2 as matrix products, without a (T, N, N, Z) intermediate. Centred first, since the
+    # expanded square loses digits far from the origin.
     centre = means.mean(dim=1, keepdim=True).detach()
     x, m = trvs - centre, means - centre
     quadratic = x.square() @ precision.mT - 2 * x @ (m * precision).mT + (m.square() * precision).sum(-1)[:, None, :]

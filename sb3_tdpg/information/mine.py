@@ -11,22 +11,22 @@ from sb3_tdpg.information.critic import CriticEstimator, Scores
 
 
 def log_mean_exp(x: th.Tensor) -> th.Tensor:
-    """Logarithm of the mean of ``exp(x)`` over all dimensions but the first: ``(T, ...) -> (T,)``."""
+    """Return the logarithm of the mean of ``exp(x)`` over all dimensions but the first: ``(T, ...) -> (T,)``."""
     x = x.flatten(1)
     return th.logsumexp(x, dim=1) - math.log(x.shape[1])
 
 
 class Mine(CriticEstimator):
     r"""
-    The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (equation 8).
+    The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (Equation 8).
 
-    A lower bound for a fixed critic on *fresh* samples, but for the bias of the logarithm of a mean: it is upward, and
-    small with many samples. On the samples that the critic was fitted to it is neither, and tends to be too high.
+    A lower bound for a fixed critic on *fresh* samples, except for the upward bias of the logarithm of a mean, which is
+    small for many samples. On the samples that the critic was fitted to, it tends to be too high.
 
-    :param ema_decay: With it the denominator of the critic's gradient (equation 10) is an exponential
-        moving average over the gradient steps, to lessen the bias of minibatches. It is the weight **on the past**:
-        0.99 averages over about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no
-        averaging. ``None``: each minibatch's own mean.
+    :param ema_decay: Weight **on the past** of an exponential moving average over gradient steps, which replaces the
+        denominator of the critic's gradient (Equation 10) to reduce the bias of minibatches: 0.99 averages over about
+        100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging. ``None``: the mean
+        of each minibatch.
     :param kwargs: See :class:`~sb3_tdpg.information.critic.CriticEstimator`.
     :raises ValueError: if ``ema_decay`` is not in [0, 1).
     """
@@ -40,7 +40,7 @@ class Mine(CriticEstimator):
         if ema_decay is not None and not 0 <= ema_decay < 1:
             raise ValueError(f"mi_kwargs: ema_decay={ema_decay} must be in [0, 1): it is the weight on the past")
         self.ema_decay = ema_decay
-        # Logarithm of the moving average for each time step; NaN until the first minibatch.
+        # Logarithm of the moving average at each time step; NaN before the first minibatch.
         self.register_buffer("log_ema", th.full((horizon,), math.nan))
 
     log_ema: th.Tensor
@@ -49,7 +49,7 @@ class Mine(CriticEstimator):
         return scores.joint.mean(dim=1) - log_mean_exp(scores.marginal)
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """In closed form (equation 10): -1 / B at the joint samples, a softmax at the marginal ones."""
+        """Differentiate in closed form (Equation 10): -1 / B at joint samples, a softmax at marginal ones."""
         gradient = th.zeros_like(values)
         marginal = values[rows, n:, 0]
         gradient[rows, :n, 0] = -1.0 / n
@@ -61,7 +61,7 @@ class Mine(CriticEstimator):
         return gradient
 
     def _update_log_ema(self, log_mean: th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """Move the average of the denominator towards this minibatch's; in logarithms, since e^F overflows."""
+        """Update the average of the denominator with this minibatch's, in logarithms since e^F overflows."""
         assert self.ema_decay is not None
         past = self.log_ema[steps]
         log_decay = math.log(self.ema_decay) if self.ema_decay > 0 else -math.inf

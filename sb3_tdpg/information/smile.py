@@ -15,10 +15,10 @@ class Smile(CriticEstimator):
     r"""
     The Donsker-Varadhan estimate with the scores clipped to ``[-clip, clip]`` in the partition term.
 
-    The critic is trained on the Jensen-Shannon objective, which is stable, and so becomes the log density ratio.
-    Clipping lowers the variance and leaves neither a lower nor an upper bound.
+    The critic is trained on the stable Jensen-Shannon objective, whose optimum is the log density ratio. Clipping
+    reduces the variance; the result is neither a lower nor an upper bound.
 
-    :param clip: tau of the paper; larger is less biased and more variable.
+    :param clip: tau of the paper; a larger value reduces the bias and increases the variance.
     :param kwargs: See :class:`~sb3_tdpg.information.critic.CriticEstimator`.
     """
 

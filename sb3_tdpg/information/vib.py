@@ -1,4 +1,4 @@
-"""The variational information bottleneck: the divergence of the encoder from a prior that is learnt."""
+"""The variational information bottleneck: the divergence of the encoder from a learnt prior."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 class VariationalBottleneck(InformationEstimator):
     r"""
-    Any density r_t that does not know the encoder's input e_t = (x~_{t-1}, y_t) gives an upper bound (Alemi et al.,
-    2017; Barber and Agakov, 2003):
+    An upper bound from a learnt prior r_t that is independent of the encoder's input e_t = (x~_{t-1}, y_t) (Alemi et
+    al., 2017; Barber and Agakov, 2003):
 
     .. math::
         I[x_t; \tilde x_t] \le I[e_t; \tilde x_t]
@@ -20,25 +20,25 @@ class VariationalBottleneck(InformationEstimator):
         \le E\, D[q(\tilde x_t | e_t) \,\|\, r_t].
 
     The prior r_t of each time step is a mixture of K diagonal Gaussians :math:`w_k N_k`, fitted to each epoch's
-    rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form; with Jensen's inequality
-    it has a bound that needs no samples (Hershey and Olsen, 2007), and that is what is estimated:
+    rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form; the estimate is an upper
+    bound of it by Jensen's inequality, which needs no samples (Hershey and Olsen, 2007):
 
     .. math::
         D[q \,\|\, r_t] \le -\log \sum_k w_k e^{-D[q \| N_k]}.
 
-    With one component it is exact, the best prior has the moments of the TRVs, and the bound is tight where q(x~_t) is
-    a Gaussian without correlations. It is then :class:`~sb3_tdpg.information.LogDet` without the covariances: looser
-    where the TRVs are correlated. The best mixture minimises the same bound by expectation-maximisation, where a
-    component's responsibility for an episode is in proportion to :math:`w_k e^{-D[q \| N_k]}`.
+    With one component this is exact, and the best prior has the moments of the TRVs: the estimate is
+    :class:`~sb3_tdpg.information.LogDet` without the covariances, so it is looser for correlated TRVs. A mixture is
+    fitted by expectation-maximisation; the responsibility of a component for an episode is proportional to
+    :math:`w_k e^{-D[q \| N_k]}`.
 
-    Before the first fit the prior is the standard normal. On the samples that the prior was fitted to, the estimate
-    reads low by about d / N for d TRVs and each component.
+    Before the first fit the prior is the standard normal. On the samples of the fit, the estimate is too low by about
+    d / N for d TRVs and each component.
 
     :param horizon: Number of time steps T.
     :param state_dim: X
     :param trv_dim: Z
     :param n_components: Number of Gaussians K in the prior of a time step.
-    :param em_steps: Steps of expectation-maximisation in each fit; one Gaussian needs none.
+    :param em_steps: Steps of expectation-maximisation in each fit; unused with one component.
     :raises ValueError: if a number is below 1.
     """
 
@@ -64,9 +64,9 @@ class VariationalBottleneck(InformationEstimator):
     @th.no_grad()
     def fit(self, batch: InformationBatch) -> dict[str, float]:
         """
-        Fit the prior of each time step to the encoder's densities in the episodes that are alive.
+        Fit the prior of each time step to the encoder's densities in the living episodes.
 
-        Where fewer than ``min_episodes`` are, it stays as it is.
+        It does not change at steps with fewer than ``min_episodes`` of them.
         """
         means, variances = batch.means.detach(), batch.stds.detach().square()  # (T, N, Z)
         alive = th.ones(means.shape[:2], dtype=th.bool, device=means.device) if batch.alive is None else batch.alive
@@ -74,7 +74,7 @@ class VariationalBottleneck(InformationEstimator):
         means, variances, alive = means[enough], variances[enough], alive[enough]
         if len(means) == 0:
             return {}
-        # What stands where an episode has ended may be anything.
+        # Values after the end of an episode are arbitrary.
         means, variances = (x.masked_fill(~alive[:, :, None], 1.0) for x in (means, variances))
         weight = alive.to(means.dtype)
         one = _moments(means, variances, weight[:, :, None])  # one Gaussian: (T, 1, Z)
@@ -92,7 +92,7 @@ class VariationalBottleneck(InformationEstimator):
         self.prior_mean[steps], self.prior_var[steps], self.prior_log_weight[steps] = prior
 
     def _slices(self, means: th.Tensor, alive: th.Tensor) -> th.Tensor:
-        """Cut the episodes of a step into K slices of one size along the direction of most variance: ``(T, N, K)``."""
+        """Cut the episodes into K slices of equal size along the direction of most variance: ``(T, N, K)``."""
         weight = alive[:, :, None].to(means.dtype)
         centred = (means - (weight * means).sum(1, keepdim=True) / weight.sum(1, keepdim=True)) * weight
         direction = th.linalg.eigh(centred.mT @ centred).eigenvectors[:, :, -1:]  # (T, Z, 1)
@@ -108,7 +108,7 @@ class VariationalBottleneck(InformationEstimator):
 
 
 def _log_joint(means: th.Tensor, variances: th.Tensor, prior: tuple[th.Tensor, th.Tensor, th.Tensor]) -> th.Tensor:
-    """Log w_k - D[q || N_k] for every episode and component: ``(T, N, K)``."""
+    """Return log w_k - D[q || N_k] for every episode and component: ``(T, N, K)``."""
     mean, var, log_weight = (x[:, None] for x in prior)  # (T, 1, K, Z), and (T, 1, K)
     ratio = variances[:, :, None] / var
     divergence = 0.5 * ((means[:, :, None] - mean).square() / var + ratio - 1 - ratio.log()).sum(-1)
@@ -122,15 +122,15 @@ def _moments(
     pseudo: tuple[th.Tensor, th.Tensor, th.Tensor] | None = None,
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Match the moments of each component to the densities that it is responsible for, by the law of total variance.
+    Fit the moments of each component to its densities by the law of total variance.
 
     :param means: ``(T, N, Z)``
     :param variances: ``(T, N, Z)``
     :param responsibility: ``(T, N, K)``
-    :param pseudo: A Gaussian that counts as one more episode of every component, so that none is ever empty.
+    :param pseudo: A Gaussian that counts as an additional episode of every component, so that none is empty.
     :return: means and variances, ``(T, K, Z)``, and logarithms of the weights, ``(T, K)``
     """
-    # Around the mean of the living: the second moments lose digits far from it.
+    # Around the mean of the living episodes: second moments lose digits far from it.
     weight = responsibility.sum(2, keepdim=True)
     origin = (weight * means).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
     centred = means - origin

@@ -1,12 +1,12 @@
 """
-What is measured after the training: intervals that hold the information, and checks of how far to trust them.
+Measure the information of a trained policy: confidence intervals, checks of them, and estimates from i.i.d. pairs.
 
-Knows nothing of Stable-Baselines3.
+Only ``callback`` imports Stable-Baselines3.
 """
 
+from sb3_tdpg.measurement.checks import TrustBadge, TrustCheck, trust_checks
 from sb3_tdpg.measurement.interval import InformationInterval, information_interval
 from sb3_tdpg.measurement.pairs import InformationEstimate, estimate_information
-from sb3_tdpg.measurement.trust import TrustBadge, TrustCheck, trust_checks
 
 __all__ = [
     "InformationEstimate",

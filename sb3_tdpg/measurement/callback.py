@@ -1,4 +1,4 @@
-"""The callback that writes an interval of the information to the training log."""
+"""A callback that logs a confidence interval of the information."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from sb3_tdpg.problem import read_problem
 
 class InformationCallback(TDPGCallback):
     """
-    Write an interval that holds the information to the log, beside the estimate that the policy is trained with.
+    Log a confidence interval of the information, in addition to the estimate that the policy is trained with.
 
-    It is made from the epoch's rollouts, which are fresh for it: they were made with the policy as it is, and each
-    critic is fitted to other episodes than those that it is evaluated on. It needs no penalty, and changes nothing in
-    the training. The keys are ``mi/lower`` and ``mi/upper``, the limits summed over time; for TensorBoard
-    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step; and ``mi/knows_d``, ..., what the TRVs know at least of
-    each component of the state, averaged over the time steps at which it varies. A component is called as in the
-    environment's ``state_names``, without its unit, or ``x0``, ``x1``, ...
+    The interval is computed from the epoch's rollouts, which were made with the current policy. It works without the
+    penalty and does not change the training. It logs ``mi/lower`` and ``mi/upper``, the limits summed over time;
+    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step (TensorBoard only); and ``mi/knows_d``, ..., a lower
+    bound of the information about each component of the state, averaged over the time steps at which it varies.
+    Components are named as in the environment's ``state_names``, without the unit, or ``x0``, ``x1``, ...
 
     :param eval_freq: Epochs from one interval to the next, beginning with the first.
-    :param confidence: With which the interval of a time step holds the truth.
-    :param components: Whether the components of the state are measured, too; it takes as long again for each.
-    :raises ValueError: if ``eval_freq`` is below 1; where the training begins, if an epoch has too few episodes.
+    :param confidence: Probability, at least, that the interval of a time step contains the truth.
+    :param components: Whether to measure the components of the state, too; each takes as long as the interval.
+    :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.
     """
 
     def __init__(self, eval_freq: int = 10, *, confidence: float = 0.95, components: bool = True) -> None:
@@ -38,14 +37,14 @@ class InformationCallback(TDPGCallback):
         self.eval_freq = eval_freq
         self.confidence = confidence
         self.components = components
-        self.interval: InformationInterval | None = None  # the last one
+        self.interval: InformationInterval | None = None  # the latest
 
     def _on_training_start(self) -> None:
         n_episodes, trv_dim = self.tdpg.n_episodes, self.tdpg.policy.trv_dim
-        if n_episodes < min_episodes(trv_dim):  # it would write limits of 0 and 0: sums over no time step
+        if n_episodes < min_episodes(trv_dim):  # it would log 0 and 0, the sums over no time step
             raise ValueError(
-                f"n_episodes={n_episodes} are too few for an interval of the information in {trv_dim} TRVs: an epoch "
-                f"must have at least {min_episodes(trv_dim)}"
+                f"n_episodes={n_episodes} is too small for an interval of the information in {trv_dim} TRVs: use at "
+                f"least {min_episodes(trv_dim)}"
             )
 
     def _on_rollout_end(self) -> None:

@@ -1,5 +1,5 @@
 """
-Where critics of i.i.d. pairs start from: the density ratio of the t-copula that fits the pairs best.
+The density ratio of the t-copula that fits i.i.d. pairs best, from which their critics start.
 
 Dimension key: M problems, K folds, N pairs, X and Z components of the two variables, D components of either or both.
 """
@@ -19,28 +19,24 @@ N_SCATTER_STEPS = 5
 
 
 def t_scores(ranks: th.Tensor, nu: th.Tensor) -> th.Tensor:
-    """Quantiles of Student's t at the ranks, for some degrees of freedom: ``(M, N, D), (M, L) -> (M, L, N, D)``."""
-    n = ranks.shape[1]
-    position = (2 * n * ranks).round().long()
-    # Of every rank that there is, and from one half alone: quantiles are dear, ranks few and the density symmetric.
-    folded = th.minimum(position, 2 * n - position)
-    there = folded.unique()
-    quantiles = nu.new_zeros(*nu.shape, n + 1)
-    quantiles[..., there] = th.as_tensor(stdtrit(nu[..., None].numpy(), there.numpy() / (2 * n)))
-    scores = quantiles.gather(2, folded.flatten(1)[:, None].expand(-1, nu.shape[1], -1))
-    return scores.unflatten(2, ranks.shape[1:]) * (1 - 2 * (position > n).double())[:, None]
+    """Return the quantiles of Student's t at the ranks, for L degrees of freedom: ``(M, N, D) -> (M, L, N, D)``."""
+    # Quantiles are expensive, and many ranks are equal.
+    values, place = ranks.unique(return_inverse=True)
+    quantiles = th.as_tensor(stdtrit(nu[..., None].numpy(), values.numpy()))  # (M, L, distinct ranks)
+    scores = quantiles.gather(2, place.flatten(1)[:, None].expand(-1, nu.shape[1], -1))
+    return scores.unflatten(2, ranks.shape[1:])
 
 
 def _quadratic(y: th.Tensor, matrix: th.Tensor) -> th.Tensor:
-    """``y' matrix y`` of every sample: ``(rows, n, D) -> (rows, n, 1)``."""
+    """Return ``y' matrix y`` of every sample: ``(rows, n, D) -> (rows, n, 1)``."""
     return ((y @ matrix) * y).sum(-1, keepdim=True)
 
 
 def _scatter(y: th.Tensor, nu: th.Tensor) -> th.Tensor:
     """
-    Scatter matrix of a multivariate t around 0, by a few EM steps towards its maximum likelihood.
+    Fit the scatter matrix of a multivariate t around 0 with a few steps of expectation-maximisation.
 
-    It is kept invertible where components are constant or copies of each other.
+    It stays invertible where components are constant or copies of each other.
 
     :param y: ``(rows, n, D)``
     :param nu: degrees of freedom, ``(rows,)``
@@ -56,7 +52,7 @@ def _scatter(y: th.Tensor, nu: th.Tensor) -> th.Tensor:
 
 
 def degrees_of_freedom(ranks: th.Tensor) -> th.Tensor:
-    """Those of :data:`DEGREES_OF_FREEDOM` for which the t-copula of all components is the most likely: ``(M,)``."""
+    """Choose from :data:`DEGREES_OF_FREEDOM` those of the most likely t-copula of all components: ``(M,)``."""
     dim = ranks.shape[-1]
     choices = th.tensor(DEGREES_OF_FREEDOM, dtype=th.double)
     y = t_scores(ranks, choices.expand(len(ranks), -1)).flatten(0, 1)
@@ -71,10 +67,10 @@ def degrees_of_freedom(ranks: th.Tensor) -> th.Tensor:
 
 def add_up(table: th.Tensor, pairs: th.Tensor) -> th.Tensor:
     """
-    Add what the x and the z of every pair bring.
+    Add the table's entries of the x and of the z of every pair.
 
-    :param table: ``(2 * rows * N, C)``: that of every x, then that of every z, row by row
-    :param pairs: where they are in it, ``row * N + i`` and ``rows * N + row * N + j``: ``(rows, n, 2)``, whole numbers
+    :param table: ``(2 * rows * N, C)``: the entries of every x, then those of every z, row by row
+    :param pairs: their places, ``row * N + i`` and ``rows * N + row * N + j``: ``(rows, n, 2)``, integers
     :return: ``(rows, n, C)``
     """
     return embedding_bag(pairs.flatten(0, 1).int(), table, mode="sum").view(*pairs.shape[:2], -1)
@@ -82,20 +78,20 @@ def add_up(table: th.Tensor, pairs: th.Tensor) -> th.Tensor:
 
 class Start(nn.Module):
     r"""
-    What the critics are before they are trained: the logarithmic density ratio of a multivariate t, for each row.
+    The critics before their training: for each row the logarithmic density ratio of a multivariate t.
 
-    With A the inverse of the scatter matrix of (x, z), and B and C those of its blocks of x and of z,
+    With A the inverse of the scatter matrix of (x, z), and B and C the inverses of its blocks of x and of z,
 
     .. math::
         c + \tfrac{\nu + X}{2} \ln(1 + x^\top B x / \nu) + \tfrac{\nu + Z}{2} \ln(1 + z^\top C z / \nu)
         - \tfrac{\nu + X + Z}{2} \ln(1 + (x, z)^\top A (x, z) / \nu).
 
-    What each x and each z bring to it is worked out once, and added for a pair of them: the last quadratic form is the
-    squared length of :math:`(x, z) W`, where :math:`W W^\top = A / \nu`, and so of a sum.
+    The terms of each x and of each z are computed once and added for a pair. The last quadratic form is the squared
+    length of :math:`(x, z) W` with :math:`W W^\top = A / \nu`, which is a sum of a term of x and a term of z.
 
-    :param table: see :func:`add_up`, ``(2 * rows * N, X + Z + 1)``: what x or z brings to :math:`(x, z) W`, then to the
-        sum of c and the logarithms of x and z
-    :param factor: of the last logarithm, ``(rows, 1, 1)``
+    :param table: see :func:`add_up`, ``(2 * rows * N, X + Z + 1)``: the term of x or z in :math:`(x, z) W`, then the
+        one in the sum of c and the logarithms of x and of z
+    :param factor: factor of the last logarithm, ``(rows, 1, 1)``
     """
 
     def __init__(self, table: th.Tensor, factor: th.Tensor) -> None:
@@ -107,27 +103,27 @@ class Start(nn.Module):
         """
         Fit the scatter matrix of each fold to the t-scores of its training pairs.
 
-        :param y: of x and z, ``(M, N, X + Z)``
-        :param train: pairs that each fold trains on, ``(K, n)``
+        :param y: t-scores of x and z, ``(M, N, X + Z)``
+        :param train: the training pairs of each fold, ``(K, n)``
         :param n_x: X
         :param nu: degrees of freedom, ``(M,)``
-        :param level: what is added: the score at which the critic says "no information"
+        :param level: the critic's score that means "no information"; it is added
         """
         n_folds, dim = len(train), y.shape[-1]
         scatter = _scatter(y[:, train].flatten(0, 1), nu.repeat_interleave(n_folds)).unflatten(0, (-1, n_folds))
         nu = nu[:, None, None, None]
         root = th.linalg.inv(th.linalg.cholesky(scatter)).mT / nu.sqrt()  # W
         constant = level + th.lgamma(nu / 2) + th.lgamma((nu + dim) / 2) - _half_log_det(scatter)
-        brought = []
+        terms = []
         for part in (slice(n_x), slice(n_x, None)):
             block, own = scatter[..., part, part], y[:, None, :, part]  # (M, 1, N, .): the same for all folds
             half = (nu + block.shape[-1]) / 2
             constant = constant - th.lgamma(half) + _half_log_det(block)
             logarithm = half * th.log1p(_quadratic(own, th.linalg.inv(block)) / nu)
-            brought.append(th.cat([own @ root[..., part, :], logarithm], -1))
-        brought[0][..., -1:] += constant
+            terms.append(th.cat([own @ root[..., part, :], logarithm], -1))
+        terms[0][..., -1:] += constant
         factor = ((nu + dim) / 2).expand(-1, n_folds, -1, -1)
-        return cls(th.stack(brought).flatten(0, 3), factor.flatten(0, 1))
+        return cls(th.stack(terms).flatten(0, 3), factor.flatten(0, 1))
 
     def flat_like(self, level: float) -> Start:
         """Return a start of the same shape that is ``level`` everywhere."""
@@ -136,11 +132,11 @@ class Start(nn.Module):
         return Start(table, th.zeros_like(self.factor))
 
     def forward(self, pairs: th.Tensor) -> th.Tensor:
-        """Evaluate at pairs of places in the table: ``(rows, n, 2) -> (rows, n, 1)``."""
+        """Evaluate pairs of places in the table: ``(rows, n, 2) -> (rows, n, 1)``."""
         return self.of_sums(add_up(self.table, pairs))
 
     def of_sums(self, sums: th.Tensor) -> th.Tensor:
-        """Evaluate where x and z bring these sums: ``(rows, n, X + Z + 1) -> (rows, n, 1)``."""
+        """Evaluate the sums of the terms of x and z: ``(rows, n, X + Z + 1) -> (rows, n, 1)``."""
         quadratic = th.linalg.vector_norm(sums[..., :-1], dim=-1, keepdim=True).square_()
         return sums[..., -1:].addcmul(self.factor, quadratic.log1p_(), value=-1)
 
@@ -150,9 +146,9 @@ def _half_log_det(matrices: th.Tensor) -> th.Tensor:
 
 
 def choose_start(starts: Sequence[Start], chosen: th.Tensor) -> Start:
-    """Take for each row the start whose number ``chosen`` ``(rows,)`` gives."""
+    """Take for each row the start with the index ``chosen``, ``(rows,)``."""
     n_rows = len(chosen)
     rows = th.arange(n_rows)
-    tables = th.stack([start.table.view(2, n_rows, -1, start.table.shape[-1]) for start in starts], 2)
+    tables = th.stack([start.table.unflatten(0, (2, n_rows, -1)) for start in starts], 2)
     table = tables[:, rows, chosen]  # (2, rows, N, X + Z + 1)
     return Start(table.flatten(0, 2), th.stack([start.factor for start in starts])[chosen, rows])

@@ -10,10 +10,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import logsumexp
 
-LOG_FLOOR = math.log(0.01)  # of the critic: a share of a in r, against outliers
-LENGTHS = (0.3, 1.0)  # of the kernel, times the median distance
-RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # of the regressions, times the number of episodes
+LOG_FLOOR = math.log(0.01)  # lower bound of the critic, against outliers
+LENGTHS = (0.3, 1.0)  # widths of the kernel, relative to the median distance
+RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # of the regressions, for each episode
 SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 the mixture of the encoder's densities, 1 a Gaussian
 CONSTANT = 1e-9  # a component that varies by less than this, relative to its size, is constant
 LOG_2_PI = math.log(2 * math.pi)
@@ -34,20 +35,19 @@ class Encoded(NamedTuple):
 
 class DensityCritic:
     r"""
-    The critic :math:`F(x, \tilde x) = \log [r(\tilde x \mid x) / a(\tilde x) + 0.01]`, fitted to some of the episodes.
+    The critic :math:`F(x, \tilde x) = \log [r(\tilde x \mid x) / a(\tilde x) + 0.01]`, fitted without an optimiser.
 
-    It takes no optimiser, and where the channel from the state to the TRVs is Gaussian it has the form of the best
-    critic that there is.
+    For a Gaussian channel from the state to the TRVs it has the form of the optimal critic.
 
-    - r is a Gaussian about a regression of the encoder's means on the state: a ridge regression plus a kernel ridge
-      regression of what that leaves. Its covariance is that of the residuals plus the encoder's own variance, whose
-      logarithm is regressed alike.
-    - a is a mixture of the encoder's densities, smoothed: every mean is drawn towards the centre, and what this takes
-      from the covariance is added to each density. Smoothing 0 is the mixture itself, 1 a Gaussian.
+    - r is a Gaussian around a regression of the encoder's means on the state: a ridge regression plus a kernel ridge
+      regression of its residuals. Its covariance is that of the residuals plus the encoder's variance, whose logarithm
+      is predicted by the same kind of regression.
+    - a is a smoothed mixture of the encoder's densities: every mean is moved towards the centre, and each density is
+      widened so that the covariance of the mixture stays the same. Smoothing 0 is the mixture itself, 1 a Gaussian.
 
-    Every ridge and the smoothing are those with the best leave-one-out error on the same episodes.
+    The ridges and the smoothing minimise the leave-one-out error on the same episodes.
 
-    :param train: The episodes, with ``K >= 1`` draws each.
+    :param train: The episodes to fit, with ``K >= 1`` draws each.
     """
 
     def __init__(self, train: Encoded) -> None:
@@ -55,32 +55,23 @@ class DensityCritic:
         self._fit_marginal(train)
 
     def log_marginal(self, trvs: np.ndarray) -> np.ndarray:
-        """
-        Log a(x~), a normalised density: ``(M,)``.
-
-        :param trvs: ``(M, Z)``
-        """
+        """Return log a(x~), a normalised density: ``(M, Z) -> (M,)``."""
         points = (trvs - self._centre) @ self._rotation.T
         return self._log_mixture(points, self._smoothing) + self._log_volume
 
     def scores(self, states: np.ndarray, trvs: np.ndarray, log_marginal: np.ndarray) -> np.ndarray:
         """
-        F of every x~ with every x: ``(M, n)``.
+        Evaluate F for every x~ with every x: ``(M, n)``.
 
         :param states: ``(n, X)``
         :param trvs: ``(M, Z)``
-        :param log_marginal: ``(M,)``, of :meth:`log_marginal`
+        :param log_marginal: The result of :meth:`log_marginal`, ``(M,)``.
         """
         log_ratio = self._log_conditional(states, trvs) - log_marginal[:, None]
         return np.logaddexp(log_ratio, LOG_FLOOR)
 
     def _log_conditional(self, states: np.ndarray, trvs: np.ndarray) -> np.ndarray:
-        """
-        Log r(x~ | x) of every x~ under every x: ``(M, n)``.
-
-        :param states: ``(n, X)``
-        :param trvs: ``(M, Z)``
-        """
+        """Return log r(x~ | x) of every x~ for every x: ``(n, X), (M, Z) -> (M, n)``."""
         means, log_stds = np.split(self._regression.predict(states), 2, axis=1)  # (n, Z) each
         log_stds = np.clip(log_stds, *self._log_std_range)  # no extrapolation
         variances = np.exp(2 * log_stds) @ self._noise_rotation.T**2 + self._residual_variance
@@ -115,10 +106,10 @@ class DensityCritic:
 
     def _log_mixture(self, points: np.ndarray, smoothing: float, own: np.ndarray | None = None) -> np.ndarray:
         """
-        Log-density of the smoothed mixture: ``(M,)``.
+        Return the log-density of the smoothed mixture: ``(M,)``.
 
         :param points: ``(M, Z)``, rotated
-        :param own: The component to be left out for each point, ``(M,)``.
+        :param own: The component to leave out for each point, ``(M,)``.
         """
         log_density = log_gaussians(
             points, math.sqrt(1 - smoothing) * self._components, self._variances + smoothing * self._spread
@@ -127,19 +118,19 @@ class DensityCritic:
         if own is not None:
             log_density[np.arange(len(points)), own] = -np.inf
             n -= 1
-        return log_mean_exp(log_density, n)
+        return logsumexp(log_density, axis=1) - math.log(n)
 
 
 def varies(inputs: np.ndarray) -> np.ndarray:
-    """Tell which columns are more than a constant and its rounding errors: ``(n, X) -> (X,)``, bool."""
+    """Return which columns are not constant up to rounding errors: ``(n, X) -> (X,)``, bool."""
     return inputs.std(axis=0) > CONSTANT * (1 + np.abs(inputs.mean(axis=0)))
 
 
 class Regression:
     """
-    A ridge regression, and a kernel ridge regression of its residuals, for each target by itself.
+    A ridge regression and a kernel ridge regression of its residuals, for each target separately.
 
-    :param inputs: ``(n, X)``; constant components are left out.
+    :param inputs: ``(n, X)``; constant components are ignored.
     :param targets: ``(n, Y)``
     """
 
@@ -158,7 +149,7 @@ class Regression:
         linear = centred - self._inputs @ self._coefficients
         square = self._distances(self._inputs)
         self._widths = np.square(LENGTHS) * (np.median(square) or 1.0)
-        self._weights = np.zeros((len(LENGTHS), *targets.shape))  # of at most one kernel for each target
+        self._weights = np.zeros((len(LENGTHS), *targets.shape))  # at most one kernel for each target
         for i, width in enumerate(self._widths):
             values, vectors = np.linalg.eigh(np.exp(-square / width))
             values = np.maximum(values, 1e-12)
@@ -167,7 +158,7 @@ class Regression:
             self._weights[:, :, better] = 0
             self._weights[i] += vectors @ (shrinkage * (vectors.T @ linear) / values[:, None])
             left = np.where(better, residuals, left)
-        self.residuals = left  # (n, Y), each of a regression without that episode
+        self.residuals = left  # (n, Y), leave-one-out
 
     def predict(self, inputs: np.ndarray) -> np.ndarray:
         """Predict the targets: ``(n, Y)``."""
@@ -182,7 +173,7 @@ class Regression:
         return (inputs - self._centre) / self._scale
 
     def _distances(self, inputs: np.ndarray) -> np.ndarray:
-        """Squared distances from the episodes of the fit: ``(M, n)``."""
+        """Return the squared distances from the episodes of the fit: ``(M, n)``."""
         square = (inputs**2).sum(axis=1)[:, None] - 2 * inputs @ self._inputs.T + (self._inputs**2).sum(axis=1)
         return np.maximum(square, 0.0)
 
@@ -194,15 +185,15 @@ def _choose_ridge(
     Choose a ridge for each target by the leave-one-out error, which has a closed form.
 
     :param basis: Orthonormal columns, ``(n, R)``.
-    :param values: Squared singular values that belong to them, ``(R,)``.
+    :param values: Their squared singular values, ``(R,)``.
     :param targets: ``(n, Y)``
-    :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices, too.
-    :param leverage: Of each episode on the regression that the targets are the residuals of.
-    :return: the factors ``(R, Y)`` by which the projections are shrunk, and the leave-one-out residuals ``(n, Y)``
+    :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
+    :param leverage: Leverage of each episode in the regression whose residuals the targets are.
+    :return: the shrinkage factors of the projections, ``(R, Y)``, and the leave-one-out residuals, ``(n, Y)``
     """
     n = len(targets)
     projections, leverages = basis.T @ targets, np.square(basis)
-    # What the basis does not reach. By complements, since a kernel that interpolates leaves hardly any digits of 1 - h.
+    # The part outside the basis. By complements, since 1 - h loses its digits where a kernel interpolates.
     beyond, spare = targets - basis @ projections, np.maximum(1 - leverage - leverages.sum(axis=1), 1e-12)
     choices, residuals = [np.zeros_like(values)], [otherwise]
     for ridge in RIDGES:
@@ -221,7 +212,7 @@ def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.nd
 
     :param noise: Variances of the noise, ``(Z,)``.
     :param covariance: ``(Z, Z)``
-    :return: the matrix ``(Z, Z)`` that leads there, the diagonal ``(Z,)``, and the logarithm of the matrix' determinant
+    :return: the matrix of the map ``(Z, Z)``, the diagonal ``(Z,)``, and the logarithm of the matrix' determinant
     """
     scale = 1 / np.sqrt(noise)
     values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
@@ -230,7 +221,7 @@ def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def log_gaussians(points: np.ndarray, means: np.ndarray, variances: np.ndarray) -> np.ndarray:
     """
-    Log-density of every point under every diagonal Gaussian: ``(M, n)``.
+    Return the log-density of every point under every diagonal Gaussian: ``(M, n)``.
 
     :param points: ``(M, Z)``
     :param means: ``(n, Z)``
@@ -240,9 +231,3 @@ def log_gaussians(points: np.ndarray, means: np.ndarray, variances: np.ndarray) 
     points, means, precision = points - centre, means - centre, 1 / variances
     quadratic = points**2 @ precision.T - 2 * points @ (means * precision).T + (means**2 * precision).sum(axis=1)
     return -0.5 * (quadratic + np.log(variances).sum(axis=1) + points.shape[1] * LOG_2_PI)
-
-
-def log_mean_exp(values: np.ndarray, n: int) -> np.ndarray:
-    """Logarithm of the sum of ``exp`` over the last axis divided by n: ``(M, n) -> (M,)``."""
-    top = values.max(axis=-1, keepdims=True)
-    return np.log(np.exp(values - top).sum(axis=-1)) + top[..., 0] - math.log(n)

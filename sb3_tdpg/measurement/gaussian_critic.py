@@ -1,5 +1,5 @@
 """
-A critic that takes next to no time to fit: the log-ratio of two Gaussians.
+A critic that is fitted almost instantly: the log-ratio of two Gaussians.
 
 Dimension key: n episodes, X state, Z TRVs, M points.
 """
@@ -10,18 +10,18 @@ import numpy as np
 
 from sb3_tdpg.measurement.density_critic import Encoded, log_gaussians, varies, whiten
 
-CUTOFF = 1e-9  # of the states' correlations' eigenvalues, relative to the largest: below, a component is told by others
+CUTOFF = 1e-9  # relative eigenvalue of the states' correlations below which a component is redundant
 
 
 class GaussianCritic:
     r"""
     The critic :math:`F(x, \tilde x) = \log r(\tilde x \mid x) / a(\tilde x)` of Gaussians with the episodes' moments.
 
-    r is a Gaussian about the linear regression of the encoder's means on the state, a one with the TRVs' mean and
-    covariance; in both, the encoder's own variance is known. It is the best critic there is where states and TRVs are
-    Gaussian together. With so few numbers to be fitted it can be fitted often, each time to most of the episodes.
+    r is a Gaussian around the linear regression of the encoder's means on the state, and a is a Gaussian with the mean
+    and covariance of the TRVs. The encoder's variance is known in both. This is the optimal critic for jointly Gaussian
+    states and TRVs. It has few parameters, so it can be fitted many times, each time to most of the episodes.
 
-    :param train: The episodes; their draws of the TRVs are not used.
+    :param train: The episodes to fit; their draws of the TRVs are not used.
     """
 
     def __init__(self, train: Encoded) -> None:
@@ -36,12 +36,7 @@ class GaussianCritic:
         self._marginal = whiten(noise, means.T @ means / (n - 1))
 
     def scores(self, states: np.ndarray, trvs: np.ndarray) -> np.ndarray:
-        """
-        F of every x~ with every x: ``(M, n)``.
-
-        :param states: ``(n, X)``
-        :param trvs: ``(M, Z)``
-        """
+        """Evaluate F for every x~ with every x: ``(n, X), (M, Z) -> (M, n)``."""
         means = (states - self._centre) / self._scale @ self._coefficients
         centred = trvs - self._mean
         (rotation, spread, log_volume), (rotation_a, spread_a, log_volume_a) = self._conditional, self._marginal

@@ -1,5 +1,5 @@
 """
-An interval that holds I[x_t; x~_t]: confidence limits from bounds whose names are told.
+Confidence intervals for I[x_t; x~_t] from named lower and upper bounds.
 
 Dimension key: T time steps, N episodes, X state, Z TRVs.
 """
@@ -30,8 +30,8 @@ from sb3_tdpg.measurement.interval_bounds import (
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
-# Of the probability to miss, by the lower and by the upper limit; the rest is for the skewness that they neglect. It
-# makes the upper limits too low and the lower ones lower than need be: 2 % come out as about 3 % and 1.5 %.
+# Shares of the probability to miss that the lower and the upper limit spend. The rest allows for skewness, which the
+# limits neglect: it makes the upper limits too low and the lower ones too cautious (2 % become about 3 % and 1.5 %).
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
 LOWER_BOUNDS = ("critic", "gaussian")
@@ -41,9 +41,9 @@ UPPER_BOUNDS = ("logdet", "loo", "marginal")
 @dataclass(frozen=True)
 class InformationInterval:
     """
-    Where I[x_t; x~_t] lies at every time step, in nats.
+    Confidence limits of I[x_t; x~_t] at every time step, in nats.
 
-    NaN where too few episodes are alive: see ``min_episodes``.
+    Limits are NaN where fewer than ``min_episodes`` are alive.
     """
 
     lower: np.ndarray
@@ -51,18 +51,18 @@ class InformationInterval:
     upper: np.ndarray
     """``(T,)``: upper confidence limits."""
     lower_name: tuple[str, ...]
-    """For each step the bound that the lower limit comes from: ``"critic"`` or ``"gaussian"``, ``"zero"`` where
-    information is never negative says more, ``""`` where there is none."""
+    """The bound that gives the lower limit of each step: ``"critic"`` or ``"gaussian"``, ``"zero"`` where both are
+    negative, ``""`` where there is no limit."""
     upper_name: tuple[str, ...]
     """Likewise ``"logdet"``, ``"loo"`` or ``"marginal"``."""
     estimates: dict[str, np.ndarray]
-    """By name of the bound, ``(T,)``: its point estimate."""
+    """Point estimate of each bound, ``(T,)``, by name."""
     errors: dict[str, np.ndarray]
-    """By name of the bound, ``(T,)``: the standard error of the estimate."""
+    """Standard error of each estimate, ``(T,)``, by name."""
     n_episodes: np.ndarray
     """``(T,)``: episodes alive."""
     confidence: float
-    """With which the interval of a step holds the truth."""
+    """Probability, at least, that the interval of a step contains the truth."""
 
     @property
     def width(self) -> np.ndarray:
@@ -71,33 +71,34 @@ class InformationInterval:
 
     @property
     def total(self) -> tuple[float, float]:
-        """Sums of the lower and of the upper limits over the time steps that have any; see :attr:`n_left_out`."""
+        """Sums of the lower and of the upper limits over the time steps that have limits; see :attr:`n_left_out`."""
         return float(np.nansum(self.lower)), float(np.nansum(self.upper))
 
     @property
     def n_left_out(self) -> int:
-        """Time steps at which some episodes are alive, but too few for limits: no part of :attr:`total`."""
+        """Number of time steps with too few living episodes for limits; :attr:`total` leaves them out."""
         return int(((self.n_episodes > 0) & np.isnan(self.upper)).sum())
 
 
 def normal_quantile(miss: float) -> float:
-    """Return how many standard errors a Gaussian exceeds with probability ``miss``."""
+    """Return the number of standard errors that a Gaussian exceeds with probability ``miss``."""
     return NormalDist().inv_cdf(1 - miss)
 
 
 def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
-    Share the probability to miss between two limits, whose bounds leave a gap that the truth lies in.
+    Divide the probability to miss between two limits, given the gap between their bounds.
 
-    The further the truth is from one bound, the less its limit can miss. It is worst at either end of the gap, where
-    :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c standard errors from their bounds
-    (Imbens and Manski, 2004, Econometrica 72(6)): half of it each without a gap, all of it each with a wide one.
+    The truth lies in the gap, and a limit far from it cannot miss it. The worst case is a truth at either end of the
+    gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c standard errors from their
+    bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets half of the probability, with a
+    wide gap each gets all of it.
 
-    :param miss: Of both limits together.
-    :param gap: Upper less lower bound, in standard errors; below 0 and NaN count as 0.
-    :return: the probability to miss of each limit by itself
+    :param miss: Probability that either limit misses.
+    :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.
+    :return: the probability to miss of each limit alone
     """
-    normal, gap = NormalDist(), max(0.0, gap)  # in this order also of NaN
+    normal, gap = NormalDist(), max(0.0, gap)  # in this order NaN becomes 0
 
     def excess(c: float) -> float:
         return normal.cdf(-c) + normal.cdf(-c - gap) - miss
@@ -108,15 +109,15 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
 
 def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     r"""
-    Return how many standard errors any of several correlated Gaussians exceeds with probability ``miss``, at most.
+    Return the number c of standard errors that any of several correlated Gaussians exceeds with at most ``miss``.
 
-    The probability that any does is at most the sum of all probabilities less those that two exceed it together, for
-    the pairs of one with each other one (Hunter, 1976, Journal of Applied Probability 13(3)). With Owen's function T it
-    is :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`: between ``miss`` for bounds that go
-    together and Bonferroni's inequality for independent ones.
+    Hunter's inequality (1976, Journal of Applied Probability 13(3)) bounds this probability by the sum of the single
+    probabilities minus the joint ones of the first Gaussian with each other. With Owen's function T this is
+    :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
+    of one, independent ones about Bonferroni's.
 
-    :param miss: Below 0.5.
-    :param correlations: Of the one with each other one.
+    :param miss: The probability, below 0.5.
+    :param correlations: Correlation of the first Gaussian with each other.
     """
     slopes = np.sqrt([(1 - rho) / (1 + rho) for rho in np.clip(correlations, -1 + 1e-9, 1)])
 
@@ -128,11 +129,11 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
 
 def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, float]:
     """
-    Find the tightest of several bounds and its limit, all of which hold together but for a probability of ``miss``.
+    Return the name and the value of the tightest limit of several bounds.
 
-    :param bounds: By name.
-    :param miss: Probability that a limit is on the wrong side of its bound's expectation.
-    :param sign: 1 for limits from above, -1 from below.
+    :param bounds: Bounds by name.
+    :param miss: Probability that any limit is on the wrong side of its bound's expectation.
+    :param sign: 1 for upper limits, -1 for lower ones.
     """
     if not bounds:
         return "", sign * math.inf
@@ -144,7 +145,7 @@ def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, flo
 
 
 def _gap(below: Collection[Estimate], above: Collection[Estimate]) -> float:
-    """Return how far the tightest bounds are apart, in standard errors."""
+    """Return the distance between the tightest bounds in standard errors."""
     if not (below and above):
         return math.nan
     lower, upper = max(below, key=lambda bound: bound.value), min(above, key=lambda bound: bound.value)
@@ -152,58 +153,54 @@ def _gap(below: Collection[Estimate], above: Collection[Estimate]) -> float:
 
 
 def min_episodes(trv_dim: int) -> int:
-    """Return how many living episodes an interval needs at a time step."""
+    """Return the number of living episodes that an interval needs at a time step."""
     return max(MIN_EPISODES, 2 * trv_dim + 2)
 
 
 @threads(1)
 def information_interval(batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0) -> InformationInterval:
     r"""
-    Give confidence limits for I[x_t; x~_t] at every time step, from fresh rollouts of a policy.
+    Compute confidence limits for I[x_t; x~_t] at every time step from fresh rollouts of a policy.
 
-    **Below** stands the Donsker-Varadhan bound of a critic on x and x~,
+    **Lower limits** come from the Donsker-Varadhan bound of a critic on x and x~,
 
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
-    which holds for any F that the samples have no part in: critics are fitted to some of the episodes, frozen, and
-    evaluated on the others. There are two kinds, and the larger bound counts.
+    which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
+    on the others. There are two kinds, and the larger bound counts:
 
-    - ``"critic"``: :class:`~sb3_tdpg.measurement.density_critic.DensityCritic`, fitted to one half of the episodes and
-      evaluated on the other; then the halves change places. Up to 300 episodes are divided in three ways, since a
-      division leaves out the pairs of episodes that it parts.
-    - ``"gaussian"``: :class:`~sb3_tdpg.measurement.gaussian_critic.GaussianCritic`, which knows one shape only and is
-      fitted at once, therefore often and to more episodes: to all but two of eight groups, and evaluated on the two
-      (five groups with more than 300 episodes). It is tighter where states and TRVs are about Gaussian together.
+    - ``"critic"``: :class:`~sb3_tdpg.measurement.density_critic.DensityCritic`, fitted to each half of the episodes and
+      evaluated on the other. Up to 300 episodes are divided in three ways, since each division misses some pairs.
+    - ``"gaussian"``: :class:`~sb3_tdpg.measurement.gaussian_critic.GaussianCritic`, which is fitted fast and therefore
+      to more episodes: to all but two of eight groups, and evaluated on these two (of five groups with more than 300
+      episodes). It is tighter where states and TRVs are about jointly Gaussian.
 
-    The means over the episodes and over the pairs are those of all critics of a kind, taken before the logarithm.
-    Densities of the encoder alone give no such bound: they bound the information of its *input*, which may be larger.
+    The means over episodes and pairs are taken over all critics of a kind before the logarithm. The encoder's density
+    alone gives no lower bound: it bounds the information about the encoder's *input*, which can be larger.
 
-    **Above** stands the smallest of three bounds on I[e_t; x~_t], which is not below I[x_t; x~_t], with
-    e_t = (x~_{t-1}, y_t) the input of the encoder, whose density q is known:
+    **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
+    e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
 
-    - ``"logdet"``: :class:`~sb3_tdpg.information.LogDet`, its bias taken off by the jackknife;
+    - ``"logdet"``: :class:`~sb3_tdpg.information.LogDet`, its bias removed by the jackknife;
     - ``"loo"``: :class:`~sb3_tdpg.information.LeaveOneOut`;
-    - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the critic's marginal density a, on fresh
-      episodes, too.
+    - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the marginal density a of the critic, also on
+      fresh episodes.
 
-    Since the encoder's density is known, its noise is drawn anew: each episode counts with the mean over several draws
-    of x~ given e. And since the mean square of the noise is known, what the draws have too much or too little of it is
-    taken off (control variates). Both lessen the error, and change no expectation.
+    Each episode uses the mean over several draws of x~ given e, since the encoder's density is known. Control variates
+    remove the deviation of the noise from its expected mean square. Both reduce the error and change no expectation.
 
-    Each limit is an estimate less or plus a multiple of its standard error. The lower limit's multiple spends three
-    fifths of the probability to miss, ``1 - confidence``, the upper one's one fifth. The rest is for what they neglect:
-    the limits are asymptotic, they take the means over episodes as Gaussian. But what an episode adds is skewed like a
-    chi-square, so that a mean that is too low comes with a standard error that is too small: the upper limits suffer,
-    not the lower ones. Of what is spent, a limit gets its share according to the gap between the estimates
-    (``miss_of_each_limit``), and a share is for all bounds of a side at once, since the tightest is taken: the closer
-    they go together, the less that costs (``joint_quantile``). The interval holds for each step by itself, not for all
-    of them at once. Above about ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about
-    ``ln(N^2 / 10)``.
+    Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of
+    the probability to miss, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
+    contributions of episodes, which resembles that of a chi-square: means that are too low come with standard errors
+    that are too small, so the upper limits miss more often than a Gaussian would. The shares depend on the gap between
+    the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since the tightest is
+    chosen (``joint_quantile``). The confidence is that of each step alone, not of all steps together. Above about
+    ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
 
-    :param batch: Rollouts ``(T, N, ...)`` that the encoder was not trained on since; the episodes are independent.
-    :param confidence: Probability, at least, with which the interval of a step holds the truth.
-    :param seed: Of the divisions into halves and of the noise.
-    :raises ValueError: if the shapes do not fit, a value is not finite, or a standard deviation is not positive.
+    :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
+    :param confidence: Probability, at least, that the interval of a step contains the truth.
+    :param seed: Seed of the divisions of the episodes and of the noise.
+    :raises ValueError: if ``confidence`` is not in (0, 1), and as :func:`check_batch`.
     """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
@@ -212,7 +209,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     horizon, _, trv_dim = batch.trvs.shape
     estimates, errors = ({name: np.full(horizon, np.nan) for name in names} for _ in range(2))
     limits = np.full((2, horizon), np.nan)
-    named: tuple[list[str], list[str]] = ([""] * horizon, [""] * horizon)
+    lower_by, upper_by = [""] * horizon, [""] * horizon
     n_episodes = np.zeros(horizon, dtype=int)
     for t in range(horizon):
         at_t = batch.at(t)
@@ -222,49 +219,43 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
         rng = np.random.default_rng((seed, t))
         step = draw_trvs(at_t, rng)
         critic, marginal = critic_bounds(step, rng)
-        bounds = dict(
-            critic=critic,
-            gaussian=gaussian_bound(step, rng),
-            logdet=log_det_bound(step),
-            loo=leave_one_out_bound(step),
-            marginal=marginal,
-        )
+        below = dict(critic=critic, gaussian=gaussian_bound(step, rng))
+        above = dict(logdet=log_det_bound(step), loo=leave_one_out_bound(step), marginal=marginal)
+        bounds = below | above
         for name, bound in bounds.items():
             estimates[name][t], errors[name][t] = bound.value, bound.error
         below, above = (
-            {name: bounds[name] for name in names if np.isfinite(bounds[name].value)}
-            for names in (LOWER_BOUNDS, UPPER_BOUNDS)
+            {name: bound for name, bound in side.items() if np.isfinite(bound.value)} for side in (below, above)
         )
         gap = _gap(below.values(), above.values())
         miss_below, miss_above = (
             miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)
         )
-        (lower_name, lower), (upper_name, upper) = limit(below, miss_below, sign=-1), limit(above, miss_above, sign=1)
-        named[0][t], named[1][t] = lower_name if lower > 0 else "zero", upper_name
+        lower_by[t], lower = limit(below, miss_below, sign=-1)
+        upper_by[t], upper = limit(above, miss_above, sign=1)
+        if lower <= 0:
+            lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
-        limits[:, t] = min(lower, upper) if lower > 0 else 0.0, upper
-    lower_limits, upper_limits = limits
-    return InformationInterval(
-        lower_limits, upper_limits, tuple(named[0]), tuple(named[1]), estimates, errors, n_episodes, confidence
-    )
+        limits[:, t] = min(lower, upper), upper
+    return InformationInterval(*limits, tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes, confidence)
 
 
 def component_estimates(
     batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""
-    Bound from below what the TRVs know of each component of the state by itself, I[x^k_t; x~_t].
+    Bound the information of the TRVs about each component of the state from below, I[x^k_t; x~_t].
 
-    The bounds are the lower ones of :func:`information_interval`, with one component of the state in place of the
-    state; the larger one counts. Where the TRVs tell several components, their density given one of them has a shape of
-    its own, which the critic follows badly; the Gaussians then say more.
+    The result is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
+    state. Where the TRVs depend on several components, their density given one of them has a complicated shape, and the
+    Gaussian critic gives the better bound.
 
     :param batch: As for :func:`information_interval`.
-    :param confidence: Of the lower limits, which are one-sided.
-    :param seed: Of the division of the episodes and of the noise.
+    :param confidence: Confidence of the lower limits, which are one-sided.
+    :param seed: Seed of the division of the episodes and of the noise.
     :return: the estimates and their lower limits, ``(T, X)`` each, nats; NaN where a component is constant and where
         too few episodes are alive
-    :raises ValueError: if the batch is not fit for an interval.
+    :raises ValueError: as :func:`check_batch`.
     """
     check_batch(batch)
     horizon, _, n_components = batch.states.shape
@@ -285,7 +276,7 @@ def component_estimates(
 
 def check_batch(batch: InformationBatch) -> None:
     """
-    Look at what an interval is to be made from.
+    Check the shapes and values of a batch.
 
     :raises ValueError: if the shapes do not fit, a value is not finite, or a standard deviation is not positive.
     """
@@ -298,6 +289,6 @@ def check_batch(batch: InformationBatch) -> None:
     alive = slice(None) if batch.alive is None else batch.alive
     for name in shapes:
         if not th.isfinite(getattr(batch, name)[alive]).all():
-            raise ValueError(f"the batch's {name} are not all finite: an interval needs numbers")
+            raise ValueError(f"the batch's {name} are not all finite")
     if not (batch.stds[alive] > 0).all():
         raise ValueError("the batch's stds must be positive: they are the encoder's standard deviations")

@@ -1,5 +1,5 @@
 """
-The bounds that the limits of an information interval come from, each with its standard error, at one time step.
+The bounds behind the limits of an information interval, each with its standard error, at one time step.
 
 Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode.
 """
@@ -11,26 +11,27 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import logsumexp, softmax
 
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.measurement.density_critic import LOG_2_PI, DensityCritic, Encoded, log_gaussians
 from sb3_tdpg.measurement.gaussian_critic import GaussianCritic
 
-MAX_DRAWS = 12  # of the TRVs, for each episode
-GROUPS = (8, 5)  # of episodes, two of which a Gaussian critic is evaluated on; the latter with more than MAX_REDIVIDED
+MAX_DRAWS = 12  # of the TRVs for each episode
+GROUPS = (8, 5)  # groups of episodes, two of which evaluate a Gaussian critic; five above MAX_REDIVIDED episodes
 MAX_VALUES = 1_000_000  # densities of all draws under all episodes; bounds the memory
 MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
 DIVISIONS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of quarters of the episodes into halves
-MAX_REDIVIDED = 300  # episodes that are divided more than once; bounds the time, and more gain little by it
-MIN_HITS = 10  # pairs of a state with another episode's TRVs at the clip, to estimate the critic's denominator from
+MAX_REDIVIDED = 300  # more episodes are divided only once, since they gain little from further divisions
+MIN_HITS = 10  # clipped pairs of a state with another episode's TRVs that the critic's denominator counts as at least
 
 
 class Estimate(NamedTuple):
-    """What a bound came to at one time step."""
+    """The estimate of a bound at one time step."""
 
     value: float  # nats
-    parts: np.ndarray  # (n,): what each episode adds to the mean that the value is, but for a constant
-    least_variance: float = 0.0  # of the value
+    parts: np.ndarray  # (n,): each episode's contribution to the mean, up to a constant
+    least_variance: float = 0.0  # lower bound on the variance of the value
 
     @property
     def error(self) -> float:
@@ -38,15 +39,15 @@ class Estimate(NamedTuple):
         return math.sqrt(max(self.parts.var(ddof=1) / len(self.parts), self.least_variance))
 
     def correlation(self, other: Estimate) -> float:
-        """Correlation of the errors of two bounds on the same episodes, 0 where one has none."""
+        """Return the correlation of the errors of two bounds on the same episodes, 0 where one has no error."""
         own, others = self.parts - self.parts.mean(), other.parts - other.parts.mean()
         return float(own @ others / max(len(own) * own.std() * others.std(), 1e-300))
 
     def less_noise(self, controls: np.ndarray) -> Estimate:
         """
-        Take off what the encoder's noise adds by chance: control variates.
+        Remove sampling noise of the encoder with control variates.
 
-        :param controls: ``(n, C)``, whose expectations are 0 in every episode, see ``noise_controls``.
+        :param controls: ``(n, C)`` with expectation 0 in every episode, see :func:`noise_controls`.
         """
         mean = controls.mean(axis=0)
         coefficients = np.linalg.lstsq(controls - mean, self.parts - self.parts.mean(), rcond=None)[0]
@@ -55,14 +56,14 @@ class Estimate(NamedTuple):
 
 def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
     """
-    Draw the encoder's noise anew, beside the one that was rolled out.
+    Draw further samples of the encoder's noise; the first draw is the one of the rollout.
 
     :param batch: One time step, ``(1, n, ...)``, all episodes alive.
-    :param rng: For the noise.
+    :param rng: Generator of the noise.
     """
     states, trvs, means, stds = (x[0].detach().cpu().numpy().astype(np.float64) for x in batch[:4])
     n, dim = means.shape
-    # Each noise comes with its mirror image, which cancels what is linear in it.
+    # Each noise is used with both signs, which cancels linear terms.
     n_pairs = int(np.clip(MAX_VALUES // (2 * n**2), 1, MAX_DRAWS // 2))
     noise = rng.standard_normal((n, n_pairs, dim))
     noise[:, 0] = (trvs - means) / stds
@@ -72,12 +73,12 @@ def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
 
 def noise_controls(step: Encoded) -> np.ndarray:
     r"""
-    Tell how large the noise of each episode's draws is by chance, relative to what the encoder's densities expect.
+    Return two control variates: by how much each episode's noise exceeds its expected size.
 
-    Log-densities are about quadratic in the noise: that of the encoder in its own units, that of the marginal in those
-    of the TRVs' covariance S. The two are :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and
+    Log-densities are about quadratic in the noise: the encoder's in units of its standard deviations, the marginal one
+    in units of the TRVs' covariance S. The control variates are :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and
     :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with :math:`\nu = \tilde x - \mu`, averaged over
-    the draws. Their expectations are 0 whatever the distribution of the means, for any S that the noise has no part in.
+    the draws. Their expectations are 0 for every distribution of the means and any S that is independent of the noise.
 
     :return: ``(n, 2)``
     """
@@ -94,8 +95,8 @@ class FreshPairs:
     """
     Scores F of frozen critics on fresh episodes and all their pairs.
 
-    Scores are clipped from above, which leaves a critic like any other, and keeps single pairs from deciding on the
-    mean of e^F.
+    Scores are clipped from above so that single pairs do not dominate the mean of e^F. A clipped critic is a valid
+    critic, too.
 
     :param n: Number of episodes.
     """
@@ -109,8 +110,8 @@ class FreshPairs:
         """
         Add the scores of a critic.
 
-        :param fresh: Episodes that it was not fitted to, m of n, by their indices.
-        :param scores: Of the K draws of the TRVs of each of them with the state of each, ``(m K, m)``.
+        :param fresh: Indices of m episodes that it was not fitted to.
+        :param scores: Scores of the K draws of the TRVs of each of them with the state of each, ``(m K, m)``.
         """
         m = len(fresh)
         each, pairs = np.arange(m), np.ix_(fresh, fresh)
@@ -121,7 +122,7 @@ class FreshPairs:
         self._pair_times[pairs] += 1
 
     def bound(self) -> Estimate:
-        """Bound the information from below; every episode must have been fresh once, and as often as any other."""
+        """Bound the information from below; all episodes must have been fresh equally often, and at least once."""
         times = self._pair_times.copy()
         np.fill_diagonal(times, 0)  # no episode is paired with itself
         ratios = np.divide(self._ratios, times, out=np.zeros_like(times), where=times > 0)
@@ -130,13 +131,12 @@ class FreshPairs:
 
 def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Estimate]:
     """
-    Fit critics to halves of the episodes, and evaluate them on the other halves; the mean over several divisions.
+    Fit critics to halves of the episodes and evaluate them on the other halves, averaged over several divisions.
 
-    A division leaves out the pairs of episodes that it parts. Any two quarters of the episodes are together in one of
-    three divisions, which leave out none.
+    A division misses the pairs of episodes from different halves. Three divisions of quarters cover all pairs.
 
-    :param step: n episodes, an even number of draws each: the mirror images are the second half.
-    :param rng: For the quarters.
+    :param step: n episodes with an even number of draws each; the second half has the noise of opposite sign.
+    :param rng: Generator of the quarters.
     :return: the lower bound of the critic and the upper bound of its marginal density
     """
     n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
@@ -145,7 +145,7 @@ def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Es
     pairs, gaps = FreshPairs(n), np.zeros(n)
     for i, division in enumerate(divisions):
         halves = [np.concatenate([quarters[q] for q in half]) for half in division]
-        # The draws are shared out among the divisions, each with its mirror image.
+        # Each division gets its share of the draws, with both signs.
         mine = np.arange(i % n_mirrored, n_mirrored, len(divisions))
         draws = step._replace(trvs=step.trvs[:, np.concatenate([mine, mine + n_mirrored])])
         for train, fresh in (halves[::-1], halves):
@@ -160,13 +160,13 @@ def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Es
 
 def gaussian_bound(step: Encoded, rng: np.random.Generator) -> Estimate:
     """
-    Fit Gaussian critics to all but two of several groups of the episodes, and evaluate each on the two left out.
+    Fit Gaussian critics to all but two of several groups of episodes and evaluate each on the two left out.
 
-    :param step: n episodes, an even number of draws each: the mirror images are the second half.
-    :param rng: For the groups.
+    :param step: n episodes with an even number of draws each; the second half has the noise of opposite sign.
+    :param rng: Generator of the groups.
     """
     n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
-    some = np.arange(max(1, 2 * n_mirrored // 3))  # the critics are many
+    some = np.arange(max(1, 2 * n_mirrored // 3))  # fewer draws, since there are many critics
     draws = step._replace(trvs=step.trvs[:, np.concatenate([some, some + n_mirrored])])
     moments = step._replace(trvs=step.trvs[:, :0])
     groups = np.array_split(rng.permutation(n), GROUPS[n > MAX_REDIVIDED])
@@ -182,30 +182,30 @@ def gaussian_bound(step: Encoded, rng: np.random.Generator) -> Estimate:
 
 def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_clip: float) -> Estimate:
     r"""
-    Put the Donsker-Varadhan bound together.
+    Compute the Donsker-Varadhan bound from the scores.
 
-    Of several critics, e^F is averaged before the logarithm is taken: the logarithm of a mean is not below the mean of
-    logarithms, so that this is a lower bound, too, and one that has the pairs of all to estimate the mean from.
+    With several critics, e^F is averaged over all of them before the logarithm. By Jensen's inequality the result is
+    still a lower bound, and its mean is estimated from more pairs.
 
-    The mean counts as at least that of a few clipped pairs: where the TRVs of no episode fit the state of another, it
-    would be estimated as 0, and the bound as infinite.
+    The mean is at least that of a few clipped pairs. Otherwise it would be 0, and the bound infinite, where no
+    episode's TRVs fit the state of another.
 
     :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
     :param ratios: e^F of the TRVs of each episode with the state of each, ``(n, n)``; 0 where they are not paired.
-    :param n_pairs: Number of those that are, about as many for each episode.
-    :param log_clip: Highest F.
+    :param n_pairs: Number of pairs, about equally many for each episode.
+    :param log_clip: Upper bound of F.
     """
     n = len(joint)
     mean = ratios.sum() / n_pairs
     floor = MIN_HITS * math.exp(log_clip) / n_pairs
     if mean < floor:
-        mean, relative_variance = floor, 1 / MIN_HITS  # of the number of clipped pairs, which are rare events
+        mean, relative_variance = floor, 1 / MIN_HITS  # the number of clipped pairs is about Poisson
         parts, least_variance = joint, joint.var(ddof=1) / n + relative_variance
     else:
-        # An episode counts through its state and through its TRVs (Hoeffding's projection).
+        # An episode contributes through its state and through its TRVs (Hoeffding's projection).
         influence = (ratios.sum(axis=0) + ratios.sum(axis=1)) * n / n_pairs / mean
         relative_variance = influence.var(ddof=1) / n
-        # Not less than that of as many independent pairs: by luck the projection can be next to constant.
+        # At least the variance of as many independent pairs, since the projection can be almost constant by chance.
         parts = joint - influence
         least_variance = float(np.square(ratios).sum() / n_pairs / mean**2 - 1) / n_pairs
     # The logarithm of a mean is biased downward by half its relative variance.
@@ -216,7 +216,7 @@ def _marginal_gaps(step: Encoded, log_marginal: np.ndarray) -> np.ndarray:
     """
     Average log q(x~ | e) - log a(x~) over the draws of an episode, ``(n,)``.
 
-    :param log_marginal: Of a density a that was fitted to other episodes, ``(n K,)``.
+    :param log_marginal: Log-density of a that was fitted to other episodes, ``(n K,)``.
     """
     n, _, dim = step.trvs.shape
     noise = (step.trvs - step.means[:, None]) / step.stds[:, None]
@@ -225,7 +225,7 @@ def _marginal_gaps(step: Encoded, log_marginal: np.ndarray) -> np.ndarray:
 
 
 def log_det_bound(step: Encoded) -> Estimate:
-    """Bound by the Gaussian of the same covariance; the jackknife takes off the bias of order 1/n."""
+    """Bound with the Gaussian of the same covariance; the jackknife removes the bias of order 1/n."""
     n, dim = step.means.shape
     variances, log_stds = np.square(step.stds), np.log(step.stds).sum(axis=1)
     scale = np.sqrt(variances.mean(axis=0))
@@ -237,7 +237,7 @@ def log_det_bound(step: Encoded) -> Estimate:
         return np.where(sign > 0, 0.5 * log_determinant, np.nan) + np.log(scale).sum() - log_std
 
     whole = bound(scatter / (n - 1) + np.diag(noise.mean(axis=0)), log_stds.mean())
-    # About the mean of the others, the scatter of the others is less by n / (n - 1) times this episode's square.
+    # Without an episode, the scatter around the new mean is smaller by n / (n - 1) times the episode's square.
     covariances = (scatter - n / (n - 1) * centred[:, :, None] * centred[:, None, :]) / (n - 2)  # (n, Z, Z)
     diagonal = np.arange(dim)
     covariances[:, diagonal, diagonal] += (noise.sum(axis=0) - noise) / (n - 1)
@@ -247,15 +247,12 @@ def log_det_bound(step: Encoded) -> Estimate:
 
 
 def leave_one_out_bound(step: Encoded) -> Estimate:
-    """Bound by the mixture of the other episodes' densities; an episode counts through its TRVs and as a component."""
+    """Bound with the mixture of the other episodes' densities, to which an episode also adds a component."""
     n, n_draws, dim = step.trvs.shape
     log_density = log_gaussians(step.trvs.reshape(-1, dim), step.means, np.square(step.stds))  # (n K, n)
     draws, own = np.arange(n * n_draws), np.repeat(np.arange(n), n_draws)
     log_own = log_density[draws, own]
     log_density[draws, own] = -np.inf
-    top = log_density.max(axis=1)
-    density = np.exp(log_density - top[:, None], out=log_density)
-    total = density.sum(axis=1)
-    gaps = (log_own - np.log(total) - top + math.log(n - 1)).reshape(n, n_draws).mean(axis=1)
-    shares = (1 / total) @ density / n_draws  # mean 1
+    gaps = (log_own - logsumexp(log_density, axis=1) + math.log(n - 1)).reshape(n, n_draws).mean(axis=1)
+    shares = softmax(log_density, axis=1).sum(axis=0) / n_draws  # mean 1
     return Estimate(float(gaps.mean()), gaps - shares).less_noise(noise_controls(step))

@@ -1,5 +1,5 @@
 """
-The information between two variables from i.i.d. pairs of them, with no policy around: fitted and read by folds.
+Estimate the information between two variables from i.i.d. pairs, by cross-fitting; needs no policy.
 
 Dimension key: M problems, K folds, N pairs, R marginal samples for each pair, X and Z the components of the two
 variables, D components of either or both, J = 4 features of each: its normal score and three cosines of its rank.
@@ -7,9 +7,9 @@ variables, D components of either or both, J = 4 features of each: its normal sc
 
 from __future__ import annotations
 
-import math
+import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from torch import nn
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator, Scores
-from sb3_tdpg.information.flat_adam import AveragedAdam
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.nwj import Nwj
 from sb3_tdpg.measurement.copula_start import (
@@ -30,25 +29,26 @@ from sb3_tdpg.measurement.copula_start import (
     degrees_of_freedom,
     t_scores,
 )
-from sb3_tdpg.networks import BatchedLinear, BatchedMLP, ELUGradient
+from sb3_tdpg.networks import BatchedMLP, ELUGradient, flatten_parameters
 
 STEPS_PER_CHECK = 50
-MIN_VARIANCE = 1e-2  # of what is brought to variance 1
-MARGINAL_SAMPLES = 16  # partners of others that x is also read with
+MIN_VARIANCE = 1e-2  # of a direction, before it is scaled to variance 1
+MARGINAL_SAMPLES = 16  # R
 MIN_PAIRS_PER_FOLD = 10
 N_WAVES = 3
+AVERAGE_DECAY = 0.98  # weight on the past, after the first steps: averages over about 50 steps
 PAIRS_AT_ONCE = 800
 
 
 class InformationEstimate(NamedTuple):
-    """What :func:`estimate_information` found, in nats: floats for one problem, ``(M,)`` arrays for M of them."""
+    """The result of :func:`estimate_information` in nats: floats for one problem, ``(M,)`` arrays for M of them."""
 
     estimate: Any
-    """Midway between the other two."""
+    """The mean of the other two."""
     held_out: Any
-    """On pairs that the critic was not fitted to: tends to be too low."""
+    """On pairs that the critic was not fitted to; tends to be too low."""
     trained_on: Any
-    """On the pairs that the critic was fitted to: tends to be too high."""
+    """On the pairs that the critic was fitted to; tends to be too high."""
 
 
 @threads(1)
@@ -66,45 +66,42 @@ def estimate_information(
     **kwargs: Any,
 ) -> InformationEstimate:
     r"""
-    Estimate I[x; z] in nats from i.i.d. pairs of two continuous variables, held out fold by fold.
+    Estimate I[x; z] in nats from i.i.d. pairs of two continuous variables, by cross-fitting.
 
-    Only the ranks of each component are used, which leaves the information as it is. The critic is
-    :math:`F = F_0 + \text{network}`. It starts from the logarithmic density ratio :math:`F_0` of a t-copula (Demarta
-    and McNeil, 2005): a multivariate Student's t, which also has tails that come together, of the t quantiles of the
-    ranks. Its scatter matrix is that of the training folds, and its degrees of freedom are the most likely ones for all
-    pairs. Where that does better on the held-out pairs of all folds, they are infinitely many, which makes a Gaussian,
-    or :math:`F_0 = 0`. The network's inputs are the normal scores and three cosines of each rank, those of x and z
-    together brought to covariance 1: where x and z depend on each other closely, the little in which they differ is
-    what counts. The network is read with the moving average of its weights.
+    Only the ranks of each component are used, which does not change the information. The critic is
+    :math:`F = F_0 + \text{network}`. The start :math:`F_0` is the logarithmic density ratio of a t-copula (Demarta and
+    McNeil, 2005), which models dependent tails. Its scatter matrix is fitted to the training folds, its degrees of
+    freedom are the most likely ones for all pairs. A Gaussian copula or :math:`F_0 = 0` replaces it where this is
+    better on the held-out pairs of all folds. The inputs of the network are the normal score and three cosines of each
+    rank, whitened jointly for x and z: for strongly dependent variables the small differences between x and z matter.
+    Estimates use the moving average of the network's weights.
 
-    Each of K folds is held out once. After how many gradient steps a critic is read is decided for a fold by the
-    estimates on the *other* folds, so that a fold's own luck is not chosen.
+    Each of K folds is held out once. The number of gradient steps for a fold is chosen by the estimates on the *other*
+    folds, which avoids a selection bias.
 
     :param x: ``(N, X)``, or ``(M, N, X)`` for M problems at once; ``(N,)`` counts as ``(N, 1)``.
-    :param z: ``(N, Z)`` or ``(M, N, Z)``, row by row the partners of ``x``.
-    :param estimator: One with a critic: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, or a class of one's own.
-    :param n_folds: K
-    :param max_gradient_steps: The most steps of gradient ascent for each critic.
-    :param patience: Training ends after this many checks, one every 50 steps, with no better held-out estimate: after
-        100 steps where the start cannot be bettered.
+    :param z: ``(N, Z)`` or ``(M, N, Z)``; row i belongs to row i of ``x``.
+    :param estimator: An estimator with a critic: ``"mine"``, ``"nwj"``, ``"smile"``, ``"infonce"``, or a class.
+    :param n_folds: Number of folds K.
+    :param max_gradient_steps: Maximum number of gradient steps for each critic.
+    :param patience: Training ends after this many checks without a better held-out estimate, one every 50 steps.
     :param learning_rate: Adam's learning rate.
-    :param batch_size: Minibatch B; None: 200, or 32 for InfoNCE, which cannot tell more than ``ln B``.
-    :param seed: Of folds, weights and minibatches. PyTorch's global random state is left as it was.
+    :param batch_size: Minibatch size B. Default: 200, or 32 for InfoNCE, whose estimates cannot exceed ``ln B``.
+    :param seed: Seed of folds, weights and minibatches. PyTorch's global random state does not change.
     :param kwargs: Further arguments of the estimator's constructor, such as ``hidden_sizes``.
-    :return: the estimate between its lower and its upper guess. For a critic with p parameters in a large sample, the
-        pairs that it was fitted to read about p / 2N too high and fresh ones about p / 2N too low (the same count as in
-        Akaike's criterion), so that the mean of both is the estimate. ``held_out`` alone is the cautious one, a lower
-        bound in expectation where the estimator is one.
-    :raises ValueError: if the shapes do not fit, a number is not finite, there are fewer than ten pairs for each fold
-        or too few for the number of components, or the estimator needs the encoder's density.
+    :return: the mean of the estimates on training pairs and on held-out pairs, and both of these. In a large sample, a
+        critic with p parameters reads about p / 2N too high on the pairs that it was fitted to and p / 2N too low on
+        fresh ones (the count of Akaike's criterion). ``held_out`` is the cautious choice: a lower bound in expectation
+        where the estimator is one.
+    :raises ValueError: if shapes do not match, a value is not finite, there are fewer than ten pairs for each fold or
+        too few for the number of components, or the estimator needs the encoder's density.
     """
     from sb3_tdpg.information import get_estimator_class  # the registry is made of the modules in this folder
 
     estimator_class = get_estimator_class(estimator)
     if not issubclass(estimator_class, CriticEstimator):
         raise ValueError(
-            f"estimator={estimator!r} needs the encoder's density, and pairs alone have none: use an estimator with a "
-            'critic, such as "mine"'
+            f'estimator={estimator!r} needs the density of an encoder: use an estimator with a critic, such as "mine"'
         )
     x, z, single = _check(x, z, n_folds)
     for name, value in (("max_gradient_steps", max_gradient_steps), ("patience", patience)):
@@ -120,7 +117,7 @@ def estimate_information(
 
 
 def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor, th.Tensor, bool]:
-    """Return both as ``(M, N, ...)``, and whether there was only one problem."""
+    """Return both as ``(M, N, ...)``, and whether there is only one problem."""
     arrays = []
     for name, value in (("x", x), ("z", z)):
         array = np.asarray(value.detach().cpu() if isinstance(value, th.Tensor) else value, dtype=np.float64)
@@ -139,7 +136,7 @@ def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor,
         raise ValueError(f"n_folds={n_folds} must be at least 2: one fold is held out while the others are trained on")
     n = arrays[0].shape[-2]
     n_components = sum(array.shape[-1] for array in arrays)
-    # Their covariance is estimated on all folds but one.
+    # The covariance of the components is estimated on all folds but one.
     fewest = max(MIN_PAIRS_PER_FOLD * n_folds, 4 * n_components)
     if n < fewest:
         raise ValueError(
@@ -155,7 +152,7 @@ def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor,
 
 
 def _ranks(x: th.Tensor) -> th.Tensor:
-    """Relative rank of every value among the N of its component, in (0, 1), equal values alike: ``(..., N, D)``."""
+    """Return the relative rank of every value in its component, in (0, 1), with ties averaged: ``(..., N, D)``."""
     values = x.mT.contiguous()
     ordered = values.sort(dim=-1).values
     below = th.searchsorted(ordered, values)
@@ -164,18 +161,16 @@ def _ranks(x: th.Tensor) -> th.Tensor:
 
 
 def _features(ranks: th.Tensor) -> th.Tensor:
-    """Normal scores, and cosines with which a small network sees more detail: ``(M, N, D) -> (M, N, J, D)``."""
+    """Compute normal scores, and cosines that show a small network more detail: ``(M, N, D) -> (M, N, J, D)``."""
     waves = [2**0.5 * th.cos(th.pi * j * ranks) for j in range(1, N_WAVES + 1)]
     return th.stack([th.special.ndtri(ranks), *waves], -2)
 
 
 def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Find the means and the maps after which the features of each kind are uncorrelated, with variance 1, in all rows.
+    Find the means and the matrices that whiten the features of each kind in all rows.
 
-    Where x and z depend on each other closely, the little in which they differ is what a network has to see.
-
-    :param features: of x and z, ``(rows, n, J, D)``
+    :param features: features of x and z, ``(rows, n, J, D)``
     :return: ``(rows, 1, J, D)`` and ``(rows, J, D, D)``
     """
     mean = features.mean(1, keepdim=True)
@@ -186,60 +181,37 @@ def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
 def _inputs(features: th.Tensor, train: th.Tensor, n_x: int) -> th.Tensor:
     """
-    What x and z bring to the network's inputs, which are the sum of both: white on each fold's training pairs.
+    Compute the terms of x and of z in the network's inputs, whose sum is white on each fold's training pairs.
 
-    :param features: of x and z, ``(M, N, J, D)``
-    :param train: pairs that each fold trains on, ``(K, n)``
+    :param features: features of x and z, ``(M, N, J, D)``
+    :param train: training pairs of each fold, ``(K, n)``
     :param n_x: X
-    :return: of every x, then of every z: ``(2 * M * K * N, J * D)``
+    :return: the terms of every x, then of every z: ``(2 * M * K * N, J * D)``
     """
     mean, axes = (found.unflatten(0, (-1, len(train))) for found in _whiten(features[:, train].flatten(0, 1)))
     centred = features[:, None] - mean  # (M, K, N, J, D)
-    brought = [
+    terms = [
         th.einsum("mknjd,mkjde->mknje", centred[..., part], axes[..., part, :])
         for part in (slice(n_x), slice(n_x, None))
     ]
-    return th.stack(brought).flatten(4).flatten(0, 3).float()
-
-
-def _elu_(x: th.Tensor) -> th.Tensor:
-    """ELU in place, to within 1e-7: ``max(x, exp(min(x, 0)) - 1)``, by a power of 2, which is faster than that of e."""
-    exponential = x.clamp(max=0).mul_(math.log2(math.e)).exp2_()
-    return th.maximum(x, exponential.sub_(1), out=x)
-
-
-def _to_one(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
-    """Map to one output, ``(M, N, I) -> (M, N, 1)``, in the order that takes a fifth of the time."""
-    return th.baddbmm(bias, weight.mT, x.mT).mT
-
-
-class _QuickELU(nn.ELU):
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return _elu_(x)
+    return th.stack(terms).flatten(4).flatten(0, 3).float()
 
 
 class StartedMLP(BatchedMLP):
     """
     Networks that are added to a fixed critic, and are zero at first.
 
-    They are given pairs as places in a table, and look up what x and z bring to their inputs and to the start. What is
-    drawn, repeated and put together for a minibatch is then numbers alone.
+    Their inputs are pairs of places in a table that holds what each x and each z adds to the inputs and to the start.
     """
 
     start: Start
-    table: th.Tensor  # see `add_up`: what is brought to the J * (X + Z) inputs, then to the start
+    table: th.Tensor  # see `add_up`: what is added to the J * (X + Z) inputs, then to the start
 
     def forward(self, pairs: th.Tensor) -> th.Tensor:
         """``(rows, n, 2) -> (rows, n, 1)``."""
-        # Not all at once: what the layers make of so many is to stay in the processor's cache.
+        # In parts, so that the values of the hidden layers stay in the processor's cache.
         parts = (self.prepare(part) for part in pairs.split(PAIRS_AT_ONCE, dim=1))
-        return th.cat([start + self._outputs(inputs) for inputs, start in parts], 1)
-
-    def _outputs(self, inputs: th.Tensor) -> th.Tensor:
-        *hidden, last = cast("list[BatchedLinear]", list(self.layers))
-        for layer in hidden:
-            inputs = self.activation(layer(inputs))
-        return _to_one(inputs, last.weight, last.bias)
+        return th.cat([start + super(StartedMLP, self).forward(inputs) for inputs, start in parts], 1)
 
     def prepare(self, pairs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Inputs of the networks, ``(rows, n, J * (X + Z))``, and what is added to their outputs, ``(rows, n, 1)``."""
@@ -248,24 +220,18 @@ class StartedMLP(BatchedMLP):
         return sums[..., :n_inputs], self.start.of_sums(sums[..., n_inputs:])
 
     def gradient_by_hand(self) -> ELUGradient:
-        """Return the means to evaluate and differentiate this critic; see :class:`ELUGradient`."""
-        return _StartedGradient(self, super().gradient_by_hand())
+        """Return a faster way than autograd to evaluate and differentiate this critic; see :class:`ELUGradient`."""
+        return _StartedGradient(self)
 
 
 class _StartedGradient(ELUGradient):
-    def __init__(self, critic: StartedMLP, network: ELUGradient) -> None:
-        self.__dict__.update(network.__dict__)
-        self._critic = critic
+    def __init__(self, critic: StartedMLP) -> None:
+        super().__init__(critic)
+        self._prepare = critic.prepare
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """As that of the base class, with kernels that take half the time but round in another way."""
-        inputs, start = self._critic.prepare(x)
-        *hidden, (last_weight, last_bias) = self._layers
-        self._inputs = [inputs]
-        for weight, bias in hidden:
-            inputs = _elu_(th.baddbmm(bias, inputs, weight))
-            self._inputs.append(inputs)
-        return start.add_(_to_one(inputs, last_weight, last_bias))
+        inputs, start = self._prepare(x)
+        return start + super().forward(inputs)
 
 
 # -- folds ----------------------------------------------------------------------------------------------------
@@ -297,13 +263,13 @@ def _cross_fit(
     n_places = n_rows * n
     places = th.arange(n_places, dtype=th.int32).view(n_problems, n_folds, n)
     on_train, fresh, seen = (places.gather(2, part.expand(n_problems, -1, -1)).flatten(0, 1) for part in parts)
-    estimator = estimator_class(n_rows, 1, 1, **kwargs)  # what is paired is places
+    estimator = estimator_class(n_rows, 1, 1, **kwargs)  # the critics' inputs are places of pairs
 
     def read(critic: nn.Module, pairs: th.Tensor) -> th.Tensor:
         """Estimate from pairs of every row: ``(rows, n) -> (M, K)``."""
         return _read(estimator, critic, pairs, pairs + n_places).view(n_problems, n_folds)
 
-    # The start is what the held-out pairs of all folds say: none, a Gaussian's ratio or a t's.
+    # The held-out pairs of all folds choose the start: a Gaussian copula, a t-copula or none.
     infinite = th.full((n_problems,), NORMAL, dtype=th.double)
     starts = [
         Start.fit(t_scores(ranks, nu[:, None])[:, 0], train, n_x, nu, _level(estimator))
@@ -316,8 +282,8 @@ def _cross_fit(
 
     th.manual_seed(seed)
     critic = _new_critic(estimator, start, _inputs(_features(ranks), train, n_x), n_folds)
-    optimizer = AveragedAdam(estimator.learning_rate)
-    optimizer.attach(critic)
+    optimizer = estimator.make_optimizer(critic)
+    averaged = _average(critic, optimizer)
     first = read(start, fresh)
     choice = _Choice(estimator.refit_below, estimator.refit_above, first, read(start, seen))
     best = first.mean(-1)
@@ -327,29 +293,44 @@ def _cross_fit(
         n_steps = min(STEPS_PER_CHECK, max_gradient_steps - n_done)
         estimator._ascend(critic, optimizer, *samples, n_steps)
         n_done += n_steps
-        with optimizer.averaged():
-            current = read(critic, fresh)
-            choice.consider(current, lambda: read(critic, seen), training)
+        current = read(averaged, fresh)
+        choice.consider(current, lambda: read(averaged, seen), training)
         improved = current.mean(-1) > best
         n_stale = th.where(training & improved, 0.0, n_stale + 1)
         best = best.fmax(current.mean(-1))
     return choice.held_out.mean(-1), choice.trained_on.mean(-1)
 
 
+def _average(critic: StartedMLP, optimizer: th.optim.Adam) -> StartedMLP:
+    """
+    Return a copy whose weights are the moving average of the critic's (Polyak and Juditsky, 1992).
+
+    The average is free of most of the noise of minibatches, so that the learning rate can be large. (The
+    ``AveragedModel`` of PyTorch takes longer for a step than all else.)
+    """
+    averaged = copy.deepcopy(critic)
+    average, (weights,) = flatten_parameters(averaged), optimizer.param_groups[0]["params"]
+
+    def update(*_: object) -> None:
+        n = optimizer.state[weights]["step"].item()
+        average.lerp_(weights, 1 - min(AVERAGE_DECAY, n / (n + 10)))
+
+    optimizer.register_step_post_hook(update)
+    return averaged
+
+
 def _level(estimator: CriticEstimator) -> float:
-    """The score at which the critic says "no information": the NWJ bound's best critic is 1 + the log ratio."""
+    """Return the score that means "no information": the optimal critic of the NWJ bound is 1 + the log ratio."""
     return 1.0 if isinstance(estimator, Nwj) else 0.0
 
 
 def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_folds: int) -> StartedMLP:
-    """Make critics that equal ``start``, whose networks begin alike in every problem: the batch changes no result."""
+    """Make critics that equal ``start``; their networks start with the same weights in every problem."""
     sizes = (inputs.shape[-1], *estimator.sizes[1:])
     networks = BatchedMLP(n_folds, sizes, estimator.activation_fn)
-    with th.random.fork_rng(devices=[]):  # what is drawn here is overwritten
+    with th.random.fork_rng(devices=[]):  # these weights are overwritten
         critic = StartedMLP(len(start.factor), sizes, estimator.activation_fn)
     critic.start, critic.table = start, th.cat([inputs, start.table], -1)
-    if estimator.activation_fn is nn.ELU:
-        critic.activation = _QuickELU()
     for parameter, fold in zip(critic.parameters(), networks.parameters(), strict=True):
         parameter.copy_(fold.repeat(len(parameter) // n_folds, 1, 1))
     last = critic.layers[-1]
@@ -359,8 +340,8 @@ def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_f
 
 
 def _read(estimator: CriticEstimator, critic: nn.Module, x: th.Tensor, z: th.Tensor) -> th.Tensor:
-    """Estimate from pairs, each x also with the z of R others: places of both, ``(rows, n)`` each ``-> (rows,)``."""
-    if isinstance(estimator, InfoNCE):  # it makes pairs of its own
+    """Estimate from the places of x and z, ``(rows, n)`` each, pairing each x also with R other z: ``(rows,)``."""
+    if isinstance(estimator, InfoNCE):  # it makes its own pairs
         estimator.critic = critic  # type: ignore[assignment]
         states, trvs = x[..., None].double(), z[..., None].double()
         return estimator._estimate(InformationBatch(states, trvs, trvs, trvs), None)
@@ -370,22 +351,22 @@ def _read(estimator: CriticEstimator, critic: nn.Module, x: th.Tensor, z: th.Ten
     partners = z[:, others]
     pairs = th.stack([x[..., None].expand_as(partners), partners], -1)
     joint, marginal = pairs[:, :, :1].flatten(1, 2), pairs[:, :, 1:].flatten(1, 2)
-    # Double, so that of scores that are large, as a diverged critic's are, no information is made by rounding.
+    # Double precision: rounding errors of the large scores of a diverged critic must not look like information.
     values = critic(th.cat([joint, marginal], 1)).squeeze(-1).double()
     return estimator._bound(Scores(values[:, :n], values[:, n:].unflatten(1, (n, n_marginal))))
 
 
 class _Choice:
     """
-    Chooses the length of training for each fold by what the other folds say of it.
+    Choose the length of training for each fold by the estimates of the other folds.
 
-    An estimate out of bounds, of any fold, is that of a critic that has diverged, which is not chosen. What a critic
-    reads on pairs that it has seen is asked for only where it may be chosen.
+    Critics with an estimate out of bounds in any fold have diverged and are not chosen. Estimates on training pairs are
+    computed only where a critic may be chosen.
 
-    :param lowest: of an estimate
-    :param highest: likewise
-    :param held_out: of the start, ``(M, K)``
-    :param trained_on: of the start, ``(M, K)``
+    :param lowest: lower bound of the estimates
+    :param highest: upper bound of the estimates
+    :param held_out: estimates of the start, ``(M, K)``
+    :param trained_on: estimates of the start, ``(M, K)``
     """
 
     def __init__(self, lowest: float, highest: float, held_out: th.Tensor, trained_on: th.Tensor) -> None:
@@ -395,11 +376,11 @@ class _Choice:
 
     def consider(self, held_out: th.Tensor, trained_on: Callable[[], th.Tensor], training: th.Tensor) -> None:
         """
-        Choose a critic for the folds for which it is better than those before.
+        Choose a critic for the folds where it is better than the earlier ones.
 
         :param held_out: ``(M, K)``
-        :param trained_on: gives ``(M, K)``
-        :param training: problems that are still in training, ``(M,)``
+        :param trained_on: returns ``(M, K)``
+        :param training: whether each problem is still in training, ``(M,)``
         """
         others = self._others(held_out)
         better = (others > self._best) & self._counts(held_out) & training[:, None]
@@ -411,10 +392,10 @@ class _Choice:
             self.trained_on = seen.where(better, self.trained_on)
 
     def _counts(self, estimates: th.Tensor) -> th.Tensor:
-        """Whether the estimates of all folds of a problem are in bounds: ``(M, K) -> (M, 1)``."""
+        """Return whether the estimates of all folds of a problem are in bounds: ``(M, K) -> (M, 1)``."""
         return ((estimates >= self._lowest) & (estimates <= self._highest)).all(-1, keepdim=True)  # NaN compares false
 
     @staticmethod
     def _others(held_out: th.Tensor) -> th.Tensor:
-        """Sum of the other folds: ``(M, K) -> (M, K)``."""
+        """Sum the estimates of the other folds: ``(M, K) -> (M, K)``."""
         return held_out @ (1 - th.eye(held_out.shape[-1], dtype=held_out.dtype))

@@ -14,12 +14,13 @@ from sb3_tdpg.measurement import estimate_information
 from sb3_tdpg.measurement.copula_start import Start, _scatter, degrees_of_freedom
 from sb3_tdpg.measurement.pairs import (
     StartedMLP,
+    _average,
     _Choice,
-    _elu_,
     _features,
     _ranks,
     _whiten,
 )
+from sb3_tdpg.networks import flatten_parameters
 
 BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "benchmark_mi"
 EASY = (  # of these the benchmark's CCA or KSG is within 10 % of the truth
@@ -190,8 +191,22 @@ def test_the_networks_gradient_by_hand_is_that_of_autograd():
         th.testing.assert_close(by_hand.forward(pairs), values)
         by_hand.backward(weights)
     th.testing.assert_close([parameter.grad for parameter in critic.parameters()], list(expected))
-    x = th.linspace(-100, 20, 500)
-    th.testing.assert_close(_elu_(x.clone()), th.nn.functional.elu(x), rtol=0, atol=2e-7)
+
+
+def test_the_averaged_critic_follows_the_trained_one():
+    critic = StartedMLP(1, (1, 1))
+    weights = flatten_parameters(critic)
+    optimizer = th.optim.Adam([weights], lr=0.1)
+    averaged, (weight, _) = _average(critic, optimizer), critic.parameters()
+    expected = weight.item()
+    for step in range(1, 600):
+        weights.grad.fill_((-1.0) ** (step // 3))
+        with th.no_grad():
+            optimizer.step()
+        past = min(0.98, step / (step + 10))
+        expected = past * expected + (1 - past) * weight.item()
+        assert next(averaged.parameters()).item() == pytest.approx(expected, abs=1e-5)
+    assert weight.item() != next(averaged.parameters()).item()
 
 
 def test_whitened_features_have_covariance_1():

@@ -1,4 +1,4 @@
-"""May an interval be trusted? The checks pass where they should, and fail where they should."""
+"""Sound intervals pass every check, and each kind of error fails the check made for it."""
 
 import math
 
@@ -9,7 +9,7 @@ from information_problems import channel, gaussian_batch, generator, random_batc
 
 from sb3_tdpg.measurement import information_interval
 from sb3_tdpg.measurement import interval as interval_module
-from sb3_tdpg.measurement.trust import TrustBadge, TrustCheck, trust_checks
+from sb3_tdpg.measurement.checks import TrustBadge, TrustCheck, trust_checks
 
 
 def test_a_sound_batch_passes_every_check():
@@ -88,5 +88,5 @@ def test_a_value_that_is_no_number_is_no_pass():
 
 
 def test_nothing_to_be_checked_is_an_error():
-    with pytest.raises(ValueError, match="no time step has an interval to be checked: 10 episodes"):
+    with pytest.raises(ValueError, match="no time step has an interval to check: at most 10 episodes"):
         trust_checks(random_batch(n=10))

@@ -1,5 +1,5 @@
 """
-May an information interval be trusted? Checks whose outcome is known beforehand.
+Check an information interval with tests whose outcome is known in advance.
 
 Dimension key: T time steps, N episodes, Z TRVs.
 """
@@ -14,9 +14,9 @@ from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.measurement.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
 
-NEAR_THE_CAP = 0.9  # of ln N
-FALSE_ALARM = 0.01  # probability of each check to fail without a cause, all time steps together
-ADDED_VARIANCE = 3.0  # of the data-processing check's noise, in multiples of the encoder's mean variance
+NEAR_THE_CAP = 0.9  # share of ln N
+FALSE_ALARM = 0.01  # probability that a check of a sound interval fails, over all time steps
+ADDED_VARIANCE = 3.0  # of the noise added for data processing, relative to the encoder's mean variance
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class TrustCheck:
     value: float
     threshold: float
     meaning: str
-    """What the number is, and its unit."""
+    """The meaning of the value, and its unit."""
 
     @property
     def passed(self) -> bool:
@@ -37,15 +37,15 @@ class TrustCheck:
 
 @dataclass(frozen=True)
 class TrustBadge:
-    """What speaks for and against an interval. ``str(badge)`` is one line, :meth:`markdown` a table."""
+    """The outcome of all checks of an interval: one line as ``str(badge)``, a table as :meth:`markdown`."""
 
     checks: tuple[TrustCheck, ...]
     capped_steps: tuple[int, ...]
-    """Time steps whose lower estimate is within 10 % of ln N, or above it: the truth can be far above."""
+    """Time steps whose lower estimate is at least 90 % of ln N, where the truth can be much higher."""
 
     @property
     def passed(self) -> bool:
-        """Whether every check passed; a cap is a warning only."""
+        """Whether every check passed; capped steps are only a warning."""
         return all(check.passed for check in self.checks)
 
     def __str__(self) -> str:
@@ -53,51 +53,48 @@ class TrustBadge:
         return f"{'trusted' if self.passed else 'NOT TRUSTED'}: {', '.join(outcomes)}{self._warning()}"
 
     def markdown(self) -> str:
-        """Return a table with a row for each check, and the warning below it."""
-        rows = [
-            f"| {check.name} | {'ok' if check.passed else '**failed**'} | {check.value:.3f} | {check.threshold:.3f} | "
-            f"{check.meaning} |"
-            for check in self.checks
-        ]
-        table = "\n".join(["| check | | value | at most | meaning |", "|---|---|---|---|---|", *rows])
-        return f"{table}\n\nWarning{self._warning().removeprefix('; warning')}" if self.capped_steps else table
+        """Return a Markdown table with a row for each check, and the warning below it."""
+        lines = ["| check | | value | at most | meaning |", "|---|---|---|---|---|"]
+        for check in self.checks:
+            outcome = "ok" if check.passed else "**failed**"
+            lines.append(f"| {check.name} | {outcome} | {check.value:.3f} | {check.threshold:.3f} | {check.meaning} |")
+        if self.capped_steps:
+            lines += ["", f"Warning{self._warning().removeprefix('; warning')}"]
+        return "\n".join(lines)
 
     def _warning(self) -> str:
         if not self.capped_steps:
             return ""
         steps = ", ".join(map(str, self.capped_steps))
-        return (
-            f"; warning: at the ln N cap at t = {steps}: the lower limit can be far below the truth, use more episodes"
-        )
+        return f"; warning: at the ln N cap at t = {steps}: the lower limit can be far too low, use more episodes"
 
 
 @threads(1)
 def trust_checks(batch: InformationBatch, interval: InformationInterval | None = None, *, seed: int = 0) -> TrustBadge:
     r"""
-    Check an information interval against what must come out.
+    Run three checks of an information interval.
 
-    - **shuffled pairs**: with every state paired with the TRVs of another episode there is no information, and no
-      lower bound must find any;
-    - **data processing**: a noisier copy of the TRVs (the same noise added to all of a time step, so much that the
-      encoder's mean variance is four times as large) knows no more of the state, so its lower limit must not be above
-      the upper limit of the TRVs, nor its estimate above theirs (where both count as 0 if they are negative: then the
-      critic finds nothing, and its limit is 0);
-    - **encoder density**: :math:`(\tilde x - \mu) / \sigma` must have mean square 1, or the density that every bound
-      rests on is not that of the TRVs (actions and TRVs taken without noise, say).
+    - **shuffled pairs**: when every state is paired with the TRVs of another episode, there is no information, and the
+      lower bounds must find none;
+    - **data processing**: a noisier copy of the TRVs (with four times the encoder's mean variance) has no more
+      information about the state. Its lower limit must not exceed the upper limit of the TRVs, and its estimate must
+      not exceed theirs; negative estimates count as 0;
+    - **encoder density**: :math:`(\tilde x - \mu) / \sigma` must have mean square 1. Otherwise the TRVs were not drawn
+      from the density that every bound uses (but without noise, for instance).
 
-    Of the time steps, the worst is reported. If all is well, a check fails with a probability of about 1 %, the number
-    of time steps allowed for.
+    Each check reports its worst time step. A check of a sound interval fails with a probability of about 1 %, all time
+    steps together.
 
     :param batch: The rollouts ``(T, N, ...)`` of the interval.
-    :param interval: From :func:`~sb3_tdpg.measurement.information_interval`; made anew if not given.
-    :param seed: Of the shuffling and of the intervals.
+    :param interval: The result of :func:`~sb3_tdpg.measurement.information_interval`; computed if not given.
+    :param seed: Seed of the shuffling and of the intervals.
     :raises ValueError: if no time step has enough episodes.
     """
     interval = information_interval(batch, seed=seed) if interval is None else interval
     steps = np.flatnonzero(np.isfinite(interval.upper) & np.isfinite(interval.estimates["critic"]))
     if len(steps) == 0:
         raise ValueError(
-            f"no time step has an interval to be checked: {interval.n_episodes.max(initial=0)} episodes at the most"
+            f"no time step has an interval to check: at most {interval.n_episodes.max(initial=0)} episodes are alive"
         )
     miss = FALSE_ALARM / len(steps)
     quantile = normal_quantile(miss)
@@ -118,20 +115,20 @@ def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float,
     for t in steps:
         living = np.flatnonzero(np.ones(states.shape[1]) if batch.alive is None else batch.alive[t].cpu().numpy())
         order = rng.permutation(living)
-        states[t, order] = batch.states[t, np.roll(order, 1)]  # one cycle: no episode keeps its own
+        states[t, order] = batch.states[t, np.roll(order, 1)]  # one cycle, so no episode keeps its own state
     null = information_interval(batch._replace(states=states), seed=seed)
     return _worst(
         "shuffled pairs",
         np.concatenate([null.estimates[name][steps] for name in LOWER_BOUNDS]),
         quantile * np.concatenate([null.errors[name][steps] for name in LOWER_BOUNDS]),
-        "nats that a lower bound finds where there are none",
+        "nats that a lower bound finds without any information",
     )
 
 
 def _data_processing(
     batch: InformationBatch, interval: InformationInterval, steps: np.ndarray, quantile: float, seed: int
 ) -> TrustCheck:
-    # Noise that knew how noisy the encoder is would tell something of its input: one variance for all of a time step.
+    # One variance for all episodes of a time step: noise that depends on the encoder's would carry information.
     variances = batch.stds.square()
     if batch.alive is not None:
         variances = variances.masked_fill(~batch.alive[..., None], 0.0)
@@ -144,7 +141,7 @@ def _data_processing(
         name,
         (copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0))[steps],
         quantile * np.hypot(copy.errors["critic"], interval.errors["critic"])[steps],
-        "nats by which a noisier copy of the TRVs knows more, by the critic's bound",
+        "nats by which the critic's bound of a noisier copy of the TRVs is higher",
     )
     crossed = TrustCheck(
         name,
@@ -163,7 +160,7 @@ def _encoder_density(batch: InformationBatch, steps: np.ndarray, quantile: float
         noise = (at_t.trvs - at_t.means) / at_t.stds
         n_noises.append(noise.shape[1] * trv_dim)
         excess.append(abs(noise.double().square().mean().item() - 1))
-    threshold = quantile * np.sqrt(2 / np.asarray(n_noises))  # the square of a normal number has variance 2
+    threshold = quantile * np.sqrt(2 / np.asarray(n_noises))  # the square of a standard normal has variance 2
     return _worst("encoder density", np.asarray(excess), threshold, "distance of the mean square of the noise from 1")
 
 
