@@ -84,6 +84,15 @@ class EpisodeBuffer(RolloutBuffer):
             getattr(self, name)[t, episode] = value
         self.alive[t, episode] = 1.0
 
+    def clear_episodes(self, episodes: np.ndarray) -> None:
+        """
+        Forget some episodes.
+
+        :param episodes: their columns, ``(n,)``
+        """
+        self.costs[:, episodes] = 0.0
+        self.alive[:, episodes] = 0.0
+
     def episode_batch(self) -> EpisodeBatch:
         """Return the epoch as tensors."""
         assert self.full, "the epoch's rollouts are not complete"

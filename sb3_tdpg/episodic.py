@@ -180,7 +180,12 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             states = self._problem.next_states(env, cast(np.ndarray, new_obs), dones, infos)
             trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
             t = np.where(dones, 0, t + 1)
-            column = np.where(dones, column + n_envs, column)
+            finished = dones
+            if dones.any() and (lost := np.array([info.get("episode_lost", False) for info in infos])).any():
+                # RayVecEnv has restarted these environments: they run the episode again.
+                rollout_buffer.clear_episodes(column[running][lost[running]])
+                finished = dones & ~lost
+            column = np.where(finished, column + n_envs, column)
             if (t[column < self.n_episodes] >= self.horizon).any():
                 raise ValueError(
                     f"an episode did not end after horizon={self.horizon} steps: the environment must return "

@@ -17,7 +17,7 @@ from small_problems import (
     train_epochs,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
 from sb3_tdpg import TDPG, BatchedVecEnv, TRVPolicy
 from sb3_tdpg.envs.lava import LavaEnv
@@ -151,6 +151,30 @@ def test_every_environment_runs_its_quota_of_episodes_however_short_they_are(bas
     # Every epoch starts with whole episodes: one of them may have been cut short and must not be seen.
     model.learn(model.num_timesteps + 1, reset_num_timesteps=False)
     assert (buffer.observations[0, :, 2] == 0).all()
+
+
+class LosesEpisodes(VecEnvWrapper):
+    """Marks the second episode of environment 1 as lost, as ``RayVecEnv`` does after a restart."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        if dones[1] and self.venv.envs[1].episode % 4 == 1:  # auto-reset: this is the index of the next episode
+            infos[1]["episode_lost"] = True
+        return observations, rewards, dones, infos
+
+
+def test_a_lost_episode_is_run_again_in_its_place():
+    env = LosesEpisodes(DummyVecEnv([lambda i=i: CountdownEnv(i, [3, 4, 2, 2]) for i in range(2)]))
+    model = tiny_tdpg(env, n_episodes=4, beta=math.inf)
+    env.venv.env_method("__setattr__", "episode", -1)
+    model.learn(1)
+    buffer = model.rollout_buffer
+    assert buffer.observations[0, :, 1].tolist() == [0, 1, 1, 2]  # environment 1 has lost its episode 0
+    assert buffer.alive.sum(0).tolist() == [3, 4, 4, 2]
+    np.testing.assert_array_equal(buffer.episode_costs, [3, 406, 406, 401])
 
 
 @pytest.mark.parametrize("mi_estimator", ["mine", "logdet", "loo", "vib"])

@@ -237,7 +237,9 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
             lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
         limits[:, t] = min(lower, upper), upper
-    return InformationInterval(*limits, tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes, confidence)
+    return InformationInterval(
+        limits[0], limits[1], tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes, confidence
+    )
 
 
 def component_estimates(
