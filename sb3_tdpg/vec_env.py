@@ -174,8 +174,7 @@ def make_episodes_env(
     :param n_episodes: Episodes per epoch; default: TDPG's default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether PandaGrasp, which simulates its episodes one by one, uses one process per core. The
-        numbers are the same without.
+    :param use_processes: Whether PandaGrasp uses one process per core, with the same numbers as without.
     :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
     :raises gymnasium.error.Error: if the id is not registered.
     """

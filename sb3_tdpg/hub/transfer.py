@@ -1,9 +1,4 @@
-"""
-Write the folder of a model, and exchange it with the Hugging Face Hub.
-
-By convention a repository is ``<organization>/tdpg-<environment>`` and its model ``tdpg-<environment>.zip``. The folder
-also has the files that rl-zoo3's ``load_from_hub`` asks for.
-"""
+"""Write the folder of a model, with the files that rl-zoo3 asks for, and exchange it with the Hugging Face Hub."""
 
 from __future__ import annotations
 
