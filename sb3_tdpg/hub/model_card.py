@@ -68,7 +68,9 @@ def model_card(
     :param pictures: Files in the folder of the card; ``training.png`` and ``replay.mp4`` are shown.
     """
     changes = {row.name: _changes(publication, row.env_kwargs) for row in publication.scenarios}
-    task, rows, evaluations = "reinforcement-learning", [], []
+    task = "reinforcement-learning"
+    rows: list[dict[str, str]] = []
+    evaluations: list[EvalResult] = []
     for result in results.to_dict("records"):
         # Digits after the point, so that the half-width of the interval shows two significant ones.
         half = (result["high"] - result["low"]) / 2

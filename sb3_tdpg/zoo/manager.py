@@ -213,7 +213,7 @@ class TDPGExperimentManager(ExperimentManager):
         if self.resume is None:  # otherwise the record of the first start stays
             super()._save_config(saved_hyperparams)
             env_id = self.env_name.gym_id
-            config = dict(algo=self.algo, env_id=env_id, block=self.block or env_id, seed=self.seed)
+            config: dict[str, Any] = dict(algo=self.algo, env_id=env_id, block=self.block or env_id, seed=self.seed)
             config |= dict(arguments=self.arguments, hyperparams=saved_hyperparams)
             write_run_config(Path(self.save_path, RECORD), config)
 
