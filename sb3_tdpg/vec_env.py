@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import load_env_creator
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -41,10 +41,7 @@ class BatchedVecEnv(VecEnv):
     def __init__(self, env: POMDPEnv, n_envs: int) -> None:
         self.env = env
         super().__init__(n_envs, env.observation_space, env.action_space)
-        self._time = 0
         self._state = np.empty((0, 0))
-        self._actions = np.empty(0)
-        self._returns = np.zeros(n_envs)
         self._start_time = time.time()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -87,12 +84,9 @@ class BatchedVecEnv(VecEnv):
             info.update(more)
         if is_last:
             elapsed = round(time.time() - self._start_time, 6)
-            for info, terminal_observation, episode_return in zip(
-                infos, observation, self._returns.tolist(), strict=True
-            ):
-                info["TimeLimit.truncated"] = False
-                info["terminal_observation"] = terminal_observation
-                info["episode"] = {"r": episode_return, "l": self._time, "t": elapsed}
+            for i, info in enumerate(infos):
+                info.update({"TimeLimit.truncated": False, "terminal_observation": observation[i]})
+                info["episode"] = {"r": float(self._returns[i]), "l": self._time, "t": elapsed}
             observation = self._start_episodes()
         return observation, (-cost).astype(np.float32), np.full(self.num_envs, is_last), infos
 
@@ -131,11 +125,17 @@ class BatchedVecEnv(VecEnv):
         return images
 
 
-def _bare_id(env_id: str) -> str:
+def _spec(env_id: str) -> EnvSpec:
+    """Return the registered specification; unlike ``gym.spec``, this also takes the ``module:id`` form."""
     module, _, bare_id = env_id.rpartition(":")
-    if module:  # gymnasium.make takes this form, gymnasium.spec does not
+    if module:
         import_module(module)
-    return bare_id
+    return gym.spec(bare_id)
+
+
+def _creator(spec: EnvSpec) -> Any:
+    """Return the class or function that makes the environment."""
+    return spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
 
 
 def batched_class(env_id: str) -> type[POMDPEnv] | None:
@@ -145,22 +145,10 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     :raises gymnasium.error.Error: if the id is not registered.
     """
-    creator = _creator(env_id)
-    additional_wrappers = gym.spec(_bare_id(env_id)).additional_wrappers
-    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv) and not additional_wrappers
+    spec = _spec(env_id)
+    creator = _creator(spec)
+    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers
     return cast(type[POMDPEnv], creator) if is_batched else None
-
-
-def _creator(env_id: str) -> Any:
-    """Return the class or function that makes the environment."""
-    spec = gym.spec(_bare_id(env_id))
-    return spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
-
-
-def _draws(env_id: str) -> bool:
-    """Whether the environment can render: Gymnasium warns when one that cannot is asked to."""
-    creator = _creator(env_id)
-    return not hasattr(creator, "metadata") or "rgb_array" in creator.metadata.get("render_modes", ())
 
 
 def default_n_envs(n_episodes: int) -> int:
@@ -186,15 +174,13 @@ def make_episodes_env(
     :param n_episodes: Episodes per epoch; default: TDPG's default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether PandaGrasp, which simulates its episodes one by one, uses one process per core. The
-        numbers are the same without.
+    :param use_processes: Whether PandaGrasp uses one process per core, with the same numbers as without.
     :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
     :raises gymnasium.error.Error: if the id is not registered.
     """
     env_kwargs = dict(env_kwargs or {})
-    env_class = batched_class(env_id)
+    env_class, spec = batched_class(env_id), _spec(env_id)
     if env_class is not None:
-        spec = gym.spec(_bare_id(env_id))
         if use_processes and env_class.shares_work:
             env_kwargs.setdefault("n_processes", usable_cores())
         env = env_class(**{**spec.kwargs, **env_kwargs})
@@ -208,6 +194,7 @@ def make_episodes_env(
             with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
                 n_episodes = defaults_for(probe.observation_space).n_episodes
         n_envs = default_n_envs(n_episodes)
-    # make_vec_env requests rendering for an id, but not for a function.
-    make = env_id if _draws(env_id) else functools.partial(gym.make, env_id)
+    # make_vec_env requests rendering for an id, which warns where there is none, but not for a function.
+    modes = getattr(_creator(spec), "metadata", {"render_modes": ["rgb_array"]}).get("render_modes", ())
+    make = env_id if "rgb_array" in modes else functools.partial(gym.make, env_id)
     return make_vec_env(make, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)

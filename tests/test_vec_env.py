@@ -133,7 +133,7 @@ def test_episodes_side_by_side_differ_from_each_other():
 def test_reset_options_are_refused_with_the_mend():
     vec_env = lava_vec_env()
     vec_env.set_options({"sensor_noise_std": 1.0})
-    with pytest.raises(ValueError, match="keywords of its constructor"):
+    with pytest.raises(ValueError, match="pass variations to its constructor"):
         vec_env.reset()
 
 

@@ -18,8 +18,9 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
     """
     Give a path to write to; it replaces the target when the block ends without an error.
 
-    :param path: The target. Several processes may replace it at once.
+    :param path: The target; folders are made. Several processes may replace it at once.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     # In a folder of its own: a compressed file contains its name, which must not vary.
     with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder:
         partial = Path(folder, path.name)

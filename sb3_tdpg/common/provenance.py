@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib import metadata
 from itertools import zip_longest
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch as th
 
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
 
@@ -35,12 +37,12 @@ def provenance() -> dict[str, Any]:
     :return: ``versions``, ``git`` (commit and whether it was changed; None outside a checkout), ``platform``,
         ``cpu_count``, ``torch_threads``, ``cuda_device`` (None without), ``utc_time``, ``command``
     """
-    import torch as th
-
     from sb3_tdpg import __version__
 
-    versions: dict[str, str | None] = {"python": platform.python_version(), "sb3_tdpg": __version__}
-    versions.update({package: _version(package) for package in PACKAGES})
+    versions = {"python": platform.python_version(), "sb3_tdpg": __version__}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
     return dict(
         versions=versions,
         git=_git(),
@@ -53,27 +55,23 @@ def provenance() -> dict[str, Any]:
     )
 
 
-def write_run_config(path: str | os.PathLike[str], config: Mapping[str, Any]) -> None:
+def write_run_config(path: Path, config: Mapping[str, Any]) -> None:
     """
     Write a run's configuration as JSON, atomically, with its :func:`provenance` unless it has one already.
 
     :param path: The file; folders are made.
-    :param config: Settings and seeds. ``inf`` (as in ``beta``) is written as ``"inf"``, since JSON has no such number;
-        ``float("inf")`` reads it back. What JSON does not know is written as text.
+    :param config: Settings and seeds; see :func:`jsonable`.
     """
     content = jsonable({**config, "provenance": config.get("provenance") or provenance()})
-    write_atomically(_with_folder(path), json.dumps(content, indent=2) + "\n")
+    write_atomically(path, json.dumps(content, indent=2) + "\n")
 
 
 def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
 
-    What one of the two leaves out counts as a difference, too: it may be a file of an earlier version, which does not
-    say what it was made with.
-
-    :param path: The file; if there is none, all is well.
-    :param config: What it must hold, and nothing else.
+    :param path: The file, which may be missing.
+    :param config: What it must hold, and nothing else: a file of an earlier version may lack a setting.
     :param what: What lies in its folder, for the message.
     """
     if not path.exists():
@@ -91,15 +89,14 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
 
 def differences(found: Any, wanted: Any) -> str:
     """
-    Name the first few differences of two values of JSON's types, in a line; nothing if there are none.
+    Name the first few differences of two values of JSON's types in one line; return an empty text if they are equal.
 
-    :param found: What is there.
-    :param wanted: What it is compared with.
     :return: as in ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
     """
     lines = list(_differences(found, wanted))
-    shown, more = lines[:MAX_DIFFERENCES], len(lines) - MAX_DIFFERENCES
-    return "; ".join([*shown, f"and {more} more"] if more > 0 else shown)
+    if len(lines) > MAX_DIFFERENCES:
+        lines[MAX_DIFFERENCES:] = [f"and {len(lines) - MAX_DIFFERENCES} more"]
+    return "; ".join(lines)
 
 
 def _differences(found: Any, wanted: Any, where: str = "") -> Iterator[str]:
@@ -107,60 +104,40 @@ def _differences(found: Any, wanted: Any, where: str = "") -> Iterator[str]:
         for key in sorted({*found, *wanted}):
             inside = f"{where}.{key}" if where else key
             yield from _differences(found.get(key, _MISSING), wanted.get(key, _MISSING), inside)
-    elif _has_dicts(found) and _has_dicts(wanted):  # rows; a list of numbers is told as a whole
+    elif all(isinstance(value, list) and any(isinstance(row, dict) for row in value) for value in (found, wanted)):
         for i, (old, new) in enumerate(zip_longest(found, wanted, fillvalue=_MISSING)):
             yield from _differences(old, new, f"{where}[{i}]")
     elif found != wanted:
-        old, new = ("" if value is _MISSING else json.dumps(value) for value in (found, wanted))
-        begin = next((i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), 0)
-        texts = (f"{_excerpt(old, begin)} there" if old else "not there", f"{_excerpt(new, begin)} here")
-        yield f"{where}: {texts[0]}, {texts[1] if new else 'not here'}"
+        texts = ["" if value is _MISSING else json.dumps(value) for value in (found, wanted)]
+        start = max(0, len(os.path.commonprefix(texts)) - MAX_LENGTH // 2)  # noqa: RUF071  (characters)
+        old, new = (_excerpt(text, start) for text in texts)
+        yield f"{where}: {old or 'not'} there, {new or 'not'} here"
 
 
 _MISSING = object()  # None is a value
 
 
-def _has_dicts(value: Any) -> bool:
-    return isinstance(value, list) and any(isinstance(item, dict) for item in value)
-
-
-def _excerpt(text: str, begin: int) -> str:
-    """Shorten a long text, so that what begins to differ there can be seen."""
-    if len(text) <= MAX_LENGTH:
-        return text
-    start = max(0, min(begin - MAX_LENGTH // 2, len(text) - MAX_LENGTH))
+def _excerpt(text: str, start: int) -> str:
+    """Shorten a long text to ``MAX_LENGTH`` characters from ``start`` on, or to its end."""
+    start = max(0, min(start, len(text) - MAX_LENGTH))
     end = start + MAX_LENGTH
     return f"{'...' * (start > 0)}{text[start:end]}{'...' * (end < len(text))}"
 
 
-def write_frame_atomically(frame: pd.DataFrame, path: str | os.PathLike[str]) -> None:
+def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
     """
-    Write a frame as CSV without its index, so that at no time a half-written file is there.
+    Write a frame as CSV without its index, atomically.
 
     :param frame: Records or a table.
     :param path: ``.csv``, or ``.csv.gz`` or ``.csv.xz`` (smaller) to compress it; folders are made. The same frame
         gives the same bytes.
     """
-    path = _with_folder(path)
     if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
         raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
     # Without mtime the compressed file would differ from one second to the next.
-    methods: dict[str, Any] = {".csv": None, ".gz": {"method": "gzip", "mtime": 0}, ".xz": "xz"}
+    compression: Any = dict(method="gzip", mtime=0) if path.suffix == ".gz" else "infer"
     with replaced_atomically(path) as partial:
-        frame.to_csv(partial, index=False, compression=methods[path.suffix])
-
-
-def _with_folder(path: str | os.PathLike[str]) -> Path:
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
+        frame.to_csv(partial, index=False, compression=compression)
 
 
 def _command() -> str:
@@ -172,13 +149,7 @@ def _command() -> str:
 
 
 def as_typed(command: Sequence[str]) -> list[str]:
-    """
-    Return a command without the folder of its program.
-
-    A program that pip has installed is run by the interpreter beside it, which its user has not typed.
-
-    :param command: Interpreter and arguments.
-    """
+    """Return a command without the folder of its program, and without the interpreter of an installed program."""
     interpreter, arguments = Path(command[0]), list(command[1:])
     if arguments and interpreter.is_absolute() and Path(arguments[0]).parent == interpreter.parent:
         return [Path(arguments[0]).name, *arguments[1:]]
@@ -202,15 +173,13 @@ def _git() -> dict[str, Any] | None:
 
 
 def jsonable(value: Any) -> Any:
-    """Turn a value into what JSON can hold."""
+    """Turn a value into what JSON can hold: infinite numbers and unknown types become text, as in ``"inf"``."""
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         return jsonable(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
         return [jsonable(item) for item in value]
-    if isinstance(value, np.generic):
-        return jsonable(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

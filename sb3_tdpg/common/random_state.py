@@ -13,23 +13,14 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 @dataclass(frozen=True)
 class RandomState:
-    """
-    A snapshot of all generators (Python, NumPy, torch, environments) and of the statistics of ``VecNormalize``.
-
-    :param python: State of :mod:`random`.
-    :param numpy: State of NumPy's global generator.
-    :param torch: State of torch's CPU generator.
-    :param cuda: States of the CUDA generators, one for each device; empty without CUDA.
-    :param env: ``np_random`` of each environment.
-    :param obs_rms: Running statistics of ``VecNormalize``; None without it.
-    """
+    """A snapshot of all generators (Python, NumPy, torch, environments) and of the statistics of ``VecNormalize``."""
 
     python: tuple[Any, ...]
     numpy: dict[str, Any]
     torch: th.Tensor
-    cuda: list[th.Tensor]
+    cuda: list[th.Tensor]  # one for each device
     env: list[np.random.Generator]
-    obs_rms: Any
+    obs_rms: Any  # None without VecNormalize
 
     @classmethod
     def capture(cls, env: VecEnv) -> RandomState:
@@ -45,11 +36,7 @@ class RandomState:
         )
 
     def restore(self, env: VecEnv) -> None:
-        """
-        Put all generators back.
-
-        :raises ValueError: if the number of environments differs.
-        """
+        """Put all generators back; raise a ``ValueError`` if the number of environments differs."""
         if len(self.env) != env.num_envs:
             raise ValueError(
                 f"the checkpoint was made with {len(self.env)} environments, the model now has {env.num_envs}: "

@@ -15,9 +15,7 @@ def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str] = ()) 
     :param commits: The commits at which the runs were made, if they are known.
     """
     versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
-    git = how["git"]
-    commit = "outside a checkout"
-    if git is not None:
-        commit = git["commit"] + (" with uncommitted changes" if git["dirty"] else "")
+    git: Mapping[str, Any] = how["git"] or dict(commit="outside a checkout", dirty=False)
+    commit = git["commit"] + " with uncommitted changes" * git["dirty"]
     runs = f"runs at {', '.join(commits)}; " if commits else ""
     return f"Made by `{command}` at commit {commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."

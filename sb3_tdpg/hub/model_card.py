@@ -13,6 +13,7 @@ import yaml
 from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from scipy import stats
 
+from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.evaluation.tables import one_or_all, summary_table
 from sb3_tdpg.hub.publication import Publication, plain
 
@@ -67,38 +68,45 @@ def model_card(
     :param pictures: Files in the folder of the card; ``training.png`` and ``replay.mp4`` are shown.
     """
     changes = {row.name: _changes(publication, row.env_kwargs) for row in publication.scenarios}
-    # Digits after the point, so that the half-width of the interval shows two significant ones.
-    halves = (results["high"] - results["low"]) / 2
-    digits = [2 if half == 0 else min(6, max(2, 1 - math.floor(math.log10(half)))) for half in halves]
-    keywords = [changes.get(name, "") for name in results["scenario"]]
-    rows = results.assign(digits=digits, keywords=keywords).to_dict("records")
     task = "reinforcement-learning"
-    data = ModelCardData(
-        library_name="stable-baselines3",
-        pipeline_tag=task,
-        tags=[publication.env_id, *TAGS],
-        model_name=publication.method,
-        eval_results=[
+    rows: list[dict[str, str]] = []
+    evaluations: list[EvalResult] = []
+    for result in results.to_dict("records"):
+        # Digits after the point, so that the half-width of the interval shows two significant ones.
+        half = (result["high"] - result["low"]) / 2
+        digits = 2 if half == 0 else min(6, max(2, 1 - math.floor(math.log10(half))))
+        mean, low, high, std = (f"{result[name]:.{digits}f}" for name in ("mean", "low", "high", "std"))
+        row = {"Scenario": result["scenario"], "Keywords": changes.get(result["scenario"], "")}
+        row |= {"Episodes": f"{result['n']:,}", "Mean cost [95 %]": f"{mean} [{low}, {high}]", "Std": std}
+        if "failure_share" in result:
+            shares = "{failure_share:.1%} [{failure_low:.1%}, {failure_high:.1%}]"
+            row["Failures [95 %]"] = shares.format(**result)
+        rows.append(row)
+        evaluations.append(
             EvalResult(
                 task_type=task,
                 task_name=task,
                 dataset_type=publication.env_id,
                 dataset_name=publication.env_id,
-                dataset_config=row["scenario"],
+                dataset_config=result["scenario"],
                 metric_type="mean_reward",
                 metric_name="mean_reward",
-                # Leaderboards split this text.
-                metric_value=f"{-row['mean']:.{row['digits']}f} +/- {row['std']:.{row['digits']}f}",
+                metric_value=f"{-result['mean']:.{digits}f} +/- {std}",  # leaderboards split this text
             )
-            for row in rows
-        ],
+        )
+    data = ModelCardData(
+        library_name="stable-baselines3",
+        pipeline_tag=task,
+        tags=[publication.env_id, *TAGS],
+        model_name=publication.method,
+        eval_results=evaluations,
     )
     make_keywords = [f"{key}={value!r}" for key, value in plain(publication.env_kwargs).items()]
     card: ModelCard = ModelCard.from_template(
         data,
         template_path=str(Path(__file__).with_name("card.md")),
         publication=publication,
-        rows=rows,
+        table=markdown_table(rows, align="llr"),
         failures="failure_share" in results,
         deterministic=bool(results["deterministic"].all()),
         evaluation_seed=one_or_all(results["seed"]),

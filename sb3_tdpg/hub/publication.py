@@ -77,13 +77,7 @@ def plain(value: Any) -> Any:
 
 
 def read_publication(folder: Path, **evaluation: Any) -> Publication:
-    """
-    Read the folder of a run (:func:`read_run`) or of rl-zoo3 (:func:`read_zoo_folder`).
-
-    :param folder: The folder.
-    :param evaluation: For a folder of rl-zoo3; see :func:`read_zoo_folder`.
-    :raises ValueError: if it is neither.
-    """
+    """Read the folder of a run (:func:`read_run`) or of rl-zoo3 (:func:`read_zoo_folder`), which is evaluated."""
     if (folder / "config.json").exists():
         return read_run(folder)
     if next(folder.glob("*/args.yml"), None) is not None:
@@ -95,11 +89,7 @@ def read_publication(folder: Path, **evaluation: Any) -> Publication:
 
 
 def read_run(folder: Path) -> Publication:
-    """
-    Read the folder of a run, see :func:`~sb3_tdpg.experiments.runs.complete_run`.
-
-    :raises ValueError: if the run is not finished.
-    """
+    """Read the folder of a finished run, see :func:`~sb3_tdpg.experiments.runs.complete_run`."""
     if missing := [n for n in ("config.json", "model.zip", "episodes.csv") if not (folder / n).exists()]:
         raise ValueError(
             f"{folder} holds no finished run, since {', '.join(missing)} is missing: finish it with the command that "
@@ -119,12 +109,10 @@ def read_run(folder: Path) -> Publication:
     is_repeatable = "scenarios" in config and (start is None or files[f"{start}/model.zip"].exists())
     return Publication(
         model=folder / "model.zip",
-        env_id=config["env_id"],
+        **{name: config[name] for name in ("env_id", "method", "seed")},
         records=records,
         scenarios=scenarios_of(config) if "scenarios" in config else (),
-        method=config["method"],
         settings=settings,
-        seed=config["seed"],
         progress=read_progress(folder),
         notes=notes,
         command=_typed_command(config["provenance"]["command"]),
@@ -146,10 +134,9 @@ def read_zoo_folder(
 
     :param folder: The folder.
     :param scenarios: Where to evaluate; default: the rows of the paper's table or, without any, the training
-        environment. The keywords of a scenario take precedence over those of the training environment.
+        environment, whose keywords hold unless a scenario replaces them.
     :param n_eval_episodes: Episodes of each scenario.
     :param seed: Seed of the evaluation.
-    :raises ValueError: if there is no policy.
     """
     inner = next(folder.glob("*/args.yml")).parent
     model_path = folder / f"{inner.name}.zip"
@@ -163,10 +150,8 @@ def read_zoo_folder(
         env = VecNormalize.load(str(inner / "vecnormalize.pkl"), make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
     model = TDPG.load(model_path, env=env, device="cpu")
     rows = PAPER_ROWS.get(env_id, [Scenario("Training", env_id)]) if scenarios is None else scenarios
-    labels = dict(train_seed=args["seed"])
-    records = evaluate_scenarios(
-        {"TDPG": model}, rows, n_eval_episodes, seed=seed, env_kwargs=env_kwargs, labels=labels
-    )
+    options: Any = dict(seed=seed, env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))
+    records = evaluate_scenarios({"TDPG": model}, rows, n_eval_episodes, **options)
     progress = None
     if get_monitor_files(str(folder)):  # the mean cost of each epoch, from the log of episodes
         costs = -load_results(str(folder))["r"].to_numpy()
@@ -178,8 +163,8 @@ def read_zoo_folder(
         note = _selection_note(folder, settings)
     else:
         note = "The policy is the last one." if is_last else "The policy is the one with the best evaluation."
-    names = {name: name for name in ("args.yml", "config.yml", "command.txt")}
-    files = {name: inner / source for name, source in {**names, "vec_normalize.pkl": "vecnormalize.pkl"}.items()}
+    files = {name: inner / name for name in ("args.yml", "config.yml", "command.txt")}
+    files["vec_normalize.pkl"] = inner / "vecnormalize.pkl"
     files = {name: path for name, path in files.items() if path.exists()}
     return Publication(
         model=model_path,

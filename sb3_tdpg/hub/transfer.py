@@ -1,9 +1,4 @@
-"""
-Write the folder of a model, and exchange it with the Hugging Face Hub.
-
-By convention a repository is ``<organization>/tdpg-<environment>`` and its model ``tdpg-<environment>.zip``. The folder
-also has the files that rl-zoo3's ``load_from_hub`` asks for.
-"""
+"""Write the folder of a model, with the files that rl-zoo3 asks for, and exchange it with the Hugging Face Hub."""
 
 from __future__ import annotations
 
@@ -31,6 +26,7 @@ from sb3_tdpg.hub.model_card import ALGORITHM, model_card, model_name, results_w
 from sb3_tdpg.hub.publication import Publication, plain, read_publication
 from sb3_tdpg.tdpg import TDPG
 
+LIBRARY: Any = dict(library_name="sb3_tdpg")  # for the statistics of the Hub
 # Files that only some models have: those of an earlier model must not be taken for the new one's.
 OPTIONAL_FILES = ["command.txt", "replay.mp4", "selected.json", "training.png", "vec_normalize.pkl"]
 
@@ -46,10 +42,8 @@ def write_model_card(
     """
     Write a folder with a model, its card and its records, ready for :func:`push_to_hub`.
 
-    It has what people and programs expect of a Stable-Baselines3 model on the Hub: ``README.md`` with metadata,
-    ``tdpg-<environment>.zip``, ``config.yml``, ``args.yml``, ``env_kwargs.yml``, ``results.json`` (of the training
-    environment) and ``train_eval_metrics.zip``; also ``episodes.csv``, ``config.json`` and ``training.png``.
-    The folder appears only when it is complete.
+    It has the files of a Stable-Baselines3 model on the Hub, ``results.json`` for the training environment, and also
+    ``episodes.csv``, ``config.json`` and ``training.png``. The folder appears only when it is complete.
 
     :param source: The folder of a run, a folder of rl-zoo3 (its policy is evaluated now), or a publication.
     :param out: The folder; it must not exist, or be empty.
@@ -63,14 +57,13 @@ def write_model_card(
     out = _empty(out)
     publication = source if isinstance(source, Publication) else read_publication(Path(source), **evaluation)
     results = results_with_intervals(publication.records)
-    model = publication.model if isinstance(publication.model, TDPG) else TDPG.load(publication.model, device="cpu")
-    out.parent.mkdir(parents=True, exist_ok=True)
     with replaced_atomically(out) as folder:
         folder.mkdir()
         model_path = folder / f"{model_name(publication.env_id)}.zip"
         if isinstance(publication.model, TDPG):
-            model.save(model_path)
+            publication.model.save(model_path)
         else:
+            TDPG.load(publication.model, device="cpu")  # refuses a damaged file
             shutil.copyfile(publication.model, model_path)
         _write_records(publication, results, folder)
         if publication.progress is not None:
@@ -110,12 +103,11 @@ def push_to_hub(
     folder = Path(folder)
     if not (folder / "README.md").exists():
         raise ValueError(f"{folder} has no README.md: let write_model_card write the folder first")
-    api = huggingface_hub.HfApi(token=token, library_name="sb3_tdpg")
+    api = huggingface_hub.HfApi(token=token, **LIBRARY)
     with _one_line_errors(repo_id, "written", f"; {folder} can be pushed again"):
         url = api.create_repo(repo_id, private=private, exist_ok=True)
-        api.upload_folder(
-            repo_id=repo_id, folder_path=folder, commit_message=commit_message, delete_patterns=OPTIONAL_FILES
-        )
+        options: Any = dict(commit_message=commit_message, delete_patterns=OPTIONAL_FILES)
+        api.upload_folder(repo_id=repo_id, folder_path=folder, **options)
     return str(url)
 
 
@@ -158,9 +150,7 @@ def load_from_hub(
                 found = f"several models ({', '.join(models)})" if models else f"no {ALGORITHM}-*.zip"
                 raise ValueError(f"{repo_id} has {found}: give filename")
             filename = models[0]
-        path = huggingface_hub.hf_hub_download(
-            repo_id, filename, revision=revision, token=token, library_name="sb3_tdpg"
-        )
+        path = huggingface_hub.hf_hub_download(repo_id, filename, revision=revision, token=token, **LIBRARY)
     return TDPG.load(path, env=env, **kwargs)
 
 
@@ -179,9 +169,7 @@ def pull_from_hub(
     """
     out = _empty(out)
     with _one_line_errors(repo_id, "read"):
-        huggingface_hub.snapshot_download(
-            repo_id, revision=revision, local_dir=out, token=token, library_name="sb3_tdpg"
-        )
+        huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=out, token=token, **LIBRARY)
     return out
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import shutil
 import warnings
+from collections.abc import Mapping
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,24 +22,58 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
+from sb3_tdpg import hyperparams as yaml_files
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.common.provenance import write_run_config
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import batched_class, default_n_envs, make_episodes_env
-from sb3_tdpg.zoo.blocks import check_block, find_file
 
 CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
 # A checkpoint resets the environments: rare enough not to matter, frequent enough to lose little.
 CHECKPOINT_EPOCHS = 10
+# Keys that the zoo itself reads; all others are arguments of the algorithm.
+ZOO_KEYS = (
+    "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps", "noise_std",
+    "noise_type", "normalize", "vec_env_wrapper",
+)  # fmt: skip
+
+
+def find_file(algo: str, block: str) -> str | None:
+    """Return the path of this plugin's file for an algorithm if it has that block, otherwise ``None``."""
+    path = resources.files(yaml_files).joinpath(f"{algo}.yml")
+    if algo == "tdpg" or (path.is_file() and block in yaml.safe_load(path.read_text(encoding="utf-8"))):
+        return str(path)  # the zoo has no file for tdpg
+    return None
+
+
+def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
+    """Refuse unknown keys, and numbers that YAML reads as text; ``where`` names the block in the message."""
+    cls = ALGOS[algo]
+    arguments = {name for base in cls.__mro__[:-1] for name in inspect.signature(base).parameters}
+    if unknown := sorted(set(block) - set(ZOO_KEYS) - arguments):
+        own = sorted(set(inspect.signature(cls).parameters) - {"env", "_init_setup_model"})
+        raise ValueError(
+            f"{where} has {', '.join(unknown)}, which is neither an argument of {cls.__name__} ({', '.join(own)}) nor "
+            f"a key of rl-zoo3 ({', '.join(ZOO_KEYS)})"
+        )
+    for key, value in block.items():
+        try:
+            number = float(value) if isinstance(value, str) else None
+        except ValueError:
+            continue
+        if number is not None:
+            correct = yaml.safe_dump(number).split()[0]
+            raise ValueError(f"{where} has {key}: {value}, which YAML reads as text, not as a number: write {correct}")
+    if "n_timesteps" not in block:
+        raise ValueError(f"{where} has no n_timesteps, the length of training in environment steps: add it")
 
 
 class TDPGExperimentManager(ExperimentManager):
     """
     Set up and run one training of rl-zoo3.
 
-    - All episodes of an environment of this plugin run side by side in one call
-      (:class:`~sb3_tdpg.vec_env.BatchedVecEnv`), for every algorithm, unless ``--vec-env subproc`` or wrappers of
-      single environments are given.
+    - Environments of this plugin run as a :class:`~sb3_tdpg.vec_env.BatchedVecEnv`, for every algorithm, unless
+      ``--vec-env subproc`` or wrappers of single environments are given.
     - Blocks of this plugin's files are found without ``--conf-file``, and are checked before anything is written.
     - The evaluation environment gets the ``env_kwargs`` of the block unless it is given its own.
     - TDPG is evaluated with the stochastic policy that it trains.
@@ -176,16 +213,14 @@ class TDPGExperimentManager(ExperimentManager):
         if self.resume is None:  # otherwise the record of the first start stays
             super()._save_config(saved_hyperparams)
             env_id = self.env_name.gym_id
-            start = dict(algo=self.algo, env_id=env_id, block=self.block or env_id, seed=self.seed)
-            config = dict(**start, arguments=list(self.arguments), hyperparams=dict(saved_hyperparams))
+            config: dict[str, Any] = dict(algo=self.algo, env_id=env_id, block=self.block or env_id, seed=self.seed)
+            config |= dict(arguments=self.arguments, hyperparams=saved_hyperparams)
             write_run_config(Path(self.save_path, RECORD), config)
 
 
 def register(manager: type[ExperimentManager] = TDPGExperimentManager) -> None:
     """
-    Add TDPG to the algorithms of rl-zoo3 in this process.
-
-    Afterwards ``rl_zoo3.train.train()`` and the other programs of the zoo accept ``--algo tdpg``.
+    Add TDPG to the algorithms of rl-zoo3 in this process: its programs then accept ``--algo tdpg``.
 
     :param manager: The experiment manager that ``train`` uses.
     """

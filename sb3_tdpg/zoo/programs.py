@@ -7,8 +7,7 @@ import json
 import runpy
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +55,10 @@ def run(program: str, arguments: Sequence[str]) -> None:
     # The programs of the zoo read their flags from there.
     argv, sys.argv = sys.argv, [f"sb3-tdpg {program}"]
     try:
-        _PROGRAMS[program](given, flags)
+        if program in ("enjoy", "record-video"):
+            _watch(program.replace("-", "_"), given, flags)
+        else:
+            dict(train=_train, tune=_tune, plot=_plot)[program](given, flags)
     except AssertionError as e:  # the zoo refuses bad input with these
         raise ValueError(" ".join(str(e).split())) from e
     finally:
@@ -86,7 +88,7 @@ def _split(program: str, arguments: Sequence[str]) -> tuple[argparse.Namespace, 
 def _train(given: argparse.Namespace, flags: list[str]) -> None:
     folder, seed = given.resume, []
     if folder is not None:
-        record = _read_record(folder, given, flags)
+        record = _read_record(folder, bool(flags or given.block))
         given, flags = _split("train", record["arguments"])
         seed = ["--seed", str(record["seed"])]  # it was drawn if none was given
     typed = ["--block", given.block, *flags] if given.block else flags
@@ -106,12 +108,12 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
     rl_zoo3.train.train()
 
 
-def _read_record(folder: Path, given: argparse.Namespace, flags: list[str]) -> dict[str, Any]:
+def _read_record(folder: Path, has_flags: bool) -> dict[str, Any]:
     """Return how the training in a folder was started, if it can be resumed."""
     if not (folder / RECORD).exists():
         raise ValueError(f"--resume {folder} is not the folder of a training: it has no {RECORD}")
     record: dict[str, Any] = json.loads((folder / RECORD).read_text())
-    if flags or given.block:
+    if has_flags:
         raise ValueError(
             f"{folder} was started with `{' '.join(record['arguments'])}`, and other flags cannot change it: give "
             "--resume alone, or train anew without it"
@@ -153,12 +155,3 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
         given.save.parent.mkdir(parents=True, exist_ok=True)
         plt.savefig(given.save, dpi=150)
         print(f"the figure is in {given.save}")
-
-
-_PROGRAMS: Mapping[str, Callable[[argparse.Namespace, list[str]], None]] = {
-    "train": _train,
-    "tune": _tune,
-    "enjoy": partial(_watch, "enjoy"),
-    "record-video": partial(_watch, "record_video"),
-    "plot": _plot,
-}
