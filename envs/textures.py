@@ -134,6 +134,13 @@ def built_in_texture(name: str) -> np.ndarray:
     return texture
 
 
+def floor_texture() -> np.ndarray:
+    """Draw the chequerboard of PyBullet's floor, ``(512, 512, 3)``: squares of 1 m, pale blue and white."""
+    side = np.arange(512) // 256
+    is_blue = side[:, None] == side
+    return np.where(is_blue[..., None], (173, 199, 239), (255, 255, 255)).astype(np.uint8)
+
+
 def random_texture(seed: int) -> np.ndarray:
     """Draw a texture ``(S, S, 3)`` of random pattern and hue; the same seed gives the same texture."""
     rng = np.random.default_rng([seed, 8])  # not the streams of the built-in ones
