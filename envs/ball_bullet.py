@@ -30,7 +30,7 @@ class BulletScene(BulletWorld):
     def _move(self, body: int, position: tuple[float, ...], orientation: tuple[float, ...] = UNTURNED) -> None:
         self.client.resetBasePositionAndOrientation(body, position, orientation)
 
-    def _add(self, color: tuple[float, float, float], specular: float, **shape: Any) -> int:
+    def _add(self, color: tuple[float, ...], specular: float, **shape: Any) -> int:
         """Add a body of one colour; return its id."""
         shape_id = self.client.createVisualShape(**shape, rgbaColor=[*color, 1.0], specularColor=[specular] * 3)
         return int(self.client.createMultiBody(baseVisualShapeIndex=shape_id))

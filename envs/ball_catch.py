@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -15,10 +15,6 @@ from .ball_scene import IMAGE_SIZE, BallScene
 from .base import POMDPEnv
 from .noise import NOISE_MODES, noisy_pixels
 from .textures import TRAINING_TEXTURE, load_texture
-
-if TYPE_CHECKING:
-    from .ball_bullet import BulletRenderer, SideView
-    from .ball_fast import FastRenderer
 
 Range = tuple[float, float]  # lowest and highest
 PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highest (x, y)
@@ -112,9 +108,12 @@ class BallCatchEnv(POMDPEnv):
         self.noise_mode = checks.one_of("noise_mode", noise_mode, NOISE_MODES)
         self.renderer = checks.one_of("renderer", renderer, RENDERERS)
         self.wall_stands_still = wall_stands_still
+        color = np.asarray(ball_color, dtype=np.float64)
+        if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+            raise ValueError(f"ball_color={ball_color} must be (red, green, blue), each between 0 and 1")
         self.scene = BallScene(
             texture=load_texture(texture),
-            ball_color=_color(ball_color),
+            ball_color=tuple(color.tolist()),
             ball_radius=checks.positive("ball_radius", ball_radius),
             camera_height=checks.positive("camera_height", camera_height),
             camera_pitch=checks.between("camera_pitch", camera_pitch, -90.0, 90.0, " degrees", strict=True),
@@ -125,8 +124,8 @@ class BallCatchEnv(POMDPEnv):
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
         module, name = RENDERERS[renderer]
         renderer_class = getattr(import_module(f".{module}", __package__), name)
-        self._renderer: BulletRenderer | FastRenderer = renderer_class(self.scene)
-        self._view: SideView | None = None
+        self._renderer = renderer_class(self.scene)
+        self._view: Any = None  # a SideView, when it is needed
 
     # -- the POMDP ----------------------------------------------------------------------------------------------------
 
@@ -198,11 +197,3 @@ class BallCatchEnv(POMDPEnv):
         self._renderer.close()
         if self._view is not None:
             self._view.close()
-
-
-def _color(value: Any) -> tuple[float, float, float]:
-    color = np.asarray(value, dtype=np.float64)
-    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
-        raise ValueError(f"ball_color={value} must be (red, green, blue), each between 0 and 1")
-    red, green, blue = color.tolist()
-    return red, green, blue

@@ -28,7 +28,7 @@ class BallScene:
     """A wall, a floor, a ball and a camera."""
 
     texture: np.ndarray  # of the wall, (H, W, 3) uint8
-    ball_color: tuple[float, float, float]  # red, green and blue, each in [0, 1]
+    ball_color: tuple[float, ...]  # red, green and blue, each in [0, 1]
     ball_radius: float
     camera_height: float  # above the floor
     camera_pitch: float  # upward tilt in degrees

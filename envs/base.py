@@ -38,7 +38,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     algorithms do not bootstrap there. The reward is the negative cost; only this class negates it.
 
     ``info["state"]`` holds a copy of the true state (after ``reset`` x_0, after ``step`` x_{t+1}), ``info["cost"]``
-    the cost of the step. A subclass may add to the info of a step by :meth:`_details`.
+    the cost of the step. A subclass may add to the info of a step by :attr:`_details`.
 
     :param horizon: Number of controls T in an episode.
     :param render_mode: ``None`` or one of ``metadata["render_modes"]``.
@@ -51,6 +51,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
     shares_work: bool = False
+    #: Further entries for the info of each episode of the last :meth:`_dynamics`, or none.
+    _details: Sequence[Mapping[str, Any]] = ()
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
         self.horizon = checks.count("horizon", horizon, ": the number of controls in an episode")
@@ -79,10 +81,6 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     @abstractmethod
     def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
         """c_T(x_T): ``(N,)``."""
-
-    def _details(self) -> Sequence[Mapping[str, Any]]:
-        """Return further entries for the info of each episode of the last :meth:`_dynamics`, or nothing."""
-        return ()
 
     def _current_state(self) -> np.ndarray:
         """Return the state to render, ``(1, X)``."""
@@ -116,7 +114,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         next_state = self._dynamics(state, action)
         if is_last:
             cost = cost + self._terminal_cost(next_state)
-        return BatchStep(next_state, self._sensor(next_state), cost, self._details())
+        return BatchStep(next_state, self._sensor(next_state), cost, self._details)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

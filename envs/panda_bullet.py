@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bullet import UNTURNED, BulletClient
+from .bullet import UNTURNED, BulletWorld
 from .panda_scene import ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_body
 
 TIME_STEP = 1 / 240  # s
@@ -60,22 +60,8 @@ class Motion(NamedTuple):
 
 
 MOTIONS = {
-    "fast": Motion(
-        solver_iterations=50,
-        approach=Phase(80, 1.0, 0.2),
-        close=Phase(60, 1.0, 0.2),
-        lift=Phase(90, 0.6, 0.2),
-        start_height=0.01,
-        is_fast=True,
-    ),
-    "reference": Motion(
-        solver_iterations=150,
-        approach=Phase(1000, 0.15, 0.2),
-        close=Phase(100, 0.15, 0.05),
-        lift=Phase(500, 0.1, 0.05),
-        start_height=0.2,
-        is_fast=False,
-    ),
+    "fast": Motion(50, Phase(80, 1.0, 0.2), Phase(60, 1.0, 0.2), Phase(90, 0.6, 0.2), 0.01, is_fast=True),
+    "reference": Motion(150, Phase(1000, 0.15, 0.2), Phase(100, 0.15, 0.05), Phase(500, 0.1, 0.05), 0.2, is_fast=False),
 }
 ABOVE_RIM = 0.0167  # m between rim and fingertips at the start of the fast motion
 LIFT_BY, LIFT_TO = 0.08, 0.3  # m
@@ -96,21 +82,18 @@ class Configuration(NamedTuple):
     mug_orientation: tuple[float, ...]  # quaternion (x, y, z, w)
 
 
-class GraspSimulation:
+class GraspSimulation(BulletWorld):
     """
     Robot, table and mug in a Bullet world of their own, without visual shapes.
 
     Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone.
 
-    :param scene: The mug.
-    :param motion: How a grasp is carried out.
     :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: the motion's.
     """
 
     def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None = None) -> None:
-        self.scene = scene
-        self.motion = motion
-        self.client = client = BulletClient()
+        super().__init__()
+        self.scene, self.motion, client = scene, motion, self.client
         client.setGravity(0.0, 0.0, -9.81)
         client.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
@@ -136,13 +119,7 @@ class GraspSimulation:
     def grasp(
         self, state: np.ndarray, pose: np.ndarray, watch: Callable[[Configuration], object] | None = None
     ) -> Outcome:
-        """
-        Carry out one grasp.
-
-        :param state: Of the mug, ``(4,)``.
-        :param pose: Of the hand, ``(4,)``.
-        :param watch: Called with the configuration 30 times a second. This does not change the outcome.
-        """
+        """Carry out a grasp; ``watch`` is called 30 times a second and does not change the outcome."""
         motion, client, self._watch = self.motion, self.client, watch
         self._restore(state)
         x, y, z, yaw = pose.tolist()
@@ -247,7 +224,3 @@ class GraspSimulation:
         origin, _, orientation = self._mug_frame()
         states = self.client.getJointStates(self._robot, (*ARM_JOINTS, *FINGER_JOINTS))
         return Configuration(tuple(state[0] for state in states), tuple(origin.tolist()), tuple(orientation))
-
-    def close(self) -> None:
-        """Close the Bullet world."""
-        self.client.close()
