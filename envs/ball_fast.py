@@ -113,8 +113,7 @@ class FastRenderer:
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """Return one image for each state: ``(N, 3, 64, 64)`` uint8 from ``(N, 5)``."""
-        images = np.empty((len(state), 3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
-        images[:] = self._behind
+        images = np.repeat(self._behind[None], len(state), axis=0)
         wall_depth = self._depth_of(WALL_X - state[:, :1], self._ray_x)  # (N, 64)
         wall_depth[wall_depth > FAR] = np.inf
         for start in range(0, len(state), CHUNK):
@@ -169,7 +168,7 @@ class FastRenderer:
 
     def _draw_balls(self, images: np.ndarray, state: np.ndarray, wall_depth: np.ndarray) -> None:
         """Draw the balls, each in the smallest window that holds it; windows of a size are drawn at once."""
-        # As seen from the camera, straight ahead and upward: (N, 2). The ball stays in the camera's plane.
+        # Straight ahead and upward from the camera: (N, 2). The ball stays in the camera's plane.
         centre = np.stack([state[:, 1] - state[:, 0], state[:, 2] - self.scene.camera_height], axis=1)
         first, last = self._bounding_box(centre)  # (N, 2): row and column
         size = (last - first).max(axis=1)

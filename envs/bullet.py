@@ -46,18 +46,13 @@ class BulletClient:
         self.client_id = client_id
         self._close = weakref.finalize(self, pybullet.disconnect, client_id)
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the world still exists."""
-        return bool(self._close.alive)
-
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # copy and pickle ask before __init__ has run
             raise AttributeError(name)
         attribute = getattr(pybullet, name)
         if not callable(attribute):
             return attribute  # a constant
-        if not self.is_open:
+        if not self._close.alive:
             raise RuntimeError("this environment has been closed: make a new one")
         return functools.partial(attribute, physicsClientId=self.client_id)
 
