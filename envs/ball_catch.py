@@ -47,25 +47,19 @@ class BallCatchEnv(POMDPEnv):
     :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, but SB3 needs
         bounds; it is large because an action beyond the bound gives no gradient. The task needs about 2 m/s.
     :param robot_range: The robot starts uniformly in ``(low, high)``, in m.
-    :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m; the paper's
-        is one point.
+    :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m.
     :param ball_speed_range: Likewise its velocity, in m/s.
     :param ball_color: Red, green and blue, each in [0, 1].
     :param ball_radius: In m.
     :param camera_height: Above the floor, in m.
     :param camera_pitch: Upward tilt in degrees, between -90 and 90.
     :param fov: The camera's field of view in degrees.
-    :param texture: The wall's texture: a built-in name, ``"random-<seed>"``, the path of an image file, or an array;
-        see :func:`~sb3_tdpg.envs.textures.load_texture`.
+    :param texture: The wall's texture, for :func:`~sb3_tdpg.envs.textures.load_texture`: a name, a path or an array.
     :param pixel_noise_std: Standard deviation of the noise on every pixel of an image with values in [0, 1].
-    :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``; see
-        :func:`~sb3_tdpg.envs.noise.noisy_pixels`.
-    :param wall_stands_still: For diagnosis: wall, sky and floor always look as from d = 0, and only the ball shows
-        where the robot is.
-    :param renderer: ``"pybullet"``, the reference (1 ms an image), or ``"fast"``, a batched ray caster that agrees
-        with it in 99.8 % of the pixels.
-    :param render_mode: ``None``, ``"rgb_array"`` (the scene from the side and the camera's image) or ``"human"``
-        (PyBullet's window).
+    :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``.
+    :param wall_stands_still: For diagnosis: only the ball shows where the robot is; the rest looks as from d = 0.
+    :param renderer: ``"pybullet"``, the reference, or ``"fast"``, a batched ray caster that agrees in 99.8 % of pixels.
+    :param render_mode: ``None``, ``"rgb_array"`` (scene and camera image) or ``"human"`` (PyBullet's window).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
@@ -127,8 +121,6 @@ class BallCatchEnv(POMDPEnv):
         self._renderer = renderer_class(self.scene)
         self._view: Any = None  # a SideView, when it is needed
 
-    # -- the POMDP ----------------------------------------------------------------------------------------------------
-
     def _initial_state(self, n: int) -> np.ndarray:
         state = np.empty((n, 5))
         state[:, 0] = self.np_random.uniform(self.robot_range[0], self.robot_range[1], n)
@@ -169,14 +161,8 @@ class BallCatchEnv(POMDPEnv):
             chunk[...] = np.rint(255 * noisy)
         return images
 
-    # -- pictures -----------------------------------------------------------------------------------------------------
-
     def render(self) -> np.ndarray | None:
-        """
-        Draw the scene from the side and the camera's image, ``(256, 772, 3)`` uint8, or update PyBullet's window.
-
-        The pixel noise in the picture is a new sample, so that rendering does not change an episode.
-        """
+        """Draw the scene from the side and the camera's image, ``(256, 772, 3)`` uint8, or update PyBullet's window."""
         if self.render_mode is None:
             return None
         state = self._current_state()
@@ -189,6 +175,7 @@ class BallCatchEnv(POMDPEnv):
             time.sleep(self.dt)
             return None
         images = self._renderer.images(self._seen_from(state))
+        # The noise is a new sample, so that rendering does not change an episode.
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)
 

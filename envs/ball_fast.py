@@ -125,8 +125,6 @@ class FastRenderer:
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
 
-    # -- wall ---------------------------------------------------------------------------------------------------------
-
     def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
         """Draw walls at some distance, ``(N,)``, whose depth is given by the row: ``(N, 64)``."""
         first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)  # (64,); equal but at its sides
@@ -163,8 +161,6 @@ class FastRenderer:
         np.copyto(texel, v, casting="unsafe")
         np.add(texel, line[..., None], out=texel)
         return self._wall_texels.take(texel, mode="clip", out=colours), texel.view(np.uint32)
-
-    # -- ball ---------------------------------------------------------------------------------------------------------
 
     def _draw_balls(self, images: np.ndarray, state: np.ndarray, wall_depth: np.ndarray) -> None:
         """Draw the balls, each in the smallest window that holds it; windows of a size are drawn at once."""

@@ -47,6 +47,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
+    action_space: spaces.Box
     #: Optional: names of the state's components in figures, with units: ``("d (m)", "v (m/s)")``.
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
@@ -107,9 +108,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(
                 f"{type(self).__name__} received an action that is not finite: {bad}; the policy has probably diverged"
             )
-        box = self.action_space
-        assert isinstance(box, spaces.Box)
-        action = np.clip(np.asarray(action, dtype=np.float64), box.low, box.high)
+        action = np.clip(np.asarray(action, dtype=np.float64), self.action_space.low, self.action_space.high)
         cost = self._cost(state, action)
         next_state = self._dynamics(state, action)
         if is_last:

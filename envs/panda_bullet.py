@@ -28,15 +28,11 @@ FINGERTIPS_BELOW_HAND = 0.1123  # m
 # Half a turn does not change the gripper. This turn is in the middle of the last joint's range, so that the arm reaches
 # all yaws of a half circle to either side of the nominal one.
 HAND_TURN = np.pi / 4 - np.pi
-
 LIFTED = 0.05  # m: higher than this a mug counts as lifted
-
-# Every LOOK_EVERY steps the fast motion checks whether a phase can end early.
-LOOK_EVERY = 8
+LOOK_EVERY = 8  # steps, after which the fast motion checks whether a phase can end early
 NEAR_TARGET = 0.01  # rad: the arm has arrived
 FINGERS_STAND_STILL = 0.01  # m/s
 LIFTED_FOR_GOOD = 0.06  # m
-
 FAR_AWAY = (5.0, 5.0, 5.0)  # m
 
 
@@ -67,11 +63,8 @@ ABOVE_RIM = 0.0167  # m between rim and fingertips at the start of the fast moti
 LIFT_BY, LIFT_TO = 0.08, 0.3  # m
 
 
-class Outcome(NamedTuple):
-    """The result of a grasp."""
-
-    state: np.ndarray  # (4,)
-    contacts: int  # points in which the fingers touch the mug at the end
+# The result of a grasp: the mug's state, (4,), and the number of points in which the fingers touch it at the end.
+Outcome = tuple[np.ndarray, int]
 
 
 class Configuration(NamedTuple):
@@ -114,8 +107,6 @@ class GraspSimulation(BulletWorld):
         self._put_arm(HOME)
         self._start = client.saveState()
 
-    # -- one grasp ----------------------------------------------------------------------------------------------------
-
     def grasp(
         self, state: np.ndarray, pose: np.ndarray, watch: Callable[[Configuration], object] | None = None
     ) -> Outcome:
@@ -139,7 +130,7 @@ class GraspSimulation(BulletWorld):
         self._run(motion.approach, low, FINGER_OPEN, lambda: self._is_at(low))
         self._run(motion.close, low, 0.0, self._fingers_stand_still)
         self._run(motion.lift, high, 0.0, lambda: self._is_decided() or self._is_at(high))
-        return Outcome(self._mug_state(state[3]), self._contacts())
+        return self._mug_state(state[3]), self._contacts()
 
     def _run(self, phase: Phase, joints: tuple[float, ...], fingers: float, is_over: Callable[[], bool]) -> None:
         """Move arm and fingers towards a goal until a phase is over."""
@@ -161,8 +152,6 @@ class GraspSimulation(BulletWorld):
     def _show(self) -> None:
         if self._watch is not None:
             self._watch(self._configuration())
-
-    # -- the world ----------------------------------------------------------------------------------------------------
 
     def _restore(self, state: np.ndarray) -> None:
         """Restore the saved state of the world, and move the mug to its state."""

@@ -36,8 +36,7 @@ class DepthCamera(BulletWorld):
         turn_and_shift = np.array(view).reshape(4, 4).T
         self.rotation = turn_and_shift[:3, :3]  # from the world's axes to right, up and backward
         self.eye = -self.rotation.T @ turn_and_shift[:3, 3]
-        # Each pixel's ray from the eye to a depth of 1 m. TinyRenderer samples a pixel at its lower left corner. The
-        # first row is the uppermost.
+        # Each pixel's ray to a depth of 1 m, uppermost row first. TinyRenderer samples pixels at the lower left corner.
         left, right, bottom, top = EDGES
         corner = np.arange(IMAGE_SIZE) / IMAGE_SIZE
         to_right = (left + (right - left) * corner) / NEAR
@@ -51,10 +50,9 @@ class DepthCamera(BulletWorld):
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """
-        Draw one depth image for each state of the mug.
+        Draw a depth image for each state of the mug: ``(N, 1, 128, 128)`` float32 in m.
 
-        :param state: ``(N, 4)``, or ``(N, 5)`` with the height of the camera above its usual position, in m.
-        :return: ``(N, 1, 128, 128)`` float32 in m
+        States are ``(N, 4)``, or ``(N, 5)`` with the height of the camera above its usual position, in m.
         """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client

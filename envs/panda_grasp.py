@@ -51,14 +51,12 @@ class PandaGraspEnv(POMDPEnv):
 
     :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
     :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
-    :param camera_range: ``(low, high)``: in every trial the camera is raised by a distance, uniform between these two,
-        in m. The distance is the fifth component of the state.
-    :param camera_shift: The camera is raised by this distance in every trial, in m. The state does not contain it.
+    :param camera_range: Each trial raises the camera uniformly in ``(low, high)``, in m: the fifth state component.
+    :param camera_shift: Every trial raises the camera by this distance, in m, which the state does not contain.
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
-    :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: 50 in the fast motion, 150 in the
-        reference.
+    :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: 50 (fast) or 150 (reference).
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch; the results are the same.
@@ -109,7 +107,7 @@ class PandaGraspEnv(POMDPEnv):
         self._is_closed = False
         self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
-    # -- Bullet worlds, each made at its first use, and so in the process that uses it --------------------------------
+    # The Bullet worlds are made at their first use, and so in the process that uses them.
 
     @cached_property
     def _world(self) -> GraspWorld:
@@ -133,8 +131,6 @@ class PandaGraspEnv(POMDPEnv):
         """Return the processes for a batch of n mugs, or this process."""
         return self._pool if self.n_processes > 1 and n > 1 else self._world
 
-    # -- the POMDP ----------------------------------------------------------------------------------------------------
-
     def _initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, self.state_space.shape[0]))
         state[:, :2] = WORKSPACE + self.np_random.uniform(-self.xy_half_width, self.xy_half_width, (n, 2))
@@ -151,11 +147,11 @@ class PandaGraspEnv(POMDPEnv):
             outcomes = self._world.grasps(mugs, poses, self._film.append)
         else:
             outcomes = self._workers(len(state)).grasps(mugs, poses)
-        next_state = np.concatenate([np.array([outcome.state for outcome in outcomes]), camera], axis=1)
+        next_state = np.concatenate([np.array([state for state, _ in outcomes]), camera], axis=1)
         heights, success = next_state[:, 2].tolist(), (next_state[:, 2] > LIFTED).tolist()
         self._details = [
-            dict(success=lifted, is_success=lifted, mug=mug, mug_height=height, grasp=pose, contacts=outcome.contacts)
-            for mug, pose, height, lifted, outcome in zip(mugs, poses, heights, success, outcomes, strict=True)
+            dict(success=lifted, is_success=lifted, mug=mug, mug_height=height, grasp=pose, contacts=contacts)
+            for mug, pose, height, lifted, (_, contacts) in zip(mugs, poses, heights, success, outcomes, strict=True)
         ]
         return next_state
 
@@ -181,8 +177,6 @@ class PandaGraspEnv(POMDPEnv):
             for image in images:
                 image += self.depth_noise_std * rng.standard_normal(image.shape)
         return np.clip(images, MIN_DEPTH, MAX_DEPTH, out=images)
-
-    # -- pictures -----------------------------------------------------------------------------------------------------
 
     def render(self) -> np.ndarray | None:
         """

@@ -54,7 +54,7 @@ class GraspWorld:
 
 class GraspPool:
     """
-    Several processes with a :class:`GraspWorld` each, which share a batch. The results are the same bit for bit.
+    Several processes with a :class:`GraspWorld` each, which share a batch; the results are the same bit for bit.
 
     The processes ignore Ctrl-C and end with this one. If one dies, the next call raises
     :class:`concurrent.futures.process.BrokenProcessPool`.

@@ -85,11 +85,9 @@ class PandaScene:
 
     def collision_shapes(self) -> list[dict[str, Any]]:
         """
-        Build the mug from a disc, twelve staves around it and three bars for the handle.
+        Build the mug from a disc, twelve staves around it and three bars for the handle, in the cup's frame.
 
         Bullet would replace a moving mesh by its convex hull, and the hull of a cup is not hollow.
-
-        :return: size, position and yaw of each shape in the cup's frame
         """
         radius, height, thickness = self.mug_radius, self.mug_height, self.mug_scale * WALL_THICKNESS
         base = self.mug_scale * BASE_HEIGHT
