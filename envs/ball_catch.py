@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -15,10 +15,6 @@ from .ball_scene import IMAGE_SIZE, BallScene
 from .base import POMDPEnv
 from .noise import NOISE_MODES, noisy_pixels
 from .textures import TRAINING_TEXTURE, load_texture
-
-if TYPE_CHECKING:
-    from .ball_bullet import BulletRenderer, SideView
-    from .ball_fast import FastRenderer
 
 Range = tuple[float, float]  # lowest and highest
 PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highest (x, y)
@@ -51,25 +47,19 @@ class BallCatchEnv(POMDPEnv):
     :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, but SB3 needs
         bounds; it is large because an action beyond the bound gives no gradient. The task needs about 2 m/s.
     :param robot_range: The robot starts uniformly in ``(low, high)``, in m.
-    :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m; the paper's
-        is one point.
+    :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m.
     :param ball_speed_range: Likewise its velocity, in m/s.
     :param ball_color: Red, green and blue, each in [0, 1].
     :param ball_radius: In m.
     :param camera_height: Above the floor, in m.
     :param camera_pitch: Upward tilt in degrees, between -90 and 90.
     :param fov: The camera's field of view in degrees.
-    :param texture: The wall's texture: a built-in name, ``"random-<seed>"``, the path of an image file, or an array;
-        see :func:`~sb3_tdpg.envs.textures.load_texture`.
+    :param texture: The wall's texture, for :func:`~sb3_tdpg.envs.textures.load_texture`: a name, a path or an array.
     :param pixel_noise_std: Standard deviation of the noise on every pixel of an image with values in [0, 1].
-    :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``; see
-        :func:`~sb3_tdpg.envs.noise.noisy_pixels`.
-    :param wall_stands_still: For diagnosis: wall, sky and floor always look as from d = 0, and only the ball shows
-        where the robot is.
-    :param renderer: ``"pybullet"``, the reference (1 ms an image), or ``"fast"``, a batched ray caster that agrees
-        with it in 99.8 % of the pixels.
-    :param render_mode: ``None``, ``"rgb_array"`` (the scene from the side and the camera's image) or ``"human"``
-        (PyBullet's window).
+    :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``.
+    :param wall_stands_still: For diagnosis: only the ball shows where the robot is; the rest looks as from d = 0.
+    :param renderer: ``"pybullet"``, the reference, or ``"fast"``, a batched ray caster that agrees in 99.8 % of pixels.
+    :param render_mode: ``None``, ``"rgb_array"`` (scene and camera image) or ``"human"`` (PyBullet's window).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
@@ -112,9 +102,12 @@ class BallCatchEnv(POMDPEnv):
         self.noise_mode = checks.one_of("noise_mode", noise_mode, NOISE_MODES)
         self.renderer = checks.one_of("renderer", renderer, RENDERERS)
         self.wall_stands_still = wall_stands_still
+        color = np.asarray(ball_color, dtype=np.float64)
+        if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+            raise ValueError(f"ball_color={ball_color} must be (red, green, blue), each between 0 and 1")
         self.scene = BallScene(
             texture=load_texture(texture),
-            ball_color=_color(ball_color),
+            ball_color=tuple(color.tolist()),
             ball_radius=checks.positive("ball_radius", ball_radius),
             camera_height=checks.positive("camera_height", camera_height),
             camera_pitch=checks.between("camera_pitch", camera_pitch, -90.0, 90.0, " degrees", strict=True),
@@ -125,10 +118,8 @@ class BallCatchEnv(POMDPEnv):
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
         module, name = RENDERERS[renderer]
         renderer_class = getattr(import_module(f".{module}", __package__), name)
-        self._renderer: BulletRenderer | FastRenderer = renderer_class(self.scene)
-        self._view: SideView | None = None
-
-    # -- the POMDP ----------------------------------------------------------------------------------------------------
+        self._renderer = renderer_class(self.scene)
+        self._view: Any = None  # a SideView, when it is needed
 
     def _initial_state(self, n: int) -> np.ndarray:
         state = np.empty((n, 5))
@@ -170,14 +161,8 @@ class BallCatchEnv(POMDPEnv):
             chunk[...] = np.rint(255 * noisy)
         return images
 
-    # -- pictures -----------------------------------------------------------------------------------------------------
-
     def render(self) -> np.ndarray | None:
-        """
-        Draw the scene from the side and the camera's image, ``(256, 772, 3)`` uint8, or update PyBullet's window.
-
-        The pixel noise in the picture is a new sample, so that rendering does not change an episode.
-        """
+        """Draw the scene from the side and the camera's image, ``(256, 772, 3)`` uint8, or update PyBullet's window."""
         if self.render_mode is None:
             return None
         state = self._current_state()
@@ -190,6 +175,7 @@ class BallCatchEnv(POMDPEnv):
             time.sleep(self.dt)
             return None
         images = self._renderer.images(self._seen_from(state))
+        # The noise is a new sample, so that rendering does not change an episode.
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)
 
@@ -198,11 +184,3 @@ class BallCatchEnv(POMDPEnv):
         self._renderer.close()
         if self._view is not None:
             self._view.close()
-
-
-def _color(value: Any) -> tuple[float, float, float]:
-    color = np.asarray(value, dtype=np.float64)
-    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
-        raise ValueError(f"ball_color={value} must be (red, green, blue), each between 0 and 1")
-    red, green, blue = color.tolist()
-    return red, green, blue

@@ -16,22 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .ball_scene import (
-    AMBIENT,
-    DIFFUSE,
-    FAR,
-    IMAGE_SIZE,
-    LIGHT,
-    NEAR,
-    PLANE_COPIES,
-    PLANE_HALF,
-    SPECULAR,
-    WALL_CENTRE_Z,
-    WALL_SCALE,
-    WALL_X,
-    BallScene,
-    floor_texture,
-)
+from .ball_scene import FAR, IMAGE_SIZE, LIGHT, NEAR, PLANE_COPIES, PLANE_HALF, WALL_SCALE, WALL_X, WALL_Z, BallScene
+from .textures import floor_texture
 
 MESH_RADIUS = 0.965  # visible radius of a sphere mesh, as a fraction of its radius
 WINDOWS = (4, 8, 16, 32, IMAGE_SIZE)  # K
@@ -39,6 +25,9 @@ CHUNK = 64  # images whose walls are drawn at once
 WINDOW_PIXELS = 12_800  # pixels of balls drawn at once
 SKY = 255
 
+# A pixel is texel * (ambient + diffuse * max(0, n.l) + specular * max(0, r_z)^2) with the normal n, the direction l to
+# the light and that of its reflection, r.
+AMBIENT, DIFFUSE, SPECULAR = 0.6, 0.35, 0.05
 TO_LIGHT = LIGHT / np.linalg.norm(LIGHT)
 
 
@@ -60,11 +49,7 @@ def pack(colours: np.ndarray) -> np.ndarray:
 
 
 class FastRenderer:
-    """
-    A batched ray caster of the scene.
-
-    :param scene: What is drawn.
-    """
+    """A batched ray caster of the scene."""
 
     def __init__(self, scene: BallScene) -> None:
         self.scene = scene
@@ -100,7 +85,7 @@ class FastRenderer:
         self._wall_texels = pack(shaded[::-1].transpose(1, 0, 2)).ravel()
         copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m of wall to a copy of the texture
         ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)
-        self._u_at_zero = PLANE_COPIES / 2 + (self.scene.camera_height - WALL_CENTRE_Z) / copy
+        self._u_at_zero = PLANE_COPIES / 2 + (self.scene.camera_height - WALL_Z) / copy
         self._u_per_metre = self._ray_z / ahead / copy  # (64,)
         self._v_per_metre = (self._ray_y / copy / ahead[:, None]).astype(np.float32)  # (64, 64)
 
@@ -112,12 +97,7 @@ class FastRenderer:
         return np.where(depth > NEAR, depth, np.inf)
 
     def _draw_floor(self) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Draw floor and sky, which move with the robot.
-
-        :return: their image, ``(3, 64, 64)``, and the floor's depth, infinite where there is none: ``(64, 1)``, or
-            ``(64, 64)`` if one of its sides is in view
-        """
+        """Draw floor and sky, ``(3, 64, 64)``; also return the floor's depth, infinite where there is none."""
         texture = shade(floor_texture(), (0.0, 0.0, 1.0))
         depth = self._depth_of(-self.scene.camera_height, self._ray_z)[:, None]
         depth[depth > FAR] = np.inf
@@ -127,14 +107,13 @@ class FastRenderer:
         rows, columns = len(texture) - 1 - (v % 1 * len(texture)).astype(int), (u % 1 * texture.shape[1]).astype(int)
         is_off = np.maximum(abs(x), abs(y)) > PLANE_HALF
         if is_off.any():
-            depth = np.where(is_off, np.inf, depth)
+            depth = np.where(is_off, np.inf, depth)  # (64, 64) instead of (64, 1)
         image = np.where(np.isfinite(depth)[..., None], texture[rows, columns], SKY).astype(np.uint8)
         return np.ascontiguousarray(image.transpose(2, 0, 1)), depth
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """Return one image for each state: ``(N, 3, 64, 64)`` uint8 from ``(N, 5)``."""
-        images = np.empty((len(state), 3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
-        images[:] = self._behind
+        images = np.repeat(self._behind[None], len(state), axis=0)
         wall_depth = self._depth_of(WALL_X - state[:, :1], self._ray_x)  # (N, 64)
         wall_depth[wall_depth > FAR] = np.inf
         for start in range(0, len(state), CHUNK):
@@ -145,8 +124,6 @@ class FastRenderer:
 
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
-
-    # -- wall ---------------------------------------------------------------------------------------------------------
 
     def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
         """Draw walls at some distance, ``(N,)``, whose depth is given by the row: ``(N, 64)``."""
@@ -185,11 +162,9 @@ class FastRenderer:
         np.add(texel, line[..., None], out=texel)
         return self._wall_texels.take(texel, mode="clip", out=colours), texel.view(np.uint32)
 
-    # -- ball ---------------------------------------------------------------------------------------------------------
-
     def _draw_balls(self, images: np.ndarray, state: np.ndarray, wall_depth: np.ndarray) -> None:
         """Draw the balls, each in the smallest window that holds it; windows of a size are drawn at once."""
-        # As seen from the camera, straight ahead and upward: (N, 2). The ball stays in the camera's plane.
+        # Straight ahead and upward from the camera: (N, 2). The ball stays in the camera's plane.
         centre = np.stack([state[:, 1] - state[:, 0], state[:, 2] - self.scene.camera_height], axis=1)
         first, last = self._bounding_box(centre)  # (N, 2): row and column
         size = (last - first).max(axis=1)

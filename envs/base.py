@@ -38,7 +38,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     algorithms do not bootstrap there. The reward is the negative cost; only this class negates it.
 
     ``info["state"]`` holds a copy of the true state (after ``reset`` x_0, after ``step`` x_{t+1}), ``info["cost"]``
-    the cost of the step. A subclass may add to the info of a step by :meth:`_details`.
+    the cost of the step. A subclass may add to the info of a step by :attr:`_details`.
 
     :param horizon: Number of controls T in an episode.
     :param render_mode: ``None`` or one of ``metadata["render_modes"]``.
@@ -47,10 +47,13 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 4}
 
     state_space: spaces.Box
+    action_space: spaces.Box
     #: Optional: names of the state's components in figures, with units: ``("d (m)", "v (m/s)")``.
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
     shares_work: bool = False
+    #: Further entries for the info of each episode of the last :meth:`_dynamics`, or none.
+    _details: Sequence[Mapping[str, Any]] = ()
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
         self.horizon = checks.count("horizon", horizon, ": the number of controls in an episode")
@@ -80,10 +83,6 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
         """c_T(x_T): ``(N,)``."""
 
-    def _details(self) -> Sequence[Mapping[str, Any]]:
-        """Return further entries for the info of each episode of the last :meth:`_dynamics`, or nothing."""
-        return ()
-
     def _current_state(self) -> np.ndarray:
         """Return the state to render, ``(1, X)``."""
         if self._state is None:
@@ -109,14 +108,12 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(
                 f"{type(self).__name__} received an action that is not finite: {bad}; the policy has probably diverged"
             )
-        box = self.action_space
-        assert isinstance(box, spaces.Box)
-        action = np.clip(np.asarray(action, dtype=np.float64), box.low, box.high)
+        action = np.clip(np.asarray(action, dtype=np.float64), self.action_space.low, self.action_space.high)
         cost = self._cost(state, action)
         next_state = self._dynamics(state, action)
         if is_last:
             cost = cost + self._terminal_cost(next_state)
-        return BatchStep(next_state, self._sensor(next_state), cost, self._details())
+        return BatchStep(next_state, self._sensor(next_state), cost, self._details)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

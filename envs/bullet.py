@@ -7,11 +7,14 @@ import os
 import sys
 import tempfile
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pybullet
 from PIL import Image
+
+Matrix = tuple[float, ...]  # 4 x 4
 
 UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
 
@@ -43,18 +46,13 @@ class BulletClient:
         self.client_id = client_id
         self._close = weakref.finalize(self, pybullet.disconnect, client_id)
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the world still exists."""
-        return bool(self._close.alive)
-
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # copy and pickle ask before __init__ has run
             raise AttributeError(name)
         attribute = getattr(pybullet, name)
         if not callable(attribute):
             return attribute  # a constant
-        if not self.is_open:
+        if not self._close.alive:
             raise RuntimeError("this environment has been closed: make a new one")
         return functools.partial(attribute, physicsClientId=self.client_id)
 
@@ -69,13 +67,12 @@ class BulletClient:
             Image.fromarray(image).save(path)
             return int(self.loadTexture(path))
 
-    def picture(self, height: int, width: int, **camera: Any) -> np.ndarray:
-        """
-        Draw the world with TinyRenderer: ``(height, width, 3)`` uint8.
-
-        :param camera: Keywords of ``getCameraImage``.
-        """
-        rgba = self.getCameraImage(width, height, renderer=pybullet.ER_TINY_RENDERER, **camera)[2]
+    def picture(
+        self, height: int, width: int, view: Matrix, projection: Matrix, light: Sequence[float], *, shadow: int = 0
+    ) -> np.ndarray:
+        """Draw the world with TinyRenderer: ``(height, width, 3)`` uint8."""
+        renderer = pybullet.ER_TINY_RENDERER
+        rgba = self.getCameraImage(width, height, view, projection, light, shadow=shadow, renderer=renderer)[2]
         return np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3]
 
     def show_window(self, distance: float, yaw: float, pitch: float, target: tuple[float, float, float]) -> None:
@@ -86,6 +83,17 @@ class BulletClient:
     def close(self) -> None:
         """Close the world; later calls do nothing."""
         self._close()
+
+
+class BulletWorld:
+    """A base class for what has a Bullet world of its own, :attr:`client`."""
+
+    def __init__(self, *, gui: bool = False) -> None:
+        self.client = BulletClient(gui=gui)
+
+    def close(self) -> None:
+        """Close the Bullet world; closing twice is fine."""
+        self.client.close()
 
 
 def enlarge(image: np.ndarray, factor: int) -> np.ndarray:

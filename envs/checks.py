@@ -8,25 +8,21 @@ from typing import Any
 import numpy as np
 
 
-def finite(name: str, value: float) -> float:
-    """Return a finite number as a float."""
-    if not np.isfinite(value):
-        raise ValueError(f"{name}={value} must be finite")
+def finite(name: str, value: float, is_valid: bool = True, requirement: str = "") -> float:
+    """Return a finite number, which fulfils a further requirement, as a float."""
+    if not (np.isfinite(value) and is_valid):
+        raise ValueError(f"{name}={value} must be finite{requirement}")
     return float(value)
 
 
 def positive(name: str, value: float) -> float:
     """Return a finite positive number as a float."""
-    if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name}={value} must be finite and positive")
-    return float(value)
+    return finite(name, value, value > 0, " and positive")
 
 
 def not_negative(name: str, value: float, hint: str = "") -> float:
     """Return a finite number of at least 0 as a float."""
-    if not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name}={value} must be finite and not negative{hint}")
-    return float(value)
+    return finite(name, value, value >= 0, f" and not negative{hint}")
 
 
 def between(name: str, value: float, low: float, high: float, unit: str, *, strict: bool = False) -> float:

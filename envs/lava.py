@@ -35,8 +35,7 @@ class LavaEnv(POMDPEnv):
 
     :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
     :param sensor_bias: Added to every observation, in m and m/s.
-    :param start_beta: ``(a, b)``: the robot starts at 5 m times a number from the Beta(a, b) distribution; ``None``:
-        uniformly, as with (1, 1).
+    :param start_beta: ``(a, b)``: the robot starts at 5 m times a Beta(a, b) number; ``None``: uniformly.
     :param action_cost: Weight of ``|u_t|`` in the stage cost (0 in the text, 1 in the table's definition).
     :param lava_stage_cost: Stage cost once in the lava; ``None``: the distance to the goal, which is 2 there.
     :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
@@ -92,7 +91,6 @@ class LavaEnv(POMDPEnv):
         A robot that is neither at the wall nor in the lava moved within [0, 5] m in the last step. So its speed was at
         most 5 m a step, and the last control adds at most ``max_action``.
         """
-        assert isinstance(self.action_space, spaces.Box)
         max_action = float(self.action_space.high[0])
         farthest = float(np.hypot(GOAL[0] - WALL, LAVA - WALL + max_action))
         stage = max(farthest, self.lava_stage_cost or 0.0) + self.action_cost * max_action
@@ -133,11 +131,7 @@ class LavaEnv(POMDPEnv):
         return cost
 
     def render(self) -> np.ndarray | None:
-        """
-        Draw the corridor from the side: ``(96, 480, 3)`` uint8.
-
-        Wall grey, lava orange, goal green, robot blue with its velocity as a dark bar.
-        """
+        """Draw wall (grey), lava, goal (green) and robot (blue) with its velocity (dark): ``(96, 480, 3)`` uint8."""
         if self.render_mode is None:
             return None
         d, v = self._current_state()[0]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bullet import UNTURNED, BulletClient
+from .bullet import UNTURNED, BulletWorld
 from .panda_scene import ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_body
 
 TIME_STEP = 1 / 240  # s
@@ -28,15 +28,11 @@ FINGERTIPS_BELOW_HAND = 0.1123  # m
 # Half a turn does not change the gripper. This turn is in the middle of the last joint's range, so that the arm reaches
 # all yaws of a half circle to either side of the nominal one.
 HAND_TURN = np.pi / 4 - np.pi
-
 LIFTED = 0.05  # m: higher than this a mug counts as lifted
-
-# Every LOOK_EVERY steps the fast motion checks whether a phase can end early.
-LOOK_EVERY = 8
+LOOK_EVERY = 8  # steps, after which the fast motion checks whether a phase can end early
 NEAR_TARGET = 0.01  # rad: the arm has arrived
 FINGERS_STAND_STILL = 0.01  # m/s
 LIFTED_FOR_GOOD = 0.06  # m
-
 FAR_AWAY = (5.0, 5.0, 5.0)  # m
 
 
@@ -60,32 +56,15 @@ class Motion(NamedTuple):
 
 
 MOTIONS = {
-    "fast": Motion(
-        solver_iterations=50,
-        approach=Phase(80, 1.0, 0.2),
-        close=Phase(60, 1.0, 0.2),
-        lift=Phase(90, 0.6, 0.2),
-        start_height=0.01,
-        is_fast=True,
-    ),
-    "reference": Motion(
-        solver_iterations=150,
-        approach=Phase(1000, 0.15, 0.2),
-        close=Phase(100, 0.15, 0.05),
-        lift=Phase(500, 0.1, 0.05),
-        start_height=0.2,
-        is_fast=False,
-    ),
+    "fast": Motion(50, Phase(80, 1.0, 0.2), Phase(60, 1.0, 0.2), Phase(90, 0.6, 0.2), 0.01, is_fast=True),
+    "reference": Motion(150, Phase(1000, 0.15, 0.2), Phase(100, 0.15, 0.05), Phase(500, 0.1, 0.05), 0.2, is_fast=False),
 }
 ABOVE_RIM = 0.0167  # m between rim and fingertips at the start of the fast motion
 LIFT_BY, LIFT_TO = 0.08, 0.3  # m
 
 
-class Outcome(NamedTuple):
-    """The result of a grasp."""
-
-    state: np.ndarray  # (4,)
-    contacts: int  # points in which the fingers touch the mug at the end
+# The result of a grasp: the mug's state, (4,), and the number of points in which the fingers touch it at the end.
+Outcome = tuple[np.ndarray, int]
 
 
 class Configuration(NamedTuple):
@@ -96,21 +75,18 @@ class Configuration(NamedTuple):
     mug_orientation: tuple[float, ...]  # quaternion (x, y, z, w)
 
 
-class GraspSimulation:
+class GraspSimulation(BulletWorld):
     """
     Robot, table and mug in a Bullet world of their own, without visual shapes.
 
     Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone.
 
-    :param scene: The mug.
-    :param motion: How a grasp is carried out.
     :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: the motion's.
     """
 
     def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None = None) -> None:
-        self.scene = scene
-        self.motion = motion
-        self.client = client = BulletClient()
+        super().__init__()
+        self.scene, self.motion, client = scene, motion, self.client
         client.setGravity(0.0, 0.0, -9.81)
         client.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
@@ -131,18 +107,10 @@ class GraspSimulation:
         self._put_arm(HOME)
         self._start = client.saveState()
 
-    # -- one grasp ----------------------------------------------------------------------------------------------------
-
     def grasp(
         self, state: np.ndarray, pose: np.ndarray, watch: Callable[[Configuration], object] | None = None
     ) -> Outcome:
-        """
-        Carry out one grasp.
-
-        :param state: Of the mug, ``(4,)``.
-        :param pose: Of the hand, ``(4,)``.
-        :param watch: Called with the configuration 30 times a second. This does not change the outcome.
-        """
+        """Carry out a grasp; ``watch`` is called 30 times a second and does not change the outcome."""
         motion, client, self._watch = self.motion, self.client, watch
         self._restore(state)
         x, y, z, yaw = pose.tolist()
@@ -162,7 +130,7 @@ class GraspSimulation:
         self._run(motion.approach, low, FINGER_OPEN, lambda: self._is_at(low))
         self._run(motion.close, low, 0.0, self._fingers_stand_still)
         self._run(motion.lift, high, 0.0, lambda: self._is_decided() or self._is_at(high))
-        return Outcome(self._mug_state(state[3]), self._contacts())
+        return self._mug_state(state[3]), self._contacts()
 
     def _run(self, phase: Phase, joints: tuple[float, ...], fingers: float, is_over: Callable[[], bool]) -> None:
         """Move arm and fingers towards a goal until a phase is over."""
@@ -184,8 +152,6 @@ class GraspSimulation:
     def _show(self) -> None:
         if self._watch is not None:
             self._watch(self._configuration())
-
-    # -- the world ----------------------------------------------------------------------------------------------------
 
     def _restore(self, state: np.ndarray) -> None:
         """Restore the saved state of the world, and move the mug to its state."""
@@ -247,7 +213,3 @@ class GraspSimulation:
         origin, _, orientation = self._mug_frame()
         states = self.client.getJointStates(self._robot, (*ARM_JOINTS, *FINGER_JOINTS))
         return Configuration(tuple(state[0] for state in states), tuple(origin.tolist()), tuple(orientation))
-
-    def close(self) -> None:
-        """Close the Bullet world."""
-        self.client.close()

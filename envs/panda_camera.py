@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .bullet import BulletClient
+from .bullet import BulletWorld
 from .panda_scene import PandaScene, add_mug_picture
 
 IMAGE_SIZE = 128  # pixels a side
@@ -15,77 +15,53 @@ NEAR, FAR = 0.01, 1000.0  # m
 EDGES = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
 
 
-class DepthCamera:
+class DepthCamera(BulletWorld):
     """
     A Bullet world of its own that contains only the mug's mesh.
 
     To draw table and mug takes 5 ms an image. The table's depth follows from geometry, so that PyBullet draws only the
     mug, in 1.4 ms, and the smaller depth of the two counts: the same to 3e-6 m.
-
-    :param scene: Size and frame of the mug.
     """
 
     def __init__(self, scene: PandaScene) -> None:
-        self.client = client = BulletClient()
+        super().__init__()
+        client = self.client
         self._mug = add_mug_picture(client, scene)
         view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
         projection = client.computeProjectionMatrix(*EDGES, NEAR, FAR)
-        self._camera = dict(
-            width=IMAGE_SIZE,
-            height=IMAGE_SIZE,
-            viewMatrix=view,
-            projectionMatrix=projection,
-            shadow=0,
-            renderer=client.ER_TINY_RENDERER,
-        )
+        self._camera = IMAGE_SIZE, IMAGE_SIZE, view, projection
         # In the single precision of a projection matrix, 1000 m become 998.65 m.
         matrix = np.array(projection, np.float32)
         self._far = float(matrix[14] / (matrix[10] + np.float32(1)))
         turn_and_shift = np.array(view).reshape(4, 4).T
         self.rotation = turn_and_shift[:3, :3]  # from the world's axes to right, up and backward
         self.eye = -self.rotation.T @ turn_and_shift[:3, 3]
-        # Each pixel's ray from the eye to a depth of 1 m. TinyRenderer samples a pixel at its lower left corner. The
-        # first row is the uppermost.
+        # Each pixel's ray to a depth of 1 m, uppermost row first. TinyRenderer samples pixels at the lower left corner.
         left, right, bottom, top = EDGES
         corner = np.arange(IMAGE_SIZE) / IMAGE_SIZE
         to_right = (left + (right - left) * corner) / NEAR
         upward = (bottom + (top - bottom) * corner[::-1]) / NEAR
         rays = np.stack(np.broadcast_arrays(to_right[None, :], upward[:, None], -1.0), axis=-1)
         self._rays_z = (rays @ self.rotation)[..., 2]  # (128, 128)
-        self.table_depth = self._depth_of_plane(0.0)
 
-    def _depth_of_plane(self, z: float) -> np.ndarray:
-        """Depth of an infinite horizontal plane, ``(128, 128)``, along the optical axis."""
-        return (z - self.eye[2]) / self._rays_z
-
-    def pixel(self, point: np.ndarray) -> tuple[float, float, float]:
-        """Return row, column and depth of a point, ``(3,)``, of the world."""
-        left, right, bottom, top = EDGES
-        to_right, upward, backward = self.rotation @ (np.asarray(point) - self.eye)
-        depth = -backward
-        column = (NEAR * to_right / depth - left) / (right - left) * IMAGE_SIZE
-        row = IMAGE_SIZE - 1 - (NEAR * upward / depth - bottom) / (top - bottom) * IMAGE_SIZE
-        return float(row), float(column), float(depth)
+    def table_depth(self, below: float = 0.0) -> np.ndarray:
+        """Depth of the table, ``(128, 128)``, along the optical axis, as if it were lower by a distance."""
+        return (-below - self.eye[2]) / self._rays_z
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """
-        Draw one depth image for each state of the mug.
+        Draw a depth image for each state of the mug: ``(N, 1, 128, 128)`` float32 in m.
 
-        :param state: ``(N, 4)``, or ``(N, 5)`` with the height of the camera above its usual position, in m.
-        :return: ``(N, 1, 128, 128)`` float32 in m
+        States are ``(N, 4)``, or ``(N, 5)`` with the height of the camera above its usual position, in m.
         """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client
         for image, (x, y, z, yaw, *raised) in zip(images, state.tolist(), strict=True):
-            # A higher camera sees what this one sees of a lower scene.
-            below = sum(raised)
+            below = sum(raised)  # a higher camera sees what this one sees of a lower scene
             orientation = client.getQuaternionFromEuler((0, 0, yaw))
             client.resetBasePositionAndOrientation(self._mug, (x, y, z - below), orientation)
-            buffer = np.asarray(client.getCameraImage(**self._camera)[3], np.float64).reshape(IMAGE_SIZE, IMAGE_SIZE)
-            table = self._depth_of_plane(-below) if raised else self.table_depth
-            image[0] = np.minimum(self._far * NEAR / (self._far - (self._far - NEAR) * buffer), table)
+            buffer = client.getCameraImage(*self._camera, shadow=0, renderer=client.ER_TINY_RENDERER)[3]
+            buffer = np.asarray(buffer, np.float64).reshape(IMAGE_SIZE, IMAGE_SIZE)
+            mug = self._far * NEAR / (self._far - (self._far - NEAR) * buffer)
+            image[0] = np.minimum(mug, self.table_depth(below))
         return images
-
-    def close(self) -> None:
-        """Close the Bullet world."""
-        self.client.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from . import checks
 from .base import POMDPEnv
-from .panda_bullet import LIFTED, MOTIONS, Configuration, Motion
+from .panda_bullet import FINGER_OPEN, HOME, LIFTED, MOTIONS, Configuration, Motion
 from .panda_camera import IMAGE_SIZE
 from .panda_pool import GraspPool, GraspWorld
 from .panda_scene import PandaScene
@@ -51,14 +51,12 @@ class PandaGraspEnv(POMDPEnv):
 
     :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
     :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
-    :param camera_range: ``(low, high)``: in every trial the camera is raised by a distance, uniform between these two,
-        in m. The distance is the fifth component of the state.
-    :param camera_shift: The camera is raised by this distance in every trial, in m. The state does not contain it.
+    :param camera_range: Each trial raises the camera uniformly in ``(low, high)``, in m: the fifth state component.
+    :param camera_shift: Every trial raises the camera by this distance, in m, which the state does not contain.
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
-    :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: 50 in the fast motion, 150 in the
-        reference.
+    :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: 50 (fast) or 150 (reference).
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch; the results are the same.
@@ -92,8 +90,7 @@ class PandaGraspEnv(POMDPEnv):
             checks.between("frame_offset", frame_offset, -0.05, 0.05, " m"),
             checks.not_negative("friction", friction),
         )
-        low, high = _check_camera(camera_range, camera_shift)
-        self.camera_range = None if camera_range is None else (low, high)
+        self.camera_range = _check_camera(camera_range, camera_shift)
         self.camera_shift = float(camera_shift)
         if solver_iterations is not None:
             checks.count("solver_iterations", solver_iterations, or_none="None or ")
@@ -107,11 +104,10 @@ class PandaGraspEnv(POMDPEnv):
         self.state_space = spaces.Box(-np.inf, np.inf, (len(self.state_names),), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
-        self._last_details: list[dict[str, Any]] = []
         self._is_closed = False
         self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
-    # -- Bullet worlds, each made at its first use, and so in the process that uses it --------------------------------
+    # The Bullet worlds are made at their first use, and so in the process that uses them.
 
     @cached_property
     def _world(self) -> GraspWorld:
@@ -135,8 +131,6 @@ class PandaGraspEnv(POMDPEnv):
         """Return the processes for a batch of n mugs, or this process."""
         return self._pool if self.n_processes > 1 and n > 1 else self._world
 
-    # -- the POMDP ----------------------------------------------------------------------------------------------------
-
     def _initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, self.state_space.shape[0]))
         state[:, :2] = WORKSPACE + self.np_random.uniform(-self.xy_half_width, self.xy_half_width, (n, 2))
@@ -153,16 +147,13 @@ class PandaGraspEnv(POMDPEnv):
             outcomes = self._world.grasps(mugs, poses, self._film.append)
         else:
             outcomes = self._workers(len(state)).grasps(mugs, poses)
-        next_state = np.concatenate([np.array([outcome.state for outcome in outcomes]), camera], axis=1)
+        next_state = np.concatenate([np.array([state for state, _ in outcomes]), camera], axis=1)
         heights, success = next_state[:, 2].tolist(), (next_state[:, 2] > LIFTED).tolist()
-        self._last_details = [
-            dict(success=lifted, is_success=lifted, mug=mug, mug_height=height, grasp=pose, contacts=outcome.contacts)
-            for mug, pose, height, lifted, outcome in zip(mugs, poses, heights, success, outcomes, strict=True)
+        self._details = [
+            dict(success=lifted, is_success=lifted, mug=mug, mug_height=height, grasp=pose, contacts=contacts)
+            for mug, pose, height, lifted, (_, contacts) in zip(mugs, poses, heights, success, outcomes, strict=True)
         ]
         return next_state
-
-    def _details(self) -> Sequence[Mapping[str, Any]]:
-        return self._last_details
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
         return self._with_noise(self._workers(len(state)).images(self._seen(state)), self.np_random)
@@ -186,8 +177,6 @@ class PandaGraspEnv(POMDPEnv):
             for image in images:
                 image += self.depth_noise_std * rng.standard_normal(image.shape)
         return np.clip(images, MIN_DEPTH, MAX_DEPTH, out=images)
-
-    # -- pictures -----------------------------------------------------------------------------------------------------
 
     def render(self) -> np.ndarray | None:
         """
@@ -229,8 +218,9 @@ class PandaGraspEnv(POMDPEnv):
         """Return the last grasp, or the robot at rest before it."""
         if self._time > 0:
             return self._film
-        x, y, z, yaw = self._current_state()[0, :4].tolist()
-        return [PandaView.at_rest((x, y, z), yaw)]
+        *position, yaw = self._current_state()[0, :4].tolist()
+        upright = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+        return [Configuration((*HOME, FINGER_OPEN, FINGER_OPEN), tuple(position), upright)]
 
     def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
         (depth,) = self._with_noise(self._world.images(self._seen(np.array([state]))), np.random.default_rng(0))
@@ -243,8 +233,8 @@ class PandaGraspEnv(POMDPEnv):
             getattr(self, name).close()
 
 
-def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float]:
-    """Return the lowest and the highest position of the camera without the shift."""
+def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float] | None:
+    """Return the range in floats if the mug is visible from all of it."""
     limit, why = MAX_CAMERA_SHIFT, "from further away the mug is not visible"
     try:
         low, high = map(float, (0.0, 0.0) if camera_range is None else camera_range)
@@ -259,4 +249,4 @@ def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tup
             f"camera_shift={shift} with camera_range={camera_range} must leave the camera within {limit} m of its "
             f"usual height: {why}"
         )
-    return low, high
+    return None if camera_range is None else (low, high)

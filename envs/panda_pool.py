@@ -21,13 +21,7 @@ SHARES = 8  # parts of a batch for each process, so that all end at about the sa
 
 
 class GraspWorld:
-    """
-    Simulation and camera of one process; each is made when it is first used.
-
-    :param scene: The mug.
-    :param motion: How a grasp is carried out.
-    :param solver_iterations: ``None``: as the motion says.
-    """
+    """Simulation and camera of one process; each is made when it is first used."""
 
     def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None) -> None:
         self._simulation_arguments = (scene, motion, solver_iterations)
@@ -60,13 +54,10 @@ class GraspWorld:
 
 class GraspPool:
     """
-    Several processes with a :class:`GraspWorld` each, which share a batch. The results are the same bit for bit.
+    Several processes with a :class:`GraspWorld` each, which share a batch; the results are the same bit for bit.
 
     The processes ignore Ctrl-C and end with this one. If one dies, the next call raises
     :class:`concurrent.futures.process.BrokenProcessPool`.
-
-    :param n_processes: At least 2.
-    :param world_arguments: Of :class:`GraspWorld`.
     """
 
     def __init__(self, n_processes: int, *world_arguments: object) -> None:

@@ -28,7 +28,7 @@ MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
 # that it can be grasped only by its rim, with one finger inside.
 MESH_SCALE = np.array([1.134, 1.134, 0.81])
 MESH_RADIUS, MESH_HEIGHT = 0.041, 0.1  # of the cup in the file
-N_STAVES = 12
+N_STAVES = 12  # with base and handle 16 shapes; PyBullet silently drops more
 WALL_THICKNESS = 0.0075
 BASE_HEIGHT = 0.006
 # Ends (y, z) of the handle's three bars in the file, their half width and thickness.
@@ -41,20 +41,17 @@ BAR_HALF_WIDTH, BAR_THICKNESS = 0.0055, 0.0085
 MASS = 0.1  # kg
 INERTIA = 2e-4  # kg m^2, about each axis
 CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame: a little towards the handle
-MAX_SHAPES = 16  # of a body; PyBullet drops any further silently
 
 
 @dataclass(frozen=True)
 class PandaScene:
     """
-    The parameters of the scene.
+    The mug: its size, its frame and its friction.
 
     The cup's frame has the cup's axis as z axis and the handle along +y. The origin of the mug's frame, whose position
     and rotation are the state, is beside the axis.
 
-    :param mug_scale: Size of the mug, as a multiple of the paper's.
-    :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
-    :param friction: Lateral friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
+    The parameters are those of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv`.
     """
 
     mug_scale: float
@@ -88,11 +85,9 @@ class PandaScene:
 
     def collision_shapes(self) -> list[dict[str, Any]]:
         """
-        Build the mug from a disc, twelve staves around it and three bars for the handle.
+        Build the mug from a disc, twelve staves around it and three bars for the handle, in the cup's frame.
 
         Bullet would replace a moving mesh by its convex hull, and the hull of a cup is not hollow.
-
-        :return: size, position and yaw of each shape in the cup's frame
         """
         radius, height, thickness = self.mug_radius, self.mug_height, self.mug_scale * WALL_THICKNESS
         base = self.mug_scale * BASE_HEIGHT
@@ -125,14 +120,8 @@ def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
 
 
 def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
-    """
-    Add the mug's collision shapes; return its body's id. The base position is that of its centre of mass.
-
-    :raises RuntimeError: if there are more shapes than PyBullet accepts.
-    """
+    """Add the mug's collision shapes; return its body's id. The base position is that of its centre of mass."""
     shapes = scene.collision_shapes()
-    if len(shapes) > MAX_SHAPES:
-        raise RuntimeError(f"the mug has {len(shapes)} shapes; PyBullet accepts {MAX_SHAPES}")
     body = client.createCollisionShapeArray(
         [client.GEOM_BOX if "half_extents" in shape else client.GEOM_CYLINDER for shape in shapes],
         halfExtents=[shape.get("half_extents", (0.0, 0.0, 0.0)) for shape in shapes],

@@ -6,8 +6,8 @@ import os
 
 import numpy as np
 
-from .bullet import UNTURNED, BulletClient, beside
-from .panda_bullet import ARM_JOINTS, FINGER_JOINTS, FINGER_OPEN, HOME, Configuration
+from .bullet import UNTURNED, BulletWorld, beside
+from .panda_bullet import ARM_JOINTS, FINGER_JOINTS, Configuration
 from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
 
 HEIGHT, WIDTH = 256, 384  # pixels of the view
@@ -20,16 +20,12 @@ FLOOR_HEIGHT = -0.625  # m
 NEAREST, FURTHEST = 0.30, 0.61  # m, white and black in the picture of the depth
 
 
-class PandaView:
-    """
-    Robot, table and mug in a Bullet world of their own, without physics.
-
-    :param scene: The mug.
-    :param gui: Open PyBullet's window.
-    """
+class PandaView(BulletWorld):
+    """Robot, table and mug in a Bullet world of their own, without physics."""
 
     def __init__(self, scene: PandaScene, *, gui: bool = False) -> None:
-        self.client = client = BulletClient(gui=gui)
+        super().__init__(gui=gui)
+        client = self.client
         if gui:
             client.show_window(DISTANCE, YAW, PITCH, MIDDLE)
         client.loadURDF(FLOOR_FILE, (0.0, 0.0, FLOOR_HEIGHT), useFixedBase=True)
@@ -43,12 +39,6 @@ class PandaView:
         )
         self._shadow = int(client.createMultiBody(baseVisualShapeIndex=shadow))
 
-    @staticmethod
-    def at_rest(position: tuple[float, float, float], yaw: float) -> Configuration:
-        """Return the configuration of the robot in its home position and the mug upright."""
-        orientation = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
-        return Configuration((*HOME, FINGER_OPEN, FINGER_OPEN), position, orientation)
-
     def place(self, configuration: Configuration) -> None:
         """Move robot and mug to a configuration."""
         client, mug = self.client, (configuration.mug_position, configuration.mug_orientation)
@@ -60,25 +50,14 @@ class PandaView:
         client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
 
     def picture(self, depth: np.ndarray) -> np.ndarray:
-        """
-        Draw the scene beside the depth image.
-
-        :param depth: Depth image in m, ``(1, 128, 128)``.
-        :return: ``(256, 644, 3)`` uint8
-        """
+        """Draw the scene beside a depth image, ``(1, 128, 128)`` in m: ``(256, 644, 3)`` uint8."""
         return beside(self.scene_picture(HEIGHT, WIDTH), depth_picture(depth))
 
     def scene_picture(self, height: int, width: int) -> np.ndarray:
         """Draw the scene, ``(height, width, 3)`` uint8."""
         view = self.client.computeViewMatrixFromYawPitchRoll(MIDDLE, DISTANCE, YAW, PITCH, 0.0, 2)
         projection = self.client.computeProjectionMatrixFOV(FOV, width / height, 0.1, 10.0)
-        return self.client.picture(
-            height, width, viewMatrix=view, projectionMatrix=projection, lightDirection=LIGHT, shadow=1
-        )
-
-    def close(self) -> None:
-        """Close the Bullet world."""
-        self.client.close()
+        return self.client.picture(height, width, view, projection, LIGHT, shadow=1)
 
 
 def depth_picture(depth: np.ndarray) -> np.ndarray:

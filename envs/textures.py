@@ -22,7 +22,6 @@ SIZE = 128  # S: 6.25 cm a texel on the wall, about a fifth of a pixel of the ca
 
 Pattern = Callable[[np.random.Generator], np.ndarray]  # draws a tileable picture (S, S), values in [0, 1]
 
-
 # Row and column of each texel, as fractions of a side.
 ROWS, COLUMNS = np.meshgrid(*[(np.arange(SIZE) + 0.5) / SIZE] * 2, indexing="ij")
 
@@ -95,8 +94,7 @@ def speckles(rng: np.random.Generator) -> np.ndarray:
 
 PATTERNS: tuple[Pattern, ...] = (bricks, tiles, stripes, dots, planks, blobs, waves, speckles)
 
-# hue, saturation, value, each in [0, 1]
-Colour = tuple[float, float, float]
+Colour = tuple[float, float, float]  # hue, saturation, value, each in [0, 1]
 
 
 def _paint(pattern: Pattern, seed: int, dark: Colour, light: Colour) -> np.ndarray:
@@ -134,6 +132,13 @@ def built_in_texture(name: str) -> np.ndarray:
     return texture
 
 
+def floor_texture() -> np.ndarray:
+    """Draw the chequerboard of PyBullet's floor, ``(512, 512, 3)``: squares of 1 m, pale blue and white."""
+    side = np.arange(512) // 256
+    is_blue = side[:, None] == side
+    return np.where(is_blue[..., None], (173, 199, 239), (255, 255, 255)).astype(np.uint8)
+
+
 def random_texture(seed: int) -> np.ndarray:
     """Draw a texture ``(S, S, 3)`` of random pattern and hue; the same seed gives the same texture."""
     rng = np.random.default_rng([seed, 8])  # not the streams of the built-in ones
@@ -142,24 +147,6 @@ def random_texture(seed: int) -> np.ndarray:
     dark = (hue, rng.uniform(0.3, 0.95), rng.uniform(0.2, 0.55))
     light = ((hue + shift) % 1, rng.uniform(0.1, 0.8), rng.uniform(0.65, 1.0))
     return _paint(pattern, int(rng.integers(2**31)), dark, light)
-
-
-def blended_texture(share: float, name: str) -> np.ndarray:
-    """
-    Blend a built-in or random texture with the training texture: ``(S, S, 3)``.
-
-    :param share: Opacity of the texture over the training texture, in [0, 1].
-    :param name: ``"random-<seed>"`` or the name of a built-in texture.
-    :raises ValueError: if the share is out of its range or the name is unknown.
-    """
-    is_random = re.fullmatch(r"random-\d+", name)
-    if not (0 <= share <= 1 and (name in _BUILT_IN or is_random)):
-        raise ValueError(
-            f"texture='{100 * share:g}%-{name}' must be '<0 to 100>%-<name>' with one of {list(_BUILT_IN)} or "
-            "'random-<seed>'"
-        )
-    lower, upper = built_in_texture(TRAINING_TEXTURE), load_texture(name)
-    return np.rint((1 - share) * lower + share * upper).astype(np.uint8)
 
 
 def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
@@ -180,22 +167,24 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
                 "of uint8 in 0..255"
             )
         return texture.copy()
-    if texture in _BUILT_IN:
-        return built_in_texture(str(texture))
-    if match := re.fullmatch(r"random-(\d+)", os.fspath(texture)):
+    name = os.fspath(texture)
+    if name in _BUILT_IN:
+        return built_in_texture(name)
+    if match := re.fullmatch(r"random-(\d+)", name):
         return random_texture(int(match[1]))
-    if match := re.fullmatch(r"(\d+)%-(.+)", os.fspath(texture)):
-        return blended_texture(int(match[1]) / 100, match[2])
-    return _load_image(texture)
-
-
-def _load_image(texture: str | os.PathLike[str]) -> np.ndarray:
-    path = Path(texture).expanduser()
+    if match := re.fullmatch(r"(\d+)%-(.+)", name):
+        share, upper = int(match[1]) / 100, match[2]
+        if share > 1 or not (upper in _BUILT_IN or re.fullmatch(r"random-\d+", upper)):
+            allowed = f"one of {list(_BUILT_IN)} or 'random-<seed>'"
+            raise ValueError(f"texture={name!r} must be '<0 to 100>%-<name>' with {allowed}")
+        blend = (1 - share) * built_in_texture(TRAINING_TEXTURE) + share * load_texture(upper)
+        return np.rint(blend).astype(np.uint8)
+    path = Path(name).expanduser()
     if not path.is_file():
         if path.suffix or path != Path(path.name):
-            raise FileNotFoundError(f"texture={str(texture)!r}: there is no such image file")
+            raise FileNotFoundError(f"texture={name!r}: there is no such image file")
         raise ValueError(
-            f"texture={str(texture)!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', '<percent>%-<name>', "
+            f"texture={name!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', '<percent>%-<name>', "
             "or the path of an image file"
         )
     try:
@@ -203,6 +192,6 @@ def _load_image(texture: str | os.PathLike[str]) -> np.ndarray:
             return np.array(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError) as error:  # what Pillow raises for a broken file differs by format
         raise ValueError(
-            f"texture={str(texture)!r} cannot be read as an image ({error}): use an intact PNG, JPEG or other file "
-            "that Pillow opens"
+            f"texture={name!r} cannot be read as an image ({error}): use an intact PNG, JPEG or other file that Pillow "
+            "opens"
         ) from error

@@ -106,20 +106,15 @@ class RayVecEnv(VecEnv):
     Exceptions of an environment are raised as they are. If an actor dies (killed, crashed, machine lost), the next call
     raises :class:`DeadActorError`. With ``max_restarts`` Ray restarts the actor instead, which makes its environments
     anew: attributes that were set and the running episodes are lost. The next step warns and ends these episodes as a
-    time limit does: reward 0, the last observation as ``info["terminal_observation"]``, and True for ``done``,
-    ``info["TimeLimit.truncated"]`` and ``info["episode_lost"]``.
+    time limit does, with reward 0 and ``info["episode_lost"]=True``.
 
     :param env_fns: Each makes an environment.
     :param n_actors: Number of actors; default: one for each CPU of the cluster, but not more than environments.
     :param max_restarts: How often Ray may restart each actor.
-    :param actor_options: Options of Ray for each actor, for instance ``dict(num_cpus=2)`` or ``dict(num_gpus=0.1)``;
-        default: one CPU, or none if this class has started Ray.
+    :param actor_options: Ray's options of an actor, like ``dict(num_gpus=0.1)``; default: one CPU (none on own Ray).
     :param start_timeout: Seconds to wait until all actors have made their environments.
-    :param step_timeout: Seconds to wait for an answer before the actor is killed, as if it had died; None: no limit. It
-        must be longer than a restart takes.
-    :raises ValueError: if an argument is out of its range.
+    :param step_timeout: Seconds before an actor that does not answer is killed, longer than a restart; None: no limit.
     :raises TimeoutError: if the actors do not start in time, for instance because the cluster has too few CPUs.
-    :raises ImportError: without Ray (``pip install sb3_tdpg[ray]``).
     """
 
     # All objects share the connection to Ray: how many use it, whether this class made it, and whether Ray runs here.
@@ -137,7 +132,19 @@ class RayVecEnv(VecEnv):
     ) -> None:
         env_fns = list(env_fns)
         options = dict(actor_options or {})
-        _check_arguments(len(env_fns), n_actors, max_restarts, options, (start_timeout, step_timeout))
+        if not env_fns:
+            raise ValueError("env_fns is empty: give one function for each environment")
+        if n_actors is not None:
+            check_count("n_actors", n_actors)
+            if n_actors > len(env_fns):
+                raise ValueError(f"n_actors={n_actors} must be at most the number of environments: {len(env_fns)}")
+        if not (isinstance(max_restarts, (int, np.integer)) and max_restarts >= 0):
+            raise ValueError(f"max_restarts={max_restarts!r} must be an integer of at least 0")
+        if taken := {"max_restarts", "max_task_retries"} & set(options):
+            raise ValueError(f"actor_options has {sorted(taken)}: give max_restarts to RayVecEnv itself")
+        for name, timeout in dict(start_timeout=start_timeout, step_timeout=step_timeout).items():
+            if timeout is not None and not timeout > 0:
+                raise ValueError(f"{name}={timeout!r} must be a positive number of seconds")
         self._max_restarts, self._start_timeout, self._step_timeout = max_restarts, start_timeout, step_timeout
         self._actors: list[Any] = []
         self._is_closed = False
@@ -146,8 +153,7 @@ class RayVecEnv(VecEnv):
             n_actors = n_actors or min(len(env_fns), max(1, int(self._ray.cluster_resources().get("CPU", 1))))
             bounds = [len(env_fns) * i // n_actors for i in range(n_actors + 1)]
             self._shares = list(itertools.starmap(slice, itertools.pairwise(bounds)))
-            # On an instance of our own a second RayVecEnv, for evaluation, would wait for free CPUs for ever. Task
-            # events go to Ray's dashboard and cost 0.1 ms a step.
+            # On Ray of our own a second RayVecEnv would wait for free CPUs for ever. Task events cost 0.1 ms a step.
             self._actor_options = {"num_cpus": 0 if self._is_local else 1, "enable_task_events": False, **options}
             actor_class = self._ray.remote(EnvActor).options(
                 max_restarts=max_restarts, max_task_retries=-1 if max_restarts else 0, **self._actor_options
@@ -188,13 +194,10 @@ class RayVecEnv(VecEnv):
             )
         return self._receive_all(replies)[1][0]
 
-    # -- the actors ---------------------------------------------------------------------------------------------------
-
     def _send(self, actor: int, method: str, *arguments: Any) -> list[Any]:
         """Call a method of an actor; return Ray's references to the observations and to the rest."""
         # Ray needs 1 ms longer for an object of more than 100 kB: the terminal image must not travel with the next.
-        call = self._actors[actor].call.options(num_returns=2)
-        return call.remote(cloudpickle.dumps((method, *arguments)))
+        return self._actors[actor].call.options(num_returns=2).remote(cloudpickle.dumps((method, *arguments)))
 
     def _receive_all(self, replies: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
         """Wait for the replies of all actors; return a tuple of the observations and one of the rest."""
@@ -227,24 +230,17 @@ class RayVecEnv(VecEnv):
 
     def _ask(self, indices: VecEnvIndices, method: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Call a method of the actors' ``DummyVecEnv`` for some environments; return one result for each."""
-        wanted = [range(self.num_envs)[i] for i in self._get_indices(indices)]
-        replies = [
-            (actor, self._send(actor, "ask", [i - share.start], method, args, kwargs))
-            for i in wanted
-            for actor, share in enumerate(self._shares)
-            if share.start <= i < share.stop
-        ]
+        places = [(actor, i) for actor, share in enumerate(self._shares) for i in range(share.stop - share.start)]
+        wanted = [places[i] for i in self._get_indices(indices)]
+        replies = [(actor, self._send(actor, "ask", [i], method, args, kwargs)) for actor, i in wanted]
         return [(self._receive(actor, reply)[1] or [None])[0] for actor, reply in replies]
-
-    # -- VecEnv -------------------------------------------------------------------------------------------------------
 
     def reset(self) -> VecEnvObs:
         """Start N episodes: observations, ``(N, *obs)``."""
         replies = [self._send(i, "reset", self._seeds[s], self._options[s]) for i, s in enumerate(self._shares)]
         parts, infos = self._receive_all(replies)
         self.reset_infos = list(itertools.chain(*infos))
-        # Seeds and options are used once.
-        self._reset_seeds()
+        self._reset_seeds()  # seeds and options are used once
         self._reset_options()
         return self._join(parts)
 
@@ -309,21 +305,3 @@ class RayVecEnv(VecEnv):
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render each environment."""
         return self.env_method("render")
-
-
-def _check_arguments(
-    n_envs: int, n_actors: int | None, max_restarts: int, options: Mapping[str, Any], timeouts: Sequence[float | None]
-) -> None:
-    if n_envs == 0:
-        raise ValueError("env_fns is empty: give one function for each environment")
-    if n_actors is not None:
-        check_count("n_actors", n_actors)
-    if n_actors is not None and n_actors > n_envs:
-        raise ValueError(f"n_actors={n_actors} must be at most the number of environments: {n_envs}")
-    if not (isinstance(max_restarts, (int, np.integer)) and max_restarts >= 0):
-        raise ValueError(f"max_restarts={max_restarts!r} must be an integer of at least 0")
-    if taken := {"max_restarts", "max_task_retries"} & set(options):
-        raise ValueError(f"actor_options has {sorted(taken)}: give max_restarts to RayVecEnv itself")
-    for name, timeout in zip(("start_timeout", "step_timeout"), timeouts, strict=True):
-        if timeout is not None and not timeout > 0:
-            raise ValueError(f"{name}={timeout!r} must be a positive number of seconds")

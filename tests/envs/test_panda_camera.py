@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_tdpg.envs.bullet import BulletClient
-from sb3_tdpg.envs.panda_camera import DISTANCE, FAR, IMAGE_SIZE, NEAR, PITCH, TARGET, YAW, DepthCamera
+from sb3_tdpg.envs.panda_camera import DISTANCE, EDGES, FAR, IMAGE_SIZE, NEAR, PITCH, TARGET, YAW, DepthCamera
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.panda_scene import TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
 
@@ -17,6 +17,16 @@ AXIS = (np.array(TARGET) - EYE) / 0.4
 
 def depth_by_hand(point):
     return float((np.asarray(point) - EYE) @ AXIS)
+
+
+def pixel(camera, point):
+    """Row, column and depth of a point of the world."""
+    left, right, bottom, top = EDGES
+    to_right, upward, backward = camera.rotation @ (np.asarray(point) - camera.eye)
+    depth = -backward
+    column = (NEAR * to_right / depth - left) / (right - left) * IMAGE_SIZE
+    row = IMAGE_SIZE - 1 - (NEAR * upward / depth - bottom) / (top - bottom) * IMAGE_SIZE
+    return row, column, depth
 
 
 def random_states(n, seed=0):
@@ -67,7 +77,7 @@ def test_the_eye_is_where_it_is_by_hand(camera):
 def test_a_point_of_the_table_has_the_depth_computed_by_hand(camera, point):
     nowhere = np.array([[0.5, 0.0, -1.0, 0.0]])  # the mug below the table
     (image,) = camera.images(nowhere)
-    row, column, depth = camera.pixel(point)
+    row, column, depth = pixel(camera, point)
     assert depth == pytest.approx(depth_by_hand(point), abs=1e-6)
     around = image[0, int(row) : int(row) + 2, int(column) : int(column) + 2]
     assert around.min() - 1e-4 < depth < around.max() + 1e-4
@@ -84,7 +94,7 @@ def test_points_of_the_mug_have_the_depths_computed_by_hand(camera, yaw):
     for angle in (np.pi * 0.75, np.pi / 4, -np.pi * 0.75):
         along = np.array([np.cos(angle), np.sin(angle)])
         point = np.append(axis + middle_of_the_rim * along, 0.081)
-        row, column, depth = camera.pixel(point)
+        row, column, depth = pixel(camera, point)
         assert depth == pytest.approx(depth_by_hand(point), abs=1e-6)
         assert image[0, round(row), round(column)] == pytest.approx(depth, abs=0.002)
 
@@ -92,7 +102,7 @@ def test_points_of_the_mug_have_the_depths_computed_by_hand(camera, yaw):
 def test_one_sees_into_the_mug(camera):
     state = np.array([[0.5, 0.012, 0.0, 0.0]])  # its axis through (0.5, 0)
     (image,) = camera.images(state)
-    row, column, lid = camera.pixel((0.5, 0.0, 0.081))
+    row, column, lid = pixel(camera, (0.5, 0.0, 0.081))
     assert image[0, round(row), round(column)] > lid + 0.01
 
 
@@ -102,9 +112,9 @@ def test_the_handle_is_seen_where_the_yaw_has_it(camera):
         outermost = 0.0805 * 1.134 - 0.012  # from the frame's origin to the outer side of the handle
         towards = yaw + np.pi / 2
         point = (0.5 + outermost * np.cos(towards), outermost * np.sin(towards), 0.0405)
-        row, column, depth = camera.pixel(point)
+        row, column, depth = pixel(camera, point)
         assert image[0, round(row), round(column)] == pytest.approx(depth, abs=0.002)
-        assert camera.table_depth[round(row), round(column)] > depth + 0.02
+        assert camera.table_depth()[round(row), round(column)] > depth + 0.02
 
 
 # -- against PyBullet's picture of the whole scene -------------------------------------------------------------------

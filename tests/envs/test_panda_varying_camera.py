@@ -6,7 +6,7 @@ from panda_oracle import mixed_actions, oracle_actions
 
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import PANDA_CAMERA, PANDA_GRASP_CAMERA
-from tests.envs.test_panda_camera import EYE, depth_by_hand
+from tests.envs.test_panda_camera import EYE, depth_by_hand, pixel
 
 LOW, HIGH = PANDA_CAMERA["camera_range"]
 YAW = -2.4  # turns the handle away from the camera
@@ -46,7 +46,7 @@ def test_a_raised_camera_sees_the_mug_from_where_it_is(env, height):
     towards = (EYE[:2] - axis) / np.linalg.norm(EYE[:2] - axis)
     aside = np.array([towards[1], -towards[0]])
     for point in (np.append(axis + 0.046 * towards, 0.04), np.append(axis + 0.06 * aside, 0.0)):
-        row, column, depth = camera.pixel(point - [0, 0, height])
+        row, column, depth = pixel(camera, point - [0, 0, height])
         assert depth == pytest.approx(depth_by_hand(point - [0, 0, height]), abs=1e-6)
         assert image[0, round(row), round(column)] == pytest.approx(depth, abs=0.004)
 
@@ -55,7 +55,7 @@ def test_at_no_height_the_image_is_the_usual_one_and_each_height_has_its_own(env
     pose = [0.5, 0.0, 0.0, 0.5]
     usual, same, higher = (env._sensor(np.array([[*pose, *h]]))[0, 0] for h in ([], [0.0], [0.02]))
     np.testing.assert_array_equal(usual, same)
-    is_table = np.isclose(usual, env._world.camera.table_depth) & (higher > 0.5)
+    is_table = np.isclose(usual, env._world.camera.table_depth()) & (higher > 0.5)
     assert is_table.sum() > 5000
     # Along the axis of view, which comes down at 45 degrees: the table there is 2 cm lower.
     np.testing.assert_allclose((higher / usual)[is_table], 1 + 0.02 / EYE[2], rtol=1e-4)
