@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -66,8 +66,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
     axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
     axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # visible also with one step
-    axes.plot(t, lower, color=PALETTE[1], linewidth=0.8)
-    axes.plot(t, upper, color=PALETTE[1], linewidth=0.8)
+    axes.plot(t, frame[["lower", "upper"]], color=PALETTE[1], linewidth=0.8)
     for limit, markers in BOUNDS.items():
         for name, (marker, label) in markers.items():
             rows = frame[frame[f"{limit}_name"] == name]
@@ -84,25 +83,24 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     return figure
 
 
-def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats") -> Figure:
+def knowledge_map(frame: pd.DataFrame) -> Figure:
     """
     Draw the information in the TRVs about each component of the state at each time step, as a heat map.
 
     Constant components are grey. Values in brackets are not distinguishable from 0.
 
     :param frame: From :func:`~sb3_tdpg.evaluation.state_knowledge`.
-    :param quantity: The column to show.
     :raises ValueError: if the frame has no component.
     """
     if len(frame) == 0:
         raise ValueError("the frame has no component: every one is constant, or too few episodes are alive")
     components = frame["component"].unique()
     table = frame.pivot(index="component", columns="t").loc[components]
-    values, lower = table[quantity].to_numpy(), table["nats_lower"].to_numpy()  # (X, T) each
+    values, lower = table["nats"].to_numpy(), table["nats_lower"].to_numpy()  # (X, T) each
     n_rows, n_columns = values.shape
     figure = new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 10.0), 1.3 + 0.5 * n_rows)
     axes = figure.add_subplot()
-    top = 1.0 if quantity == "r2" else max(float(np.nanmax(values)), 0.1)
+    top = max(float(np.nanmax(values)), 0.1)
     axes.set_facecolor("#DDDDDD")
     image = axes.imshow(values, cmap="viridis", vmin=0, vmax=top, aspect="auto")
     for row, column in np.ndindex(values.shape) if n_columns <= MAX_ANNOTATED_STEPS else ():
@@ -117,7 +115,7 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
     axes.set_xlabel("time step $t$", fontsize=9)
     axes.spines[:].set_visible(False)
     bar = figure.colorbar(image, pad=0.02)
-    bar.set_label(r"$I[x^k_t; \tilde{x}_t]$ (nat), at least" if quantity == "nats" else "$R^2$", fontsize=9)
+    bar.set_label(r"$I[x^k_t; \tilde{x}_t]$ (nat), at least", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return figure
 
@@ -129,6 +127,7 @@ def short_name(row: str) -> str:
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
+    """Draw the legend of the axes above the figure."""
     handles, labels = axes.get_legend_handles_labels()
     columns = -(-len(labels) // -(-len(labels) // 3))  # as few rows as possible with up to three columns, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
@@ -149,6 +148,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) ->
 
 
 def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure with a constrained layout; the size is in inches."""
     return import_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
@@ -162,14 +162,14 @@ def log_axis(axes: Axes, which: str, subs: tuple[int, ...]) -> None:
 
 
 def tidy(axes: Axes) -> None:
+    """Remove the spines at the top and at the right, and make the tick labels small."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
 
 
 def import_matplotlib() -> Any:
+    """Import Matplotlib, which is an optional dependency."""
     try:
-        import matplotlib.cm
-        import matplotlib.colors
         import matplotlib.figure
         import matplotlib.ticker
     except ImportError as e:

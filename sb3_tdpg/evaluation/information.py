@@ -94,7 +94,7 @@ def information_report(
     seed: int = 0,
     *,
     names: Sequence[str] | None = None,
-    at_end: Callable[[], Any] | None = None,
+    at_end: Callable[[], Any] = lambda: None,
 ) -> InformationReport:
     """
     Run fresh episodes and estimate what the policy's TRVs know about the state at each time step.
@@ -112,21 +112,24 @@ def information_report(
         raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: pass a TDPG model")
     check_env_fits(model, env)
     names = read_problem(env).state_names if names is None else names
-    batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
-    at_end = at_end or (lambda: None)
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes={n_episodes} must be at least 1")
+    n_rounds = -(-n_episodes // env.num_envs)
+    seeds = [seed, *np.random.SeedSequence([seed, n_rounds]).generate_state(n_rounds)[1:].tolist()]
+    batches, costs = zip(*(encode_episodes(model, env, seed=each) for each in seeds), strict=True)
+    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*batches, strict=True)))
+    batch = batch.select(th.arange(n_episodes))
     interval = information_interval(batch, seed=seed)
     at_end()
     known = state_knowledge(batch, names, seed=seed)
     at_end()
     badge = trust_checks(batch, interval, seed=seed)
     at_end()
-    return InformationReport(interval, known, badge, costs)
+    return InformationReport(interval, known, badge, np.concatenate(costs)[:n_episodes])
 
 
 @threads(1)
-def state_knowledge(
-    batch: InformationBatch, names: Sequence[str] | None = None, *, confidence: float = 0.95, seed: int = 0
-) -> pd.DataFrame:
+def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None, *, seed: int = 0) -> pd.DataFrame:
     """
     Estimate what the TRVs know about each component of the state at each time step.
 
@@ -134,10 +137,9 @@ def state_knowledge(
 
     :param batch: Rollouts ``(T, N, ...)``, for instance of :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
     :param names: Names of the X components; default: ``x0``, ``x1``, ...
-    :param confidence: Confidence of the lower limit, which is one-sided.
     :param seed: Seed of the division into halves and of the encoder's noise.
     :return: A row for each time step and component, with the columns ``t``, ``component``, ``nats`` (a lower bound on
-        I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit, clipped at 0) and ``r2`` (of a
+        I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit of 95 %, clipped at 0) and ``r2`` (of a
         leave-one-out regression of the component on the TRVs, clipped at 0). NaN where a component is constant and
         where too few episodes are alive. Components that are constant at all time steps are left out.
     :raises ValueError: if the number of names is wrong, or the batch is unfit for an interval.
@@ -146,7 +148,7 @@ def state_knowledge(
     names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
     if len(names) != n_components:
         raise ValueError(f"names={names} must have a name for each of the {n_components} components of the state")
-    nats, limits = component_estimates(batch, confidence=confidence, seed=seed)
+    nats, limits = component_estimates(batch, seed=seed)
     r2 = np.full_like(nats, np.nan)
     for t in range(horizon):
         known = np.isfinite(nats[t])
@@ -171,22 +173,9 @@ def interval_frame(interval: InformationInterval) -> pd.DataFrame:
     they come from, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``, ``marginal``) and
     ``n_episodes``.
     """
-    limits = dict(lower=interval.lower, upper=interval.upper)
-    names = dict(lower_name=interval.lower_name, upper_name=interval.upper_name)
+    columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
     t = np.arange(len(interval.lower))
-    return pd.DataFrame(dict(t=t, **limits, **names, **interval.estimates, n_episodes=interval.n_episodes))
-
-
-def _encode_in_rounds(model: Any, env: VecEnv, n_episodes: int, seed: int) -> EncodedEpisodes:
-    """Run :func:`encode_episodes` until there are enough episodes, with another seed in each round."""
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 1")
-    n_rounds = -(-n_episodes // env.num_envs)
-    seeds = [seed, *np.random.SeedSequence([seed, n_rounds]).generate_state(n_rounds)[1:].tolist()]
-    rounds = [encode_episodes(model, env, seed=each) for each in seeds]
-    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*(each.batch for each in rounds), strict=True)))
-    costs = np.concatenate([each.costs for each in rounds])
-    return EncodedEpisodes(batch.select(th.arange(n_episodes)), costs[:n_episodes])
+    return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
 
 def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisodes:
@@ -220,11 +209,8 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     Bound the information of a batch, summed over time.
 
     A step with too few live episodes for an estimate counts as much as the last step with enough. If it counted as 0,
-    policies with many TRVs, which need more episodes, would seem to know less.
-
-    Both bounds are estimated from the same episodes. The information between the TRVs and the inputs of these N
-    encoders is at most the log-det bound of the inputs; only its estimate can exceed the bound, because the TRVs are
-    sampled. A control variate makes the estimate precise where the two are close, and it is clipped at the upper bound.
+    policies with many TRVs, which need more episodes, would seem to know less. The estimate of the lower bound can
+    exceed the upper bound, because the TRVs are sampled, and is clipped there.
 
     :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
     :raises ValueError: if there are too few episodes from the start.

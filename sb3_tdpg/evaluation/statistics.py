@@ -36,25 +36,20 @@ def aggregate_seeds(
     require_columns(records_by_seed, ["train_seed"])
     if not 0 < level < 1:
         raise ValueError(f"level={level} must lie between 0 and 1")
-    iqm = _import_rliable()[1].aggregate_iqm
     rows = []
     for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
-        means = group["mean"].to_numpy()
-        (point,), (low,), (high,) = _bootstrap(
-            lambda x: np.array([iqm(x)]), means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed
-        )
+        means, stds = group[["mean", "std"]].to_numpy().T
+        (point,), (low,), (high,) = interquartile_means(means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed)
         seeds = dict(n_seeds=len(means), iqm=point, low=low, high=high, min=means.min(), max=means.max())
         how = {name: one_or_all(group[name]) for name in ("seed", "deterministic")}
-        std = iqm(group["std"].to_numpy())
-        rows.append(
-            dict(model=model, scenario=scenario, **seeds, episode_std=std, level=level, n=group["n"].iloc[0], **how)
-        )
+        more = dict(episode_std=_interquartile_mean(stds), level=level, n=group["n"].iloc[0])
+        rows.append(dict(model=model, scenario=scenario, **seeds, **more, **how))
     return pd.DataFrame(rows)
 
 
 def probability_of_improvement(
     records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
-) -> tuple[float, float, float]:
+) -> tuple[float, ...]:
     """
     Estimate the probability that a seed of one method has a lower mean cost than a seed of another method.
 
@@ -67,16 +62,11 @@ def probability_of_improvement(
     :return: the probability, 0.5 for no difference, and the ends of its interval
     """
     means = _seed_means(records_by_seed)
-    estimates = probabilities_of_improvement(
-        means[model].to_numpy()[:, None], means[control].to_numpy()[:, None], **bootstrap
-    )
-    value, low, high = (float(estimate[0]) for estimate in estimates)
-    return value, low, high
+    costs, of_control = (means[label].to_numpy()[:, None] for label in (model, control))
+    return tuple(estimate.item() for estimate in probabilities_of_improvement(costs, of_control, **bootstrap))
 
 
-def paired_difference(
-    records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
-) -> tuple[float, float, float]:
+def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any) -> tuple[float, ...]:
     """
     Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
 
@@ -91,15 +81,11 @@ def paired_difference(
     :raises ValueError: if the seeds are not the same.
     """
     means = _seed_means(records_by_seed)
-    if sorted(means[model].index) != sorted(means[control].index):
-        raise ValueError(
-            f"the seeds of {model!r} are {sorted(means[model].index)}, those of {control!r} "
-            f"{sorted(means[control].index)}: a paired difference needs the same of both"
-        )
-    differences = (means[model] - means[control]).to_numpy()
-    estimates = _bootstrap(lambda x: np.array([x.mean()]), differences[:, None], **bootstrap)
-    value, low, high = (float(estimate[0]) for estimate in estimates)
-    return value, low, high
+    seeds, of_control = (sorted(means[label].index) for label in (model, control))
+    if seeds != of_control:
+        raise ValueError(f"the seeds of {model!r} are {seeds}, those of {control!r} {of_control}: they must match")
+    differences = (means[model] - means[control]).to_numpy()[:, None]
+    return tuple(estimate.item() for estimate in _bootstrap(lambda x: x.mean(axis=0), differences, **bootstrap))
 
 
 def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,12 +97,13 @@ def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarra
         its own.
     :return: the means and the ends of their intervals, each ``(rows,)``
     """
-    cut = len(scores) // 4
+    return _bootstrap(_interquartile_mean, scores, **bootstrap)
 
-    def means(x: np.ndarray) -> np.ndarray:  # scipy.stats.trim_mean, in a tenth of the time
-        return np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0)
 
-    return _bootstrap(means, scores, **bootstrap)
+def _interquartile_mean(x: np.ndarray) -> np.ndarray:
+    """Compute the mean of the middle half along the first axis, as scipy's ``trim_mean`` in a tenth of the time."""
+    cut = len(x) // 4
+    return np.asarray(np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0))
 
 
 def probabilities_of_improvement(
@@ -144,36 +131,21 @@ def _seed_means(records_by_seed: pd.DataFrame) -> pd.Series:
 
 
 def _bootstrap(
-    statistic: Callable[..., np.ndarray],
-    *scores: np.ndarray,
-    level: float = 0.95,
-    n_bootstrap: int = 2000,
-    seed: int = 0,
+    statistic: Callable[..., Any], *scores: np.ndarray, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Resample the seeds, and return a statistic with the ends of its percentile interval, each ``(rows,)``.
-
-    :param scores: One array ``(seeds, rows)``, or two.
-    """
-    library, _ = _import_rliable()
+    """Resample the seeds of arrays ``(seeds, rows)``; return a statistic and the ends of its percentile interval."""
+    try:
+        from rliable import library
+    except ImportError as e:
+        raise ImportError("statistics over seeds need rliable: pip install sb3_tdpg[plots]") from e
     # rliable draws from NumPy's global generator, whatever random_state it is given.
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
+        of_scores = {"scores": scores if len(scores) > 1 else scores[0]}
         points, intervals = library.get_interval_estimates(
-            {"scores": scores if len(scores) > 1 else scores[0]},
-            statistic,
-            reps=n_bootstrap,
-            confidence_interval_size=level,
+            of_scores, statistic, reps=n_bootstrap, confidence_interval_size=level
         )
     finally:
         np.random.set_state(state)  # noqa: NPY002
     return points["scores"], *intervals["scores"]
-
-
-def _import_rliable() -> tuple[Any, Any]:
-    try:
-        from rliable import library, metrics
-    except ImportError as e:
-        raise ImportError("statistics over seeds need rliable: pip install sb3_tdpg[plots]") from e
-    return library, metrics

@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-VAST = 1e6
-"""Bounds further apart count as infinite: some environments use the largest float for "unbounded"."""
+VAST = 1e6  # bounds further apart count as infinite: some environments use the largest float for "unbounded"
 
 
 def finite_range(space: spaces.Box) -> np.ndarray:
@@ -26,10 +25,9 @@ def finite_range(space: spaces.Box) -> np.ndarray:
 
 def kind_of(space: spaces.Space) -> str | None:
     """
-    Return the kind of observation.
+    Return ``"image"``, ``"vector"`` or, if it is not a ``Box``, ``None``.
 
-    :return: ``"image"``: a ``Box`` of three dimensions, one of them the channels, or of two with bytes, and finite
-        bounds; ``"vector"``: any other ``Box``; ``None``: not a ``Box``
+    An image has finite bounds and three dimensions, one of them the channels, or two dimensions and bytes.
     """
     if not isinstance(space, spaces.Box):
         return None
@@ -52,7 +50,6 @@ class Sensor:
     An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
     becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed.
 
-    :param space: The observation space.
     :param scale: Scale of the components of a vector, in the space's shape; see :func:`.observation_scale`.
     """
 
@@ -101,13 +98,7 @@ class Sensor:
         return units if self.channel_axis == 0 else np.moveaxis(units, 3, 1)
 
     def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        """
-        Convert back to the order, the bounds and the type of the space.
-
-        :param units: ``(N, C, H, W)`` or ``(N, D)``
-        :param observations: The unperturbed observations, ``(N, *obs)``.
-        :return: ``(N, *obs)``, a new array
-        """
+        """Convert back to the order, bounds and type of the space; components without a scale stay unperturbed."""
         low, high = self.space.low, self.space.high
         if self.is_image:
             units = units.reshape(observations.shape) if self.channel_axis is None else units
