@@ -108,9 +108,7 @@ def cost_distribution(
 
     :param costs: Independent and identically distributed, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.
-    :param confidence: Probability with which the band holds; ``None``: the distribution of the sample itself, on the
-        same ranks, without allowance for the sampling error.
-    :raises ValueError: if a cost is not finite or exceeds the bound, or a confidence is given without a bound.
+    :param confidence: Probability with which the band holds; ``None``: no allowance for the sampling error.
     """
     costs = np.sort(_checked_costs(costs))
     n = len(costs)
@@ -146,7 +144,6 @@ def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = N
     In :math:`s = 1 / \beta` the function is convex (the perspective of a convex function plus a linear one), so a local
     search finds the minimum. Every beta gives a valid bound; some distribution within ``kl`` nats attains the minimum.
 
-    :param distribution: From :func:`cost_distribution`.
     :param kl: D[shifted || training] in nats, or an upper bound on it; inf gives the largest cost.
     :param beta: Use this value instead of searching.
     """
@@ -189,11 +186,9 @@ def certificate(
 
     :param costs: Costs of independent episodes in training, ``(N,)``.
     :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.
-    :param cost_bound: Upper bound on the episode cost. Costs that may be larger can be clipped,
-        ``np.minimum(costs, cost_bound)``, to certify the clipped cost.
+    :param cost_bound: Upper bound on the episode cost.
     :param confidence: Confidence of the bound; ``None``: an estimate without allowance for the sampling error.
     :param beta: Use this value instead of the best one.
-    :raises ValueError: see :func:`cost_distribution` and :func:`worst_mean`.
     """
     return worst_mean(cost_distribution(costs, cost_bound, confidence), kl, beta)
 

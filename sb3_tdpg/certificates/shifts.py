@@ -40,8 +40,7 @@ from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
 INFORMATION_EPISODES = 4_000  # for the bound on the information
-EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Shares of the episodes whose divergence is capped; the best level is chosen afterwards."""
+EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of the episodes with a capped divergence to try
 
 _START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
 
@@ -122,11 +121,7 @@ def lava_shift(
     start_beta: Sequence[float] | None = None,
     training_noise_std: float = 0.01,
 ) -> Shift:
-    """
-    Declare a shift of the lava problem; see :class:`~sb3_tdpg.envs.lava.LavaEnv` for the keywords.
-
-    The divergences are from a training with a uniform start, no bias, and ``training_noise_std`` as sensor noise.
-    """
+    """Declare a shift of the lava problem from a uniform start, no bias and the sensor noise of the training."""
     noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
     bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
     given = dict(sensor_noise_std=sensor_noise_std, sensor_bias=sensor_bias, start_beta=start_beta)
@@ -161,9 +156,7 @@ def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.0
 
 class TrainingEpisodes:
     """
-    Recorded training episodes of a policy, from which certificates are computed.
-
-    A certificate runs no episode in the shifted environment: its sensor only observes the recorded states.
+    Recorded training episodes of a policy; the sensor of a shifted environment only observes their states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
     :param scenario: The training environment, one of this plugin.
@@ -237,8 +230,7 @@ class TrainingEpisodes:
         Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
 
         The mean of a step's divergence under the *shifted* distribution is at most its worst mean within the divergence
-        of the steps before. The divergence of a step is capped: where it is larger, the bound assumes that the step is
-        not shifted and that the episode has the largest cost.
+        of the steps before. Where it exceeds a cap, the bound assumes an unshifted step and the largest episode cost.
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
@@ -280,11 +272,7 @@ class TrainingEpisodes:
 
 
 def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
-    """
-    Run n episodes with sensor noise that :func:`encode` can draw again.
-
-    A loop of its own over the methods of the POMDP: start, sensor, dynamics and policy have separate random streams.
-    """
+    """Run n episodes whose start, sensor, dynamics and policy have separate random streams, for :func:`encode`."""
     env.np_random = np.random.default_rng([*seed, _START])
     state, costs = env._initial_state(n), np.zeros(n)
     trv = th.zeros(n, model.policy.trv_dim, device=model.device)
@@ -345,8 +333,7 @@ def _information(recorded: RecordedEpisodes) -> float:
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
     # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
     double = [[Normal(d.mean.double(), d.stddev.double()) for d in densities] for densities in (shifted, training)]
-    pairs = zip(*double, strict=True)
-    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in pairs])
+    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in zip(*double, strict=True)])
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:

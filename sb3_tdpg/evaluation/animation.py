@@ -57,10 +57,7 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
     except ImportError as e:
         raise ValueError("a video needs matplotlib: pip install sb3_tdpg[plots]") from e
     if ending == ".mp4" and _ffmpeg() is None:
-        raise ValueError(
-            f"{path}: writing an .mp4 needs ffmpeg, which is not installed: install it, pip install imageio-ffmpeg, "
-            "or use .gif"
-        )
+        raise ValueError(f"{path}: an .mp4 needs ffmpeg: install it, pip install imageio-ffmpeg, or use .gif")
 
 
 def _ffmpeg() -> str | None:
@@ -164,8 +161,7 @@ def _write_gif(video: _Video, path: Path, fps: float) -> None:
     images, durations = [], []
     for is_last in video.frames():
         images.append(video.image())
-        # In ms; players show frames of less than 20 ms more slowly.
-        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))
+        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; less is shown more slowly
     # One palette for all frames, or they flicker. MAXCOVERAGE keeps small objects' colours, k-means serves large ones.
     sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
     palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)

@@ -40,8 +40,8 @@ def enjoy(
     :param seed: Seed of the environment and of the policy's sampling.
     :param n_episodes: Number of episodes.
     :param deterministic: Act without noise, which changes the policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param record: Write a video of the environment's pictures and the TRVs there, ``.gif`` or ``.mp4``. If the
-        environment has a method ``film``, it returns the pictures between two steps.
+    :param record: Write a video there, ``.gif`` or ``.mp4``. A method ``film`` of the environment returns the pictures
+        between two steps.
     :return: the episodes; without ``record`` they have no pictures
     :raises ValueError: if there is no model, it does not fit the environment, or a video cannot be made.
     """
@@ -107,7 +107,7 @@ class _Recorder(gym.Wrapper):
     def _picture(self) -> np.ndarray:
         picture = self.env.render()
         if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
-            raise ValueError(f"render() of {self.env} must return a picture: an array (height, width, 3) of uint8")
+            raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
         return picture
 
 

@@ -24,7 +24,6 @@ def scenario_env(
     """
     Make a new environment of a scenario, wrapped as the model needs it.
 
-    :param scenario: Id and keywords of the environment.
     :param model: An SB3 model. If its own environment normalises observations (``VecNormalize``), the new one does so
         with the same statistics, frozen.
     :param n_episodes: Number of episodes to run at a time.

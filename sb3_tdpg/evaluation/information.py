@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TINY = 1e-30
-ESTIMATES = ("interval", "knowledge", "checks")
-"""The three parts of :func:`information_report`, in this order."""
+ESTIMATES = ("interval", "knowledge", "checks")  # the parts of an information report, in this order
 
 
 class EncodedEpisodes(NamedTuple):
@@ -94,7 +93,7 @@ def information_report(
     seed: int = 0,
     *,
     names: Sequence[str] | None = None,
-    at_end: Callable[[], Any] = lambda: None,
+    at_end: Callable[[], Any] | None = None,
 ) -> InformationReport:
     """
     Run fresh episodes and estimate what the policy's TRVs know about the state at each time step.
@@ -105,8 +104,7 @@ def information_report(
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
     :param names: Names of the components of the state; default: the environment's ``state_names``, or ``x0``, ...
     :param at_end: Called at the end of each of the three ``ESTIMATES``.
-    :raises ValueError: if model and environment do not fit, there are too few episodes for an interval at any time
-        step, or the names do not fit.
+    :raises ValueError: if model, environment or names do not fit, or there are too few episodes for an interval.
     """
     if not isinstance(model.policy, TRVPolicy):
         raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: pass a TDPG model")
@@ -119,6 +117,7 @@ def information_report(
     batches, costs = zip(*(encode_episodes(model, env, seed=each) for each in seeds), strict=True)
     batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*batches, strict=True)))
     batch = batch.select(th.arange(n_episodes))
+    at_end = at_end or (lambda: None)
     interval = information_interval(batch, seed=seed)
     at_end()
     known = state_knowledge(batch, names, seed=seed)
@@ -137,12 +136,10 @@ def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None,
 
     :param batch: Rollouts ``(T, N, ...)``, for instance of :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
     :param names: Names of the X components; default: ``x0``, ``x1``, ...
-    :param seed: Seed of the division into halves and of the encoder's noise.
     :return: A row for each time step and component, with the columns ``t``, ``component``, ``nats`` (a lower bound on
         I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit of 95 %, clipped at 0) and ``r2`` (of a
         leave-one-out regression of the component on the TRVs, clipped at 0). NaN where a component is constant and
         where too few episodes are alive. Components that are constant at all time steps are left out.
-    :raises ValueError: if the number of names is wrong, or the batch is unfit for an interval.
     """
     horizon, _, n_components = batch.states.shape
     names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
@@ -184,7 +181,6 @@ def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisode
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
     :param env: N environments.
-    :param seed: Seed of the environments and of the policy's sampling.
     """
     problem = read_problem(env)
     steps, costs = [], np.zeros(env.num_envs)
@@ -213,7 +209,6 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     exceed the upper bound, because the TRVs are sampled, and is clipped there.
 
     :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
-    :raises ValueError: if there are too few episodes from the start.
     """
     n_episodes, trv_dim = batch.trvs.shape[1:]
     if n_episodes < trv_dim + 2:
@@ -222,15 +217,14 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
             f"{trv_dim + 2}"
         )
     log_det = LogDet(1, batch.states.shape[2], trv_dim)
-    at_step = InformationBounds(0.0, 0.0)
-    total = np.zeros(2)
+    at_step = total = np.zeros(2)
     for t in range(len(batch.trvs)):
         at_t = batch.at(t)
         if at_t.trvs.shape[1] >= trv_dim + 2:
             upper = log_det(at_t).item()
-            at_step = InformationBounds(upper, min(_lower_bound(at_t), upper))
+            at_step = np.array([upper, min(_lower_bound(at_t), upper)])
         if at_t.trvs.shape[1] > 0:
-            total += at_step
+            total = total + at_step
     return InformationBounds(*total.tolist())
 
 
@@ -241,8 +235,6 @@ def _lower_bound(at_t: InformationBatch) -> float:
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
     :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0
     given the encoder's inputs. It is the control variate: for a Gaussian mixture it would remove all of the noise.
-
-    :param at_t: One step, ``(1, N, ...)``.
     """
     log_density = log_density_matrix(at_t)[0].double()
     own = log_density.diagonal() - log_density.logsumexp(dim=1) + math.log(len(log_density))  # (N,)

@@ -22,15 +22,9 @@ from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import is_monitored, rollout
 from sb3_tdpg.problem import read_problem
 
-MAX_PARALLEL_EPISODES = 1_000
-"""Number of episodes run side by side; a constant, because results depend on it."""
-
-MAX_FINAL_COMPONENTS = 32
-"""Longer arrays in the last info, such as images, are not recorded."""
-
+MAX_PARALLEL_EPISODES = 1_000  # run side by side; a constant, because results depend on it
+MAX_FINAL_COMPONENTS = 32  # longer arrays in the last info, such as images, are not recorded
 COLUMNS = ("model", "scenario", "env_id", "episode", "cost", "length", "seed", "deterministic")
-"""The columns of every frame of records."""
-
 _BOOKKEEPING = frozenset({"episode", "terminal_observation", "TimeLimit.truncated"})  # of SB3, not of the environment
 
 

@@ -31,7 +31,6 @@ def aggregate_seeds(
     :return: one row for each model and scenario: ``n_seeds``, ``iqm``, ``low``, ``high``, ``min``, ``max``,
         ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
         seed), ``level``, ``seed`` and ``deterministic``
-    :raises ImportError: without rliable (``pip install sb3_tdpg[plots]``).
     """
     require_columns(records_by_seed, ["train_seed"])
     if not 0 < level < 1:
@@ -56,7 +55,6 @@ def probability_of_improvement(
     The mean is over all given scenarios: the same policy runs in all of them, so they are resampled together.
 
     :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
-    :param model: Label of the method.
     :param control: Label of the method to compare with.
     :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the probability, 0.5 for no difference, and the ends of its interval
@@ -70,15 +68,11 @@ def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, *
     """
     Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
 
-    Pairing removes the differences between seeds where both methods start from the same policy and meet the same
-    episodes.
+    Pairing removes the differences between seeds where both methods start from one policy and meet the same episodes.
 
-    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
-    :param model: Label of the method.
     :param control: Label of the method to compare with; it must have the same seeds.
     :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
-    :raises ValueError: if the seeds are not the same.
     """
     means = _seed_means(records_by_seed)
     seeds, of_control = (sorted(means[label].index) for label in (model, control))
@@ -92,9 +86,8 @@ def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarra
     """
     Compute the interquartile mean over seeds for many rows at once; see :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
 
-    :param scores: ``(seeds, rows)``
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`; each row is resampled on
-        its own.
+    :param scores: ``(seeds, rows)``; each row is resampled on its own.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the means and the ends of their intervals, each ``(rows,)``
     """
     return _bootstrap(_interquartile_mean, scores, **bootstrap)
@@ -112,10 +105,9 @@ def probabilities_of_improvement(
     """
     Estimate, row by row, the probability that a seed has a lower cost than a seed of the control; ties count half.
 
-    :param costs: ``(seeds, rows)``
+    :param costs: ``(seeds, rows)``; each row is resampled on its own.
     :param of_control: ``(seeds of the control, rows)``
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`; each row is resampled on
-        its own.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the probabilities and the ends of their intervals, each ``(rows,)``
     """
 

@@ -57,9 +57,7 @@ def comparison_markdown(
     :param scenarios: The rows, in this order. The paper's numbers are shown for models whose label is a key of
         ``scenario.paper``.
     :param quantity: Name of the numbers, for the line below the table.
-    :param digits: Number of decimals.
-    :return: the table, with our lowest and the paper's lowest number of each row in bold, and a line that says how it
-        was made
+    :return: the table with the lowest numbers of each row in bold, ours and the paper's, and a line on how it was made
     """
     over_seeds = "iqm" in summary.columns
     require_columns(summary, ["model", "scenario", *(("iqm", "low", "high") if over_seeds else ("mean", "std"))])

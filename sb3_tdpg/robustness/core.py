@@ -65,11 +65,9 @@ class Perturber:
 
     def __call__(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """
-        Perturb the next observation of each episode.
+        Perturb the next observation of each episode, and return a new array ``(n, *obs)``.
 
-        :param observations: ``(n, *obs)``; they are not changed.
         :param which: Indices of their environments, ``(n,)``; ``None``: all.
-        :return: a new array in the observation space, ``(n, *obs)``
         """
         index = slice(None) if which is None else which
         episode = {name: values[index] for name, values in self._episode.items()}  # views of all, or copies

@@ -2,8 +2,7 @@
 All perturbations, each a function of a batch of observations with its row of the registry above it.
 
 Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Lost and late
-observations (``raw``) are ``(n, *obs)`` in the units of their space. The first line of a docstring is the summary in
-the tables of the documentation and of the report.
+observations (``raw``) are ``(n, *obs)`` in the units of their space.
 
 Dimension key: n episodes side by side, C channels, H and W rows and columns, D components, K steps of delay.
 """
@@ -101,8 +100,7 @@ def occlusion(images: np.ndarray, side: float, episode: Episode, rng: np.random.
 @perturbation("image", "share of the pixels", (0.01, 0.05, 0.1, 0.2, 0.4))
 def dropped_pixels(images: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Set random pixels to the lowest value, new ones in every frame."""
-    n, _, height, width = images.shape
-    is_dead = rng.random((n, 1, height, width), dtype=np.float32) < share
+    is_dead = rng.random(images[:, :1].shape, dtype=np.float32) < share
     return np.where(is_dead, np.float32(0), images)
 
 

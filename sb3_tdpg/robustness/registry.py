@@ -36,12 +36,9 @@ class Perturbation:
     where an episode begins and returns arrays with a leading dimension of n. ``apply`` finds them in ``episode``,
     beside the time ``episode["t"]``, ``(n,)``, which is 0 at the first observation.
 
-    :param name: Name of the perturbation.
     :param kind: ``"image"`` or ``"vector"``.
     :param parameter: The quantity that the severities are values of, with its unit.
     :param severities: Five values, from the mildest to the strongest.
-    :param apply: See above.
-    :param draw: See above; ``None``: nothing is drawn for an episode.
     :param summary: The effect in a few words.
     :param channels: Permitted numbers of image channels; ``None``: any.
     :param on_depth: Whether it makes sense on depth images: floats of one channel.
@@ -97,8 +94,7 @@ class Perturbation:
         return self.objection(space, horizon) is None
 
 
-PERTURBATIONS: dict[str, Perturbation] = {}
-"""The perturbations by name; :mod:`sb3_tdpg.robustness.effects` adds those of this package."""
+PERTURBATIONS: dict[str, Perturbation] = {}  # by name, filled by :mod:`sb3_tdpg.robustness.effects`
 
 
 def register(perturbation: Perturbation) -> None:

@@ -30,7 +30,6 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> np.ndarray:
     steps. The environments must be reset afterwards. Their random generators, and a seed that waits for the first
     reset, are restored, so the next episodes are the same as without the rollout.
 
-    :param env: One environment or several, unperturbed.
     :param model: SB3 model that acts; ``None``: clipped standard Gaussian actions, as of an untrained policy.
     :return: in the shape of the observation space, float64
     """
@@ -68,7 +67,7 @@ def _observations(env: VecEnv, model: Any) -> np.ndarray:
     observe = None if normalize is None else normalize.normalize_obs
     seen: list[np.ndarray] = []
     has_ended = np.zeros(env.num_envs, dtype=bool)
-    for step in rollout(_Untrained(env.action_space) if model is None else model, env, observe=observe):
+    for step in rollout(model or _Untrained(env.action_space), env, observe=observe):
         seen += [step.next_observations] if seen else [step.observations, step.next_observations]
         has_ended |= step.dones
         if len(seen) > MAX_STEPS or (has_ended.all() and len(seen) * env.num_envs >= N_OBSERVATIONS):
