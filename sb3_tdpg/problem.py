@@ -60,12 +60,7 @@ class Problem:
 
 
 def read_problem(env: VecEnv) -> Problem:
-    """
-    Read the horizon and the state of an environment, without a step.
-
-    :raises ValueError: if it has no finite horizon, an unsuitable observation space, no state although it needs one, or
-        names that do not fit the state.
-    """
+    """Read the horizon and the state of an environment without a step; a ``ValueError`` says what it lacks."""
     if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
         raise ValueError(
             f"the observation space {env.observation_space} is not supported: use gymnasium.wrappers.FlattenObservation"
@@ -81,17 +76,15 @@ def read_problem(env: VecEnv) -> Problem:
             "attribute `horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
     state_space = _attribute(env, "state_space")
-    if state_space is not None:
-        state_dim = int(np.prod(state_space.shape))
-        return Problem(int(horizon), state_dim, state_is_observation=False, state_names=_state_names(env, state_dim))
-    observation_shape = env.observation_space.shape
-    if observation_shape is None or len(observation_shape) > 1:
+    is_observation = state_space is None
+    shape = env.observation_space.shape if is_observation else state_space.shape
+    if is_observation and (shape is None or len(shape) > 1):
         raise ValueError(
-            f"the mutual information needs the true state, and an observation of shape {observation_shape} cannot "
-            f"stand in for it: {BRING_THE_STATE}"
+            f"the mutual information needs the true state, and an observation of shape {shape} cannot stand in for it: "
+            f"{BRING_THE_STATE}"
         )
-    state_dim = max(1, int(np.prod(observation_shape)))
-    return Problem(int(horizon), state_dim, state_is_observation=True, state_names=_state_names(env, state_dim))
+    state_dim = int(np.prod(shape))
+    return Problem(int(horizon), state_dim, is_observation, _state_names(env, state_dim))
 
 
 def reward_threshold(env: VecEnv) -> float | None:

@@ -46,9 +46,7 @@ class CostDistribution(NamedTuple):
 
     def capped(self, level: float) -> tuple[CostDistribution, float]:
         """
-        Cap the cost at the lowest value of the sample that it exceeds with a probability of at most ``level``.
-
-        If the sample is too small for the level, the cap is its largest value.
+        Cap the cost at the lowest value of the sample that it exceeds with a probability of at most ``level``, if any.
 
         :return: the distribution of the capped cost, and the probability of a cost above the cap
         """
@@ -76,7 +74,6 @@ def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | No
     :param costs: ``(N,)``
     :param beta: At least 0; 0 gives the limit, the mean.
     :param probabilities: Probabilities of the costs, ``(N,)``; default: 1 / N each.
-    :raises ValueError: if a cost is not finite, or beta is negative or not finite.
     """
     costs = _checked_costs(costs)
     if not (np.isfinite(beta) and beta >= 0):
@@ -89,8 +86,7 @@ def _risk(values: np.ndarray, weights: np.ndarray, beta: float) -> float:
     mean = float(weights @ values)
     if beta == 0:
         return mean
-    # Relative to the mean, since the difference from it is of the order of beta. The rest is scipy's logsumexp without
-    # its checks, which take ten times as long as the sum.
+    # Relative to the mean: the difference from it is of the order of beta. scipy's logsumexp takes ten times as long.
     exponents = beta * (values - mean)
     largest = float(exponents.max())
     if largest < 1:  # expm1: a small difference from 1 would be rounded away
@@ -108,14 +104,11 @@ def cost_distribution(
     ``1 - confidence``, divided by the number of ranks i that are used, hold simultaneously (Bonferroni), and the step
     function through them is a lower bound on F. The missing probability at the highest cost, about
     ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. This bounds the mean of every increasing function
-    simultaneously, so the entropic risk may be optimised over beta. (It is Anderson's bound of 1969 with a band whose
-    width in the tail is :math:`N^{-1}`, not :math:`N^{-1/2}` as that of Dvoretzky, Kiefer and Wolfowitz.)
+    simultaneously, so the entropic risk may be optimised over beta.
 
     :param costs: Independent and identically distributed, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.
-    :param confidence: Probability with which the band holds; ``None``: the distribution of the sample itself, on the
-        same ranks, without allowance for the sampling error.
-    :raises ValueError: if a cost is not finite or exceeds the bound, or a confidence is given without a bound.
+    :param confidence: Probability with which the band holds; ``None``: no allowance for the sampling error.
     """
     costs = np.sort(_checked_costs(costs))
     n = len(costs)
@@ -126,10 +119,8 @@ def cost_distribution(
         check_allowance(confidence, cost_bound)
         assert cost_bound is not None
         if costs[-1] > cost_bound:
-            raise ValueError(
-                f"a cost of {costs[-1]:g} exceeds cost_bound={cost_bound:g}: give a larger bound, or certify the "
-                "clipped cost, np.minimum(costs, cost_bound)"
-            )
+            given = f"a cost of {costs[-1]:g} exceeds cost_bound={cost_bound:g}"
+            raise ValueError(f"{given}: give a larger bound, or certify the clipped cost np.minimum(costs, cost_bound)")
         below = beta_distribution.ppf((1 - confidence) / len(ranks), ranks, n + 1 - ranks)
         below, values = np.append(below, 1.0), np.append(costs[ranks - 1], cost_bound)
     return CostDistribution(values, np.diff(below, prepend=0.0), confidence)
@@ -137,15 +128,12 @@ def cost_distribution(
 
 def check_allowance(confidence: float | None, cost_bound: float | None) -> None:
     """Raise a ``ValueError`` if the confidence is not a probability, or there is no finite cost bound for it."""
-    if confidence is None:
-        return
-    if not 0 < confidence < 1:
+    if confidence is not None and not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, or be None for no allowance")
-    if cost_bound is None or not np.isfinite(cost_bound):
+    if confidence is not None and (cost_bound is None or not np.isfinite(cost_bound)):
         raise ValueError(
             f"cost_bound={cost_bound} must be finite for a confidence of {confidence}, because a rare episode could "
-            "cost anything: give an upper bound on the episode cost, or confidence=None for an estimate without "
-            "allowance for the sampling error"
+            "cost anything: give an upper bound on the episode cost, or confidence=None for an estimate"
         )
 
 
@@ -153,24 +141,21 @@ def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = N
     r"""
     Bound the mean under any distribution within ``kl`` nats: the minimum of ``risk + kl / beta`` over beta.
 
-    With :math:`s = 1 / \beta` the function is :math:`s \log \mathbb E\, e^{c / s} + s\, \mathbb D`: the perspective of
-    a convex function plus a linear one. It is convex in s and quasi-convex in log beta, so a local search finds the
-    minimum. Every beta gives a valid bound. The minimum is tight: some distribution within ``kl`` nats attains it.
+    In :math:`s = 1 / \beta` the function is convex (the perspective of a convex function plus a linear one), so a local
+    search finds the minimum. Every beta gives a valid bound; some distribution within ``kl`` nats attains the minimum.
 
-    :param distribution: From :func:`cost_distribution`.
     :param kl: D[shifted || training] in nats, or an upper bound on it; inf gives the largest cost.
     :param beta: Use this value instead of searching.
     """
     if not kl >= 0:
         raise ValueError(f"kl={kl} must be at least 0")
     values, weights, confidence = distribution
-    largest = float(values[-1])
     if beta is not None:
         if not (np.isfinite(beta) and beta > 0):
             raise ValueError(f"beta={beta} must be finite and positive, or None to search for the best one")
         risk = _risk(values, weights, beta)
         return Certificate(risk + kl / beta, beta, risk, kl, confidence)
-    width = largest - float(values[0])
+    largest, width = float(values[-1]), float(values[-1]) - float(values[0])
     if kl == 0 or width == 0:
         mean = float(weights @ values)
         return Certificate(mean, 0.0, mean, kl, confidence)
@@ -201,11 +186,9 @@ def certificate(
 
     :param costs: Costs of independent episodes in training, ``(N,)``.
     :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.
-    :param cost_bound: Upper bound on the episode cost. Costs that may be larger can be clipped,
-        ``np.minimum(costs, cost_bound)``, to certify the clipped cost.
+    :param cost_bound: Upper bound on the episode cost.
     :param confidence: Confidence of the bound; ``None``: an estimate without allowance for the sampling error.
     :param beta: Use this value instead of the best one.
-    :raises ValueError: see :func:`cost_distribution` and :func:`worst_mean`.
     """
     return worst_mean(cost_distribution(costs, cost_bound, confidence), kl, beta)
 
@@ -216,8 +199,7 @@ def _ranks(n: int) -> np.ndarray:
     if n > _HIGHEST:
         n_steps = math.ceil(math.log(n / (2 * _HIGHEST) + 1) / math.log(_RANK_FACTOR))
         from_top += [_HIGHEST * _RANK_FACTOR ** np.arange(n_steps), np.linspace(n / 2, n - 1, 100)]
-    ranks = n - np.unique(np.concatenate(from_top).astype(np.int64).clip(0, n - 1))
-    return ranks[::-1]
+    return n - np.unique(np.concatenate(from_top).astype(np.int64).clip(0, n - 1))[::-1]
 
 
 def _checked_costs(costs: np.ndarray) -> np.ndarray:

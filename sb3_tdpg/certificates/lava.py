@@ -22,7 +22,7 @@ from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit
-from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, _legend_above, _log_axis, _new_figure, _tidy
+from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, legend_above, log_axis, new_figure, tidy
 from sb3_tdpg.tdpg import TDPG
 
 if TYPE_CHECKING:
@@ -221,7 +221,7 @@ def _theorem_table(theorem: pd.DataFrame, random: pd.DataFrame) -> str:
 
 def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float) -> Figure:
     """Draw the bound over the cost, and both over the size of the shift, from ``random.csv`` and ``paper.csv``."""
-    figure = _new_figure(WIDTH, 4.0)
+    figure = new_figure(WIDTH, 4.0)
     against_cost, against_size = figure.subplots(1, 2, sharey=True)
     for color, label in zip(cycle(PALETTE), random["model"].unique(), strict=False):
         group = random[random["model"] == label]
@@ -241,11 +241,11 @@ def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float
     for axes in (against_cost, against_size):
         axes.axhline(trivial, color=INK, linestyle=(0, (4, 3)), linewidth=1)
         axes.grid(alpha=0.25)
-        _tidy(axes)
-    _log_axis(against_cost, "x", subs=(1, 3))
-    _log_axis(against_cost, "y", subs=(1, 2, 5))
+        tidy(axes)
+    log_axis(against_cost, "x", subs=(1, 3))
+    log_axis(against_cost, "y", subs=(1, 2, 5))
     against_size.set_xscale("log")
     against_cost.set(xlabel="mean cost in the shifted environment", ylabel="certified upper bound (dashed: trivial)")
     against_size.set_xlabel("divergence of sensor and start (nat); crosses: cost")
-    _legend_above(figure, against_cost)
+    legend_above(figure, against_cost)
     return figure

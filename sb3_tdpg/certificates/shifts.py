@@ -14,6 +14,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,8 +40,7 @@ from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
 INFORMATION_EPISODES = 4_000  # for the bound on the information
-EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Shares of the episodes whose divergence is capped; the best level is chosen afterwards."""
+EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of the episodes with a capped divergence to try
 
 _START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
 
@@ -93,9 +93,9 @@ class RecordedEpisodes(NamedTuple):
 
     def first(self, n: int | None) -> RecordedEpisodes:
         """Return the first n of them."""
-        costs, states, prev_trvs, noise, densities, seed = self
-        first = [Normal(density.mean[:n], density.stddev[:n]) for density in densities]
-        return RecordedEpisodes(costs[:n], states[:, :n], prev_trvs[:, :n], noise[:n], first, seed)
+        densities = [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities]
+        arrays = (self.costs[:n], self.states[:, :n], self.prev_trvs[:, :n], self.last_trv_noise[:n])
+        return RecordedEpisodes(*arrays, densities, self.seed)
 
 
 def gaussian_kl(bias: np.ndarray, std: float, training_std: float) -> float:
@@ -121,11 +121,7 @@ def lava_shift(
     start_beta: Sequence[float] | None = None,
     training_noise_std: float = 0.01,
 ) -> Shift:
-    """
-    Declare a shift of the lava problem; see :class:`~sb3_tdpg.envs.lava.LavaEnv` for the keywords.
-
-    The divergences are from a training with a uniform start, no bias, and ``training_noise_std`` as sensor noise.
-    """
+    """Declare a shift of the lava problem from a uniform start, no bias and the sensor noise of the training."""
     noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
     bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
     given = dict(sensor_noise_std=sensor_noise_std, sensor_bias=sensor_bias, start_beta=start_beta)
@@ -147,27 +143,20 @@ def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.0
     random = np.random.default_rng(seed)
     shifts: list[Shift] = []
     while len(shifts) < n:
-        has_noise, has_bias, has_start = random.random(3) < 0.5
-        noise, length = 10.0 ** random.uniform((-3.0, -3.0), (0.0, 0.0))
+        is_changed = random.random(3) < 0.5
+        noise, length = (10.0 ** random.uniform((-3.0, -3.0), (0.0, 0.0))).tolist()
         angle = random.uniform(0, 2 * math.pi)
-        start = 2.0 ** random.uniform(-1, 1, 2)
-        if has_noise or has_bias or has_start:
-            shift = lava_shift(
-                f"shift {len(shifts)}",
-                sensor_noise_std=float(noise) if has_noise else None,
-                sensor_bias=(float(length * math.cos(angle)), float(length * math.sin(angle))) if has_bias else None,
-                start_beta=(float(start[0]), float(start[1])) if has_start else None,
-                training_noise_std=training_noise_std,
-            )
-            shifts.append(shift)
+        bias = (length * math.cos(angle), length * math.sin(angle))
+        start = tuple((2.0 ** random.uniform(-1, 1, 2)).tolist())
+        values: dict[str, Any] = dict(sensor_noise_std=noise, sensor_bias=bias, start_beta=start)
+        if changes := dict(compress(values.items(), is_changed)):
+            shifts.append(lava_shift(f"shift {len(shifts)}", **changes, training_noise_std=training_noise_std))
     return shifts
 
 
 class TrainingEpisodes:
     """
-    Recorded training episodes of a policy, from which certificates are computed.
-
-    A certificate runs no episode in the shifted environment: its sensor only observes the recorded states.
+    Recorded training episodes of a policy; the sensor of a shifted environment only observes their states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
     :param scenario: The training environment, one of this plugin.
@@ -178,8 +167,7 @@ class TrainingEpisodes:
     :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
         error probability is spent on the distribution of the cost, half on the divergence.
     :param seed: Seed of the episodes.
-    :raises ValueError: if the environment is not of this plugin, the model's environment normalises, or a number is
-        invalid; no episode has been run by then.
+    :raises ValueError: before any episode, if the environment or the model's is unsuitable, or a number is invalid.
     """
 
     def __init__(
@@ -194,10 +182,8 @@ class TrainingEpisodes:
         seed: int = 0,
     ) -> None:
         if not 1 <= n_budget_episodes <= min(n_episodes, EPISODES_AT_A_TIME):
-            raise ValueError(
-                f"n_budget_episodes={n_budget_episodes} must be at least 1 and at most n_episodes={n_episodes} and "
-                f"{EPISODES_AT_A_TIME}"
-            )
+            most = f"at most n_episodes={n_episodes} and {EPISODES_AT_A_TIME}"
+            raise ValueError(f"n_budget_episodes={n_budget_episodes} must be at least 1 and {most}")
         check_allowance(confidence, cost_bound)
         self.model, self.scenario, self.seed = model, scenario, seed
         self._env = _pomdp(model, scenario)
@@ -230,15 +216,13 @@ class TrainingEpisodes:
 
     def divergences(self, shift: Shift, n_episodes: int | None = None) -> np.ndarray:
         """
-        Compute the divergence at each step of each recorded episode, given the noise that couples the two sensors.
+        Compute the divergence at each step of the first recorded episodes, given the noise that couples the sensors.
 
-        :param shift: A shift of the sensor.
-        :param n_episodes: Number of the first recorded episodes to use; default: all.
         :return: ``(T + 1, N)``: for each step D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] of the TRVs in
             nats, and in the last row the divergence of the last actions
         """
         recorded = self.recorded.first(n_episodes)
-        shifted = encode(self.model, _pomdp(self.model, self._shifted(shift)), recorded)
+        shifted = encode(self.model, self._shifted(shift), recorded)
         return _divergences(shifted, recorded.densities)
 
     def budgets(self, shift: Shift, n_episodes: int | None = None) -> list[Budget]:
@@ -246,11 +230,8 @@ class TrainingEpisodes:
         Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
 
         The mean of a step's divergence under the *shifted* distribution is at most its worst mean within the divergence
-        of the steps before. The divergence of a step is capped: where it is larger, the bound assumes that the step is
-        not shifted and that the episode has the largest cost.
+        of the steps before. Where it exceeds a cap, the bound assumes an unshifted step and the largest episode cost.
 
-        :param shift: A shift of sensor and start.
-        :param n_episodes: Number of the first recorded episodes to use; default: all.
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
         divergences = self.divergences(shift, n_episodes)
@@ -264,49 +245,34 @@ class TrainingEpisodes:
 
         The certificates through the TRVs and through the sensor hold simultaneously, so the lowest is valid.
 
-        :param shift: A shift of sensor and start.
         :param n_episodes: Number of the first recorded episodes to use for the divergence of the TRVs; default: all.
         """
-        trivial = self.cost_bound
-        candidates = [
-            (worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl).bound, budget)
-            for budget in self.budgets(shift, n_episodes)
-        ]
-        through_trvs, budget = min(candidates, key=lambda candidate: candidate[0])
+
+        def bound_through_trvs(budget: Budget) -> float:
+            return worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl).bound
+
+        budget = min(self.budgets(shift, n_episodes), key=bound_through_trvs)
         sensor_kl = shift.start_kl + len(self.recorded.states) * shift.sensor_kl
-        through_sensor = worst_mean(self.distribution, sensor_kl).bound
-        bound = min(through_trvs, through_sensor, trivial)
-        return ShiftCertificate(bound, through_trvs, through_sensor, trivial, budget, sensor_kl)
+        bounds = (bound_through_trvs(budget), worst_mean(self.distribution, sensor_kl).bound, self.cost_bound)
+        return ShiftCertificate(min(bounds), *bounds, budget, sensor_kl)
 
     def fixed_beta(self, beta: float, information: float) -> Certificate:
-        """
-        Apply the corrected Theorem II.1 at a fixed beta, with the budget ``beta * information``.
-
-        :param information: Upper bound on the sum over t of I[x_t; x~_t] in nats.
-        """
+        """Apply the corrected Theorem II.1 at a fixed beta, with an upper bound on the information in nats."""
         return worst_mean(self.distribution, beta * information, beta)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
-        """
-        Run the shifted environment, to compare a certificate with it.
-
-        :return: the costs of the episodes, ``(N,)``, and the mean divergence of TRVs and start along them, which the
-            budget bounds
-        """
-        shifted = record_episodes(self.model, _pomdp(self.model, self._shifted(shift)), n_episodes, (seed, _TEST))
+        """Run the shifted environment; return the costs, ``(N,)``, and the mean divergence, which the budget bounds."""
+        shifted = record_episodes(self.model, self._shifted(shift), n_episodes, (seed, _TEST))
         by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
         return shifted.costs, shift.start_kl + float(by_step[:-2].sum() + by_step[-2:].min())
 
-    def _shifted(self, shift: Shift) -> Scenario:
-        return Scenario(shift.name, self.scenario.env_id, {**self.scenario.env_kwargs, **shift.env_kwargs})
+    def _shifted(self, shift: Shift) -> POMDPEnv:
+        kwargs = {**self.scenario.env_kwargs, **shift.env_kwargs}
+        return _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
 
 
 def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
-    """
-    Run n episodes with sensor noise that :func:`encode` can draw again.
-
-    A loop of its own over the methods of the POMDP: start, sensor, dynamics and policy have separate random streams.
-    """
+    """Run n episodes whose start, sensor, dynamics and policy have separate random streams, for :func:`encode`."""
     env.np_random = np.random.default_rng([*seed, _START])
     state, costs = env._initial_state(n), np.zeros(n)
     trv = th.zeros(n, model.policy.trv_dim, device=model.device)
@@ -330,10 +296,7 @@ def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) ->
 
 def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal]:
     """
-    Encode the recorded states as the sensor of another environment observes them.
-
-    The sensor draws the same random numbers as in the episodes, which couples the observations; the noise of the last
-    TRVs is the same, too.
+    Encode the recorded states as the sensor of another environment observes them, with the same random numbers.
 
     :return: the densities of the TRVs at each step, and of the last actions
     """
@@ -350,17 +313,15 @@ def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal
 
 
 def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
-    density = policy.action_density(trvs, np.full(len(trvs), policy.horizon - 1)).distribution
-    return Normal(density.mean, density.stddev)
+    return policy.action_density(trvs, np.full(len(trvs), policy.horizon - 1)).distribution
 
 
 def _information(recorded: RecordedEpisodes) -> float:
     """Compute the log-det bound, an upper bound on the sum over t of I[x_t; x~_t]."""
     n_episodes, trv_dim = recorded.last_trv_noise.shape
     if n_episodes < trv_dim + 2:
-        raise ValueError(
-            f"n_episodes={n_episodes} must be at least {trv_dim + 2}, to estimate the information of {trv_dim} TRVs"
-        )
+        least = f"at least {trv_dim + 2}, to estimate the information of {trv_dim} TRVs"
+        raise ValueError(f"n_episodes={n_episodes} must be {least}")
     means, stds = (th.stack([getattr(d, name) for d in recorded.densities[:-1]]).cpu() for name in ("mean", "stddev"))
     last = means[-1] + stds[-1] * recorded.last_trv_noise.cpu()
     trvs = th.cat([recorded.prev_trvs[1:].cpu(), last[None]])
@@ -371,11 +332,8 @@ def _information(recorded: RecordedEpisodes) -> float:
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
     # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
-    def double(density: Normal) -> Normal:
-        return Normal(density.mean.double(), density.stddev.double())
-
-    pairs = ((double(p), double(q)) for p, q in zip(shifted, training, strict=True))
-    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in pairs])
+    double = [[Normal(d.mean.double(), d.stddev.double()) for d in densities] for densities in (shifted, training)]
+    return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in zip(*double, strict=True)])
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
@@ -397,8 +355,5 @@ def _pomdp(model: Any, scenario: Scenario) -> POMDPEnv:
         raise ValueError("the model's environment normalises observations (VecNormalize), which is not supported here")
     env = scenario_env(scenario, model, n_episodes=1, n_envs=1).unwrapped
     if not isinstance(env, BatchedVecEnv):
-        raise ValueError(
-            f"{scenario.env_id} is not an environment of this plugin: a certificate needs the methods of a POMDPEnv, "
-            "to observe recorded states with the shifted sensor"
-        )
+        raise ValueError(f"{scenario.env_id} is not an environment of this plugin: a certificate needs a POMDPEnv")
     return env.env

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from sb3_tdpg.common.files import replaced_atomically
-from sb3_tdpg.evaluation.figures import INK, PALETTE
+from sb3_tdpg.evaluation.figures import INK, PALETTE, tidy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,11 +48,7 @@ class Episode(NamedTuple):
 
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
-    """
-    Check that a video can be written to a path, before any episode is run.
-
-    :raises ValueError: if the file extension is unknown, or matplotlib or ffmpeg is missing.
-    """
+    """Raise a ``ValueError`` if the file extension is unknown, or matplotlib or ffmpeg is missing."""
     ending = Path(path).suffix
     if ending not in (".gif", ".mp4"):
         raise ValueError(f"{path}: the extension {ending!r} is not a video format: use .gif or .mp4")
@@ -61,10 +57,7 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
     except ImportError as e:
         raise ValueError("a video needs matplotlib: pip install sb3_tdpg[plots]") from e
     if ending == ".mp4" and _ffmpeg() is None:
-        raise ValueError(
-            f"{path}: writing an .mp4 needs ffmpeg, which is not installed: install it, pip install imageio-ffmpeg, "
-            "or use .gif"
-        )
+        raise ValueError(f"{path}: an .mp4 needs ffmpeg: install it, pip install imageio-ffmpeg, or use .gif")
 
 
 def _ffmpeg() -> str | None:
@@ -83,16 +76,13 @@ def _ffmpeg() -> str | None:
 
 def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float) -> None:
     """
-    Write episodes as a video, one after the other.
-
-    The time axis always reaches to the horizon, and all episodes share the limits of the TRVs, so only the lines move.
-    The last frame of each episode stays for about a second.
+    Write episodes as a video, one after the other; the last frame of each stays for about a second.
 
     :param episodes: Episodes with pictures of the same size.
     :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
     :param horizon: Number of controls T in an episode.
     :param fps: Frames per second; a GIF is timed in hundredths of a second.
-    :raises ValueError: if the video cannot be written there, see ``check_animation_path``.
+    :raises ValueError: if the video cannot be written there.
     """
     check_animation_path(path)
     path = Path(path)
@@ -113,29 +103,22 @@ class _Video:
         height, width = episodes[0].pictures[0].shape[:2]
         self._factor = -(-MIN_WIDTH // width)
         height, width = self._factor * height, self._factor * width
-        self.figure: Figure = Figure(figsize=(width / DPI, (height + PANEL_HEIGHT) / DPI), dpi=DPI)
+        total = height + PANEL_HEIGHT
+        self.figure: Figure = Figure(figsize=(width / DPI, total / DPI), dpi=DPI)
         self.canvas = FigureCanvasAgg(self.figure)
         # Pixel by pixel: the picture in axes would be resampled.
         self._picture = self.figure.figimage(self._enlarged(episodes[0].pictures[0]), xo=0, yo=PANEL_HEIGHT)
-        self._axes = self.figure.add_axes((
-            LEFT / width,
-            BOTTOM / (height + PANEL_HEIGHT),
-            (width - LEFT - RIGHT) / width,
-            (PANEL_HEIGHT - TOP - BOTTOM) / (height + PANEL_HEIGHT),
+        self._axes = axes = self.figure.add_axes((
+            LEFT / width, BOTTOM / total, (width - LEFT - RIGHT) / width, (PANEL_HEIGHT - TOP - BOTTOM) / total
         ))  # fmt: skip
-        self._draw_axes(horizon)
-
-    def _draw_axes(self, horizon: int) -> None:
-        axes = self._axes
-        trvs = np.concatenate([episode.trvs for episode in self.episodes])
+        # All frames share the limits, so only the lines move.
+        trvs = np.concatenate([episode.trvs for episode in episodes])
         low, high = float(trvs.min()), float(trvs.max())
         margin = 0.05 * (high - low) or 1.0
-        axes.set_xlim(0, horizon)
-        axes.set_ylim(low - margin, high + margin)
+        axes.set(xlim=(0, horizon), ylim=(low - margin, high + margin))
         axes.locator_params(axis="x", integer=True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
         axes.grid(alpha=0.25)
+        tidy(axes)
         axes.set_xlabel("time step $t$", fontsize=9)
         axes.set_ylabel(r"TRVs $\tilde{x}_t$", fontsize=9)
         self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
@@ -178,10 +161,8 @@ def _write_gif(video: _Video, path: Path, fps: float) -> None:
     images, durations = [], []
     for is_last in video.frames():
         images.append(video.image())
-        # In ms; players show frames of less than 20 ms more slowly.
-        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))
-    # One palette for all frames, because a palette for each frame flickers. MAXCOVERAGE keeps the colours of small
-    # objects; the k-means step then moves the palette towards the colours of large ones.
+        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; less is shown more slowly
+    # One palette for all frames, or they flicker. MAXCOVERAGE keeps small objects' colours, k-means serves large ones.
     sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
     palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]

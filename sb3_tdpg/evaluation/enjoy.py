@@ -40,25 +40,25 @@ def enjoy(
     :param seed: Seed of the environment and of the policy's sampling.
     :param n_episodes: Number of episodes.
     :param deterministic: Act without noise, which changes the policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param record: Write a video of the environment's pictures and the TRVs there, ``.gif`` or ``.mp4``. If the
-        environment has a method ``film``, it returns the pictures between two steps.
+    :param record: Write a video there, ``.gif`` or ``.mp4``. A method ``film`` of the environment returns the pictures
+        between two steps.
     :return: the episodes; without ``record`` they have no pictures
     :raises ValueError: if there is no model, it does not fit the environment, or a video cannot be made.
     """
-    if record is not None:
-        check_animation_path(record)
-    model = _load(model_path)
     env_kwargs = dict(env_kwargs or {})
     if record is not None:
+        check_animation_path(record)
         env_kwargs.setdefault("render_mode", "rgb_array")
+    try:
+        model = TDPG.load(Path(model_path))
+    except OSError as e:
+        raise ValueError(f"{model_path} cannot be read ({e.strerror}): give the .zip file of model.save()") from e
     check_models_fit({str(model_path): model}, [Scenario("enjoy", env_id, env_kwargs)])
     env = gym.make(env_id, **env_kwargs)
     fps = env.metadata.get("render_fps", 10)
     with contextlib.closing(DummyVecEnv([lambda: _Recorder(env, record is not None)])) as vec_env:
         if record is not None and env.render_mode != "rgb_array":
-            raise ValueError(
-                f"{env_id} with render_mode={env.render_mode!r} renders no pictures to record: it needs 'rgb_array'"
-            )
+            raise ValueError(f"{env_id} needs render_mode='rgb_array' to be recorded, not {env.render_mode!r}")
         episodes: list[Episode] = []
         trvs: list[np.ndarray] = []
         for step in rollout(model, vec_env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic):
@@ -107,9 +107,7 @@ class _Recorder(gym.Wrapper):
     def _picture(self) -> np.ndarray:
         picture = self.env.render()
         if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
-            raise ValueError(
-                f"render() of {self.env} returned no picture: it must return an array (height, width, 3) of uint8"
-            )
+            raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
         return picture
 
 
@@ -131,7 +129,7 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
             keywords[key] = _plain(yaml.safe_load(value))
         except (yaml.YAMLError, TypeError) as e:
             raise ValueError(
-                f"{text!r}: the value must be a number, a text, true, false, null or a list of these, like [-1, 0.5]"
+                f"{text!r}: the value must be a number, a text, true, false, null or a list of these"
             ) from e
     return keywords
 
@@ -146,10 +144,3 @@ def _plain(value: Any) -> Any:
     if not isinstance(value, (str, bool, int, float, type(None))):
         raise TypeError(f"{value!r} is a {type(value).__name__}")
     return value
-
-
-def _load(path: str | os.PathLike[str]) -> TDPG:
-    try:
-        return TDPG.load(Path(path))
-    except OSError as e:
-        raise ValueError(f"{path} cannot be read ({e.strerror}): give the .zip file that model.save() wrote") from e

@@ -15,36 +15,30 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
 from sb3_tdpg.vec_env import make_episodes_env
 
+EnvWrapper = Callable[[VecEnv], VecEnv]  # for instance a perturbation
+
 
 def scenario_env(
-    scenario: Scenario,
-    model: Any,
-    *,
-    n_episodes: int,
-    n_envs: int | None = None,
-    sensor: Callable[[VecEnv], VecEnv] | None = None,
+    scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int | None = None, sensor: EnvWrapper | None = None
 ) -> VecEnv:
     """
     Make a new environment of a scenario, wrapped as the model needs it.
 
-    :param scenario: Id and keywords of the environment.
     :param model: An SB3 model. If its own environment normalises observations (``VecNormalize``), the new one does so
         with the same statistics, frozen.
     :param n_episodes: Number of episodes to run at a time.
     :param n_envs: Number of environments; default: see :func:`~sb3_tdpg.vec_env.make_episodes_env`.
-    :param sensor: A wrapper to put inside the model's own wrappers, for instance a perturbation.
+    :param sensor: A wrapper to put around the environment, inside those of the model.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
     )
     if sensor is not None:
         env = sensor(env)
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None:
-        normalize = copy.copy(normalize)  # its copy comes without an environment
+    if (normalize := model.get_vec_normalize_env()) is not None:
+        normalize = copy.copy(normalize)  # without an environment
         normalize.set_venv(env)
-        normalize.training = False
-        normalize.norm_reward = False
+        normalize.training = normalize.norm_reward = False
         env = normalize
     space = env.observation_space
     if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
@@ -53,11 +47,7 @@ def scenario_env(
 
 
 def check_models_fit(models: Mapping[str, Any], scenarios: Sequence[Scenario]) -> None:
-    """
-    Check every model against an environment of each scenario, before any episode is run.
-
-    :raises ValueError: if an environment cannot be made, or its spaces or horizon differ from the model's.
-    """
+    """Raise a ``ValueError`` if an environment cannot be made, or its spaces or horizon differ from a model's."""
     for scenario in scenarios:
         name = f"scenario {scenario.name!r} ({scenario.env_id})"
         for label, model in models.items():
@@ -70,11 +60,7 @@ def check_models_fit(models: Mapping[str, Any], scenarios: Sequence[Scenario]) -
 
 
 def check_env_fits(model: Any, env: VecEnv, model_name: str = "the model", env_name: str = "the environment") -> None:
-    """
-    Check that an environment has the spaces and the horizon that a model was trained with.
-
-    :raises ValueError: if it has not.
-    """
+    """Raise a ``ValueError`` unless an environment has the spaces and the horizon that a model was trained with."""
     where = f"{model_name} does not fit {env_name}"
     for name in ("observation_space", "action_space"):
         expected, given = getattr(model, name, None), getattr(env, name)

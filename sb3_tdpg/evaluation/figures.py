@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -35,7 +35,7 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
 
     :param progress: Log of SB3's CSV logger by label: ``pandas.read_csv("progress.csv")``.
     """
-    figure = _new_figure(WIDTH, 2.8)
+    figure = new_figure(WIDTH, 2.8)
     cost, information = (figure.add_subplot(1, 2, i) for i in (1, 2))
     for color, (label, frame) in zip(cycle(PALETTE), progress.items(), strict=False):
         epochs = frame["time/iterations"]
@@ -43,14 +43,14 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
         if "mi/total" in frame:
             information.plot(epochs, frame["mi/total"], color=color, label=label)
     if all((frame["rollout/ep_cost_mean"] > 0).all() for frame in progress.values()):
-        _log_axis(cost, "y", subs=(1, 2, 5))
+        log_axis(cost, "y", subs=(1, 2, 5))
     cost.set_ylabel("mean episode cost", fontsize=9)
     information.set_ylabel(r"$I[x_t; \tilde{x}_t]$, summed over $t$ (nat)", fontsize=9)
     for axes in (cost, information):
         axes.set_xlabel("policy epoch", fontsize=9)
         axes.grid(alpha=0.25)
-        _tidy(axes)
-    _legend_above(figure, cost)
+        tidy(axes)
+    legend_above(figure, cost)
     return figure
 
 
@@ -60,14 +60,13 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
 
     :param frame: From :func:`~sb3_tdpg.evaluation.interval_frame`.
     """
-    figure = _new_figure(WIDTH * 0.75, 3.4)
+    figure = new_figure(WIDTH * 0.75, 3.4)
     axes = figure.add_subplot()
-    _tidy(axes)
+    tidy(axes)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
     axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
     axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # visible also with one step
-    axes.plot(t, lower, color=PALETTE[1], linewidth=0.8)
-    axes.plot(t, upper, color=PALETTE[1], linewidth=0.8)
+    axes.plot(t, frame[["lower", "upper"]], color=PALETTE[1], linewidth=0.8)
     for limit, markers in BOUNDS.items():
         for name, (marker, label) in markers.items():
             rows = frame[frame[f"{limit}_name"] == name]
@@ -77,32 +76,31 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     if upper.max() > 0.7 * cap:
         axes.axhline(cap, color=INK, linestyle=(0, (4, 3)), linewidth=1, label=r"$\ln N$: lower limits fall behind")
     axes.set_ylim(bottom=0, top=max(1.05 * upper.max(), 0.1))
-    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
+    axes.xaxis.set_major_locator(import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
     axes.set_xlabel("time step $t$", fontsize=9)
     axes.set_ylabel(r"$I[x_t; \tilde{x}_t]$ (nat)", fontsize=9)
-    _legend_above(figure, axes)
+    legend_above(figure, axes)
     return figure
 
 
-def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats") -> Figure:
+def knowledge_map(frame: pd.DataFrame) -> Figure:
     """
     Draw the information in the TRVs about each component of the state at each time step, as a heat map.
 
     Constant components are grey. Values in brackets are not distinguishable from 0.
 
     :param frame: From :func:`~sb3_tdpg.evaluation.state_knowledge`.
-    :param quantity: The column to show.
     :raises ValueError: if the frame has no component.
     """
     if len(frame) == 0:
         raise ValueError("the frame has no component: every one is constant, or too few episodes are alive")
     components = frame["component"].unique()
     table = frame.pivot(index="component", columns="t").loc[components]
-    values, lower = table[quantity].to_numpy(), table["nats_lower"].to_numpy()  # (X, T) each
+    values, lower = table["nats"].to_numpy(), table["nats_lower"].to_numpy()  # (X, T) each
     n_rows, n_columns = values.shape
-    figure = _new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 10.0), 1.3 + 0.5 * n_rows)
+    figure = new_figure(min(max(3.0 + 0.6 * n_columns, 4.5), 10.0), 1.3 + 0.5 * n_rows)
     axes = figure.add_subplot()
-    top = 1.0 if quantity == "r2" else max(float(np.nanmax(values)), 0.1)
+    top = max(float(np.nanmax(values)), 0.1)
     axes.set_facecolor("#DDDDDD")
     image = axes.imshow(values, cmap="viridis", vmin=0, vmax=top, aspect="auto")
     for row, column in np.ndindex(values.shape) if n_columns <= MAX_ANNOTATED_STEPS else ():
@@ -112,23 +110,24 @@ def knowledge_map(frame: pd.DataFrame, quantity: Literal["nats", "r2"] = "nats")
             text = f"{value:.2f}" if lower[row, column] > 0 else f"({value:.2f})"
             axes.text(column, row, text, color=color, fontsize=8, ha="center", va="center")
     axes.set_yticks(range(n_rows), components, fontsize=9)
-    axes.xaxis.set_major_locator(_import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
+    axes.xaxis.set_major_locator(import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
     axes.tick_params(labelsize=8, length=0)
     axes.set_xlabel("time step $t$", fontsize=9)
     axes.spines[:].set_visible(False)
     bar = figure.colorbar(image, pad=0.02)
-    bar.set_label(r"$I[x^k_t; \tilde{x}_t]$ (nat), at least" if quantity == "nats" else "$R^2$", fontsize=9)
+    bar.set_label(r"$I[x^k_t; \tilde{x}_t]$ (nat), at least", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return figure
 
 
-def _short(row: str) -> str:
+def short_name(row: str) -> str:
     """Shorten the name of a row for a tick label: "Sensor noise 0.10" -> "0.10"."""
     last = row.rsplit(" ", 1)[-1]
     return last if last[0].isdigit() else "0" if row == "Training" else row
 
 
-def _legend_above(figure: Figure, axes: Axes) -> None:
+def legend_above(figure: Figure, axes: Axes) -> None:
+    """Draw the legend of the axes above the figure."""
     handles, labels = axes.get_legend_handles_labels()
     columns = -(-len(labels) // -(-len(labels) // 3))  # as few rows as possible with up to three columns, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
@@ -148,28 +147,29 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) ->
         figure.savefig(partial, format=path.suffix.lstrip("."), dpi=dpi)
 
 
-def _new_figure(width: float, height: float) -> Figure:
-    return _import_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure with a constrained layout; the size is in inches."""
+    return import_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
-def _log_axis(axes: Axes, which: str, subs: tuple[int, ...]) -> None:
+def log_axis(axes: Axes, which: str, subs: tuple[int, ...]) -> None:
     """Make an axis logarithmic, with the ticks (10, 30, 100, ...) as plain numbers."""
     axes.set(**{f"{which}scale": "log"})
     axis = getattr(axes, f"{which}axis")
-    axis.set_major_locator(_import_matplotlib().ticker.LogLocator(subs=subs))
+    axis.set_major_locator(import_matplotlib().ticker.LogLocator(subs=subs))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter("")
 
 
-def _tidy(axes: Axes) -> None:
+def tidy(axes: Axes) -> None:
+    """Remove the spines at the top and at the right, and make the tick labels small."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
 
 
-def _import_matplotlib() -> Any:
+def import_matplotlib() -> Any:
+    """Import Matplotlib, which is an optional dependency."""
     try:
-        import matplotlib.cm
-        import matplotlib.colors
         import matplotlib.figure
         import matplotlib.ticker
     except ImportError as e:

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TINY = 1e-30
-ESTIMATES = ("interval", "knowledge", "checks")
-"""The three parts of :func:`information_report`, in this order."""
+ESTIMATES = ("interval", "knowledge", "checks")  # the parts of an information report, in this order
 
 
 class EncodedEpisodes(NamedTuple):
@@ -105,14 +104,19 @@ def information_report(
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
     :param names: Names of the components of the state; default: the environment's ``state_names``, or ``x0``, ...
     :param at_end: Called at the end of each of the three ``ESTIMATES``.
-    :raises ValueError: if model and environment do not fit, there are too few episodes for an interval at any time
-        step, or the names do not fit.
+    :raises ValueError: if model, environment or names do not fit, or there are too few episodes for an interval.
     """
     if not isinstance(model.policy, TRVPolicy):
         raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: pass a TDPG model")
     check_env_fits(model, env)
     names = read_problem(env).state_names if names is None else names
-    batch, costs = _encode_in_rounds(model, env, n_episodes, seed)
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes={n_episodes} must be at least 1")
+    n_rounds = -(-n_episodes // env.num_envs)
+    seeds = [seed, *np.random.SeedSequence([seed, n_rounds]).generate_state(n_rounds)[1:].tolist()]
+    batches, costs = zip(*(encode_episodes(model, env, seed=each) for each in seeds), strict=True)
+    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*batches, strict=True)))
+    batch = batch.select(th.arange(n_episodes))
     at_end = at_end or (lambda: None)
     interval = information_interval(batch, seed=seed)
     at_end()
@@ -120,13 +124,11 @@ def information_report(
     at_end()
     badge = trust_checks(batch, interval, seed=seed)
     at_end()
-    return InformationReport(interval, known, badge, costs)
+    return InformationReport(interval, known, badge, np.concatenate(costs)[:n_episodes])
 
 
 @threads(1)
-def state_knowledge(
-    batch: InformationBatch, names: Sequence[str] | None = None, *, confidence: float = 0.95, seed: int = 0
-) -> pd.DataFrame:
+def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None, *, seed: int = 0) -> pd.DataFrame:
     """
     Estimate what the TRVs know about each component of the state at each time step.
 
@@ -134,19 +136,16 @@ def state_knowledge(
 
     :param batch: Rollouts ``(T, N, ...)``, for instance of :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
     :param names: Names of the X components; default: ``x0``, ``x1``, ...
-    :param confidence: Confidence of the lower limit, which is one-sided.
-    :param seed: Seed of the division into halves and of the encoder's noise.
     :return: A row for each time step and component, with the columns ``t``, ``component``, ``nats`` (a lower bound on
-        I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit, clipped at 0) and ``r2`` (of a
+        I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit of 95 %, clipped at 0) and ``r2`` (of a
         leave-one-out regression of the component on the TRVs, clipped at 0). NaN where a component is constant and
         where too few episodes are alive. Components that are constant at all time steps are left out.
-    :raises ValueError: if the number of names is wrong, or the batch is unfit for an interval.
     """
     horizon, _, n_components = batch.states.shape
     names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
     if len(names) != n_components:
         raise ValueError(f"names={names} must have a name for each of the {n_components} components of the state")
-    nats, limits = component_estimates(batch, confidence=confidence, seed=seed)
+    nats, limits = component_estimates(batch, seed=seed)
     r2 = np.full_like(nats, np.nan)
     for t in range(horizon):
         known = np.isfinite(nats[t])
@@ -171,22 +170,9 @@ def interval_frame(interval: InformationInterval) -> pd.DataFrame:
     they come from, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``, ``marginal``) and
     ``n_episodes``.
     """
-    limits = dict(lower=interval.lower, upper=interval.upper)
-    names = dict(lower_name=interval.lower_name, upper_name=interval.upper_name)
+    columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
     t = np.arange(len(interval.lower))
-    return pd.DataFrame(dict(t=t, **limits, **names, **interval.estimates, n_episodes=interval.n_episodes))
-
-
-def _encode_in_rounds(model: Any, env: VecEnv, n_episodes: int, seed: int) -> EncodedEpisodes:
-    """Run :func:`encode_episodes` until there are enough episodes, with another seed in each round."""
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes} must be at least 1")
-    n_rounds = -(-n_episodes // env.num_envs)
-    seeds = [seed, *np.random.SeedSequence([seed, n_rounds]).generate_state(n_rounds)[1:].tolist()]
-    rounds = [encode_episodes(model, env, seed=each) for each in seeds]
-    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*(each.batch for each in rounds), strict=True)))
-    costs = np.concatenate([each.costs for each in rounds])
-    return EncodedEpisodes(batch.select(th.arange(n_episodes)), costs[:n_episodes])
+    return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
 
 def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisodes:
@@ -195,7 +181,6 @@ def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisode
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
     :param env: N environments.
-    :param seed: Seed of the environments and of the policy's sampling.
     """
     problem = read_problem(env)
     steps, costs = [], np.zeros(env.num_envs)
@@ -220,14 +205,10 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     Bound the information of a batch, summed over time.
 
     A step with too few live episodes for an estimate counts as much as the last step with enough. If it counted as 0,
-    policies with many TRVs, which need more episodes, would seem to know less.
-
-    Both bounds are estimated from the same episodes. The information between the TRVs and the inputs of these N
-    encoders is at most the log-det bound of the inputs; only its estimate can exceed the bound, because the TRVs are
-    sampled. A control variate makes the estimate precise where the two are close, and it is clipped at the upper bound.
+    policies with many TRVs, which need more episodes, would seem to know less. The estimate of the lower bound can
+    exceed the upper bound, because the TRVs are sampled, and is clipped there.
 
     :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
-    :raises ValueError: if there are too few episodes from the start.
     """
     n_episodes, trv_dim = batch.trvs.shape[1:]
     if n_episodes < trv_dim + 2:
@@ -236,15 +217,14 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
             f"{trv_dim + 2}"
         )
     log_det = LogDet(1, batch.states.shape[2], trv_dim)
-    at_step = InformationBounds(0.0, 0.0)
-    total = np.zeros(2)
+    at_step = total = np.zeros(2)
     for t in range(len(batch.trvs)):
         at_t = batch.at(t)
         if at_t.trvs.shape[1] >= trv_dim + 2:
             upper = log_det(at_t).item()
-            at_step = InformationBounds(upper, min(_lower_bound(at_t), upper))
+            at_step = np.array([upper, min(_lower_bound(at_t), upper)])
         if at_t.trvs.shape[1] > 0:
-            total += at_step
+            total = total + at_step
     return InformationBounds(*total.tolist())
 
 
@@ -255,8 +235,6 @@ def _lower_bound(at_t: InformationBatch) -> float:
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
     :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0
     given the encoder's inputs. It is the control variate: for a Gaussian mixture it would remove all of the noise.
-
-    :param at_t: One step, ``(1, N, ...)``.
     """
     log_density = log_density_matrix(at_t)[0].double()
     own = log_density.diagonal() - log_density.logsumexp(dim=1) + math.log(len(log_density))  # (N,)

@@ -35,9 +35,7 @@ def isolated_randomness(seed: int, model: Any) -> Iterator[None]:
     """
     Seed every generator that ``model.predict`` may sample from, and restore all of them afterwards.
 
-    :param seed: Seed of the global generators of torch, NumPy and Python, and of the model's action space, from which
-        DQN explores.
-    :param model: An SB3 model.
+    These are the global ones of torch, NumPy and Python, and the model's action space, from which DQN explores.
     """
     numpy_state, python_state, action_space = np.random.get_state(), random.getstate(), model.action_space  # noqa: NPY002
     device = th.device(getattr(model, "device", "cpu"))

@@ -7,30 +7,24 @@ Dimension key: T horizon, N episodes, X state.
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
+from sb3_tdpg.evaluation.environments import EnvWrapper, check_models_fit, scenario_env
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import is_monitored, rollout
 from sb3_tdpg.problem import read_problem
 
-MAX_PARALLEL_EPISODES = 1_000
-"""Number of episodes run side by side; a constant, because results depend on it."""
-
-MAX_FINAL_COMPONENTS = 32
-"""Longer arrays in the last info, such as images, are not recorded."""
-
+MAX_PARALLEL_EPISODES = 1_000  # run side by side; a constant, because results depend on it
+MAX_FINAL_COMPONENTS = 32  # longer arrays in the last info, such as images, are not recorded
 COLUMNS = ("model", "scenario", "env_id", "episode", "cost", "length", "seed", "deterministic")
-"""The columns of every frame of records."""
-
 _BOOKKEEPING = frozenset({"episode", "terminal_observation", "TimeLimit.truncated"})  # of SB3, not of the environment
 
 
@@ -78,12 +72,10 @@ def evaluate_scenarios(
         for label, each in models.items():
             for scenario in rows:
                 progress.set_description(f"{label}, {scenario.name}")
-                frame = run_episodes(
-                    each, scenario, n_episodes, seed=seed, deterministic=deterministic, at_end=progress.update
-                )
+                how: dict[str, Any] = dict(seed=seed, deterministic=deterministic, at_end=progress.update)
+                frame = run_episodes(each, scenario, n_episodes, **how)
                 frames.append(frame.assign(model=label, scenario=scenario.name, env_id=scenario.env_id))
-    records = pd.concat(frames, ignore_index=True)
-    records = records.assign(**labels, seed=seed, deterministic=deterministic)
+    records = pd.concat(frames, ignore_index=True).assign(**labels, seed=seed, deterministic=deterministic)
     final = [name for name in records.columns if name not in {*labels, *COLUMNS}]
     return records[[*labels, *COLUMNS[:6], *final, *COLUMNS[6:]]]
 
@@ -95,13 +87,13 @@ def run_episodes(
     *,
     seed: int,
     deterministic: bool = False,
-    sensor: Callable[[VecEnv], VecEnv] | None = None,
-    at_end: Callable[[], Any] | None = None,
+    sensor: EnvWrapper | None = None,
+    at_end: Callable[[], Any] = lambda: None,
 ) -> pd.DataFrame:
     """
     Run one model in one scenario that it fits; see :func:`evaluate_scenarios`.
 
-    :param sensor: A wrapper to put inside the model's own wrappers, for instance a perturbation.
+    :param sensor: A wrapper to put around the environment, inside those of the model.
     :param at_end: Called at the end of each episode.
     :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``:
         first the first episodes of all environments, then the second ones, and so on
@@ -110,22 +102,19 @@ def run_episodes(
     returns, monitored = np.zeros(env.num_envs), is_monitored(env)
     ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and environment
     with contextlib.closing(env):
-        steps = rollout(model, env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic)
-        for step in steps:
+        for step in rollout(model, env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic):
             returns += step.rewards
             for i in np.flatnonzero(step.finished):
                 info = step.infos[i]
                 of_monitor = info["episode"] if monitored else {}
                 cost, length = -of_monitor.get("r", returns[i]), of_monitor.get("l", step.t[i] + 1)
                 ended[int(step.episode[i]), int(i)] = dict(cost=cost, length=length, **_final_columns(info))
-                if at_end is not None:
-                    at_end()
+                at_end()
             returns[step.dones] = 0
     # If they were numbered as they end, a number would mean another start for each model and perturbation.
     order = sorted(range(n_episodes), key=list(ended).__getitem__)
-    records = pd.DataFrame(list(ended.values())).iloc[order].reset_index(drop=True)
-    records.insert(0, "episode", np.arange(n_episodes))
-    return records
+    records = pd.DataFrame(list(ended.values())).iloc[order]
+    return records.reset_index(drop=True).rename_axis("episode").reset_index()
 
 
 class Trajectories(NamedTuple):
@@ -141,26 +130,19 @@ def rollout_states(
     """
     Run episodes of a fixed horizon side by side and keep the true states ``info["state"]``.
 
-    :param model: An SB3 model.
     :param scenario: A scenario whose environment has a horizon and reports its state.
-    :param n_episodes: Number of episodes N.
-    :param seed: Seed of the environment and of the policy's sampling.
-    :param deterministic: Act without noise.
     :raises ValueError: if the model does not fit, or an episode ends before the horizon.
     """
     check_models_fit({type(model).__name__: model}, [scenario])
-    env = scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)
-    with contextlib.closing(env):
+    states: list[Any] = []
+    costs = np.zeros(n_episodes)
+    with contextlib.closing(scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)) as env:
         problem = read_problem(env)
-        states: list[Any] = []
-        costs = np.zeros(n_episodes)
         steps = rollout(model, env, seeds=evaluation_seeds(seed), deterministic=deterministic, problem=problem)
         for step in islice(steps, problem.horizon):
             if step.dones.any() and len(states) < problem.horizon - 1:
-                raise ValueError(
-                    f"an episode ended after {len(states) + 1} of {problem.horizon} steps: rollout_states needs "
-                    "episodes of equal length"
-                )
+                ended = f"an episode ended after {len(states) + 1} of {problem.horizon} steps"
+                raise ValueError(f"{ended}: rollout_states needs episodes of equal length")
             states.append(step.states)
             costs -= step.rewards
         states.append(np.stack([info["state"] for info in step.infos]))
@@ -174,10 +156,8 @@ def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:
         array = np.asarray(value)
         if name in _BOOKKEEPING or array.dtype.kind not in "biuf" or array.size > MAX_FINAL_COMPONENTS:
             continue
-        if array.ndim == 0:
-            columns[f"final_{name}"] = array.item()
-        else:
-            columns.update({f"final_{name}_{i}": x for i, x in enumerate(array.ravel().tolist())})
+        names = [f"final_{name}_{i}" for i in range(array.size)] if array.ndim else [f"final_{name}"]
+        columns.update(zip(names, array.ravel().tolist(), strict=True))
     if "is_success" in info:
         columns["failure"] = not info["is_success"]
     return columns
@@ -189,20 +169,16 @@ def _named_models(model: Any) -> dict[str, Any]:
         raise ValueError("model is an empty mapping: give at least one model, for instance {'TDPG': model}")
     for label, each in models.items():
         if isinstance(each, type) or getattr(each, "policy", None) is None:
-            raise ValueError(
-                f"model {label!r} is {each!r}, expected a Stable-Baselines3 model with a policy, as from TDPG.load(...)"
-            )
+            raise ValueError(f"model {label!r} is {each!r}, expected a Stable-Baselines3 model with a policy")
     return models
 
 
 def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, seed: int, labels: Mapping[str, Any]) -> None:
     if not scenarios:
         raise ValueError("scenarios is empty: give at least one, for instance sb3_tdpg.envs.scenarios.LAVA")
-    names = [scenario.name for scenario in scenarios]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(
-            f"scenario names must differ, but {twice} occur more than once: a table could not distinguish them"
-        )
+    counts = Counter(scenario.name for scenario in scenarios)
+    if twice := sorted(name for name, count in counts.items() if count > 1):
+        raise ValueError(f"scenario names must differ, but {twice} occur more than once")
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes per scenario")
     if not isinstance(seed, (int, np.integer)) or seed < 0:

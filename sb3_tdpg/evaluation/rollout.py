@@ -53,9 +53,8 @@ def rollout(
     """
     Run a policy and yield every step.
 
-    The episodes are shared out evenly beforehand, as in SB3's ``evaluate_policy``: each environment runs its quota.
-    The first N episodes that finish would be the short ones. Environments that are through their quota run on with a
-    cleared memory; only steps with ``finished`` end an episode that counts.
+    As in SB3's ``evaluate_policy``, each environment has a quota of episodes: the first N that finish would be short
+    ones. After its quota it runs on with a cleared memory; only steps with ``finished`` end an episode that counts.
 
     With ``seeds`` the global random generators belong to the rollout until it ends: draw nothing from them in the body
     of the loop. They are restored when the loop ends, also by ``break`` or an exception.
@@ -113,12 +112,9 @@ def is_monitored(env: VecEnv) -> bool:
 
 def act(model: Any, observations: Any, prev_trvs: th.Tensor, t: np.ndarray) -> tuple[PolicyStep, np.ndarray]:
     """
-    Sample one step of a TDPG model, like ``model.predict``, and keep the densities of the TRVs.
+    Sample one step of a TDPG model from y_t, ``(E, *obs)``, and x~_{t-1}, ``(E, Z)``, at the times t, ``(E,)``.
 
-    :param observations: y_t, ``(E, *obs)``
-    :param prev_trvs: x~_{t-1}, ``(E, Z)``
-    :param t: ``(E,)``
-    :return: the step, and the actions as an environment takes them: ``(E, *action)``, clipped to their bounds
+    :return: the step with the densities of the TRVs, and the actions, clipped to their bounds, ``(E, *action)``
     """
     model.policy.set_training_mode(False)
     with th.no_grad():

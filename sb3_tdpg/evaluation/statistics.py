@@ -31,92 +31,72 @@ def aggregate_seeds(
     :return: one row for each model and scenario: ``n_seeds``, ``iqm``, ``low``, ``high``, ``min``, ``max``,
         ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
         seed), ``level``, ``seed`` and ``deterministic``
-    :raises ImportError: without rliable (``pip install sb3_tdpg[plots]``).
     """
     require_columns(records_by_seed, ["train_seed"])
     if not 0 < level < 1:
         raise ValueError(f"level={level} must lie between 0 and 1")
-    iqm = _import_rliable()[1].aggregate_iqm
     rows = []
     for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
-        means = group["mean"].to_numpy()
-        (point,), (low,), (high,) = _bootstrap(
-            lambda x: np.array([iqm(x)]), means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed
-        )
+        means, stds = group[["mean", "std"]].to_numpy().T
+        (point,), (low,), (high,) = interquartile_means(means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed)
         seeds = dict(n_seeds=len(means), iqm=point, low=low, high=high, min=means.min(), max=means.max())
         how = {name: one_or_all(group[name]) for name in ("seed", "deterministic")}
-        std = iqm(group["std"].to_numpy())
-        rows.append(
-            dict(model=model, scenario=scenario, **seeds, episode_std=std, level=level, n=group["n"].iloc[0], **how)
-        )
+        more = dict(episode_std=_interquartile_mean(stds), level=level, n=group["n"].iloc[0])
+        rows.append(dict(model=model, scenario=scenario, **seeds, **more, **how))
     return pd.DataFrame(rows)
 
 
 def probability_of_improvement(
     records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
-) -> tuple[float, float, float]:
+) -> tuple[float, ...]:
     """
     Estimate the probability that a seed of one method has a lower mean cost than a seed of another method.
 
     The mean is over all given scenarios: the same policy runs in all of them, so they are resampled together.
 
     :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
-    :param model: Label of the method.
     :param control: Label of the method to compare with.
     :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the probability, 0.5 for no difference, and the ends of its interval
     """
     means = _seed_means(records_by_seed)
-    estimates = probabilities_of_improvement(
-        means[model].to_numpy()[:, None], means[control].to_numpy()[:, None], **bootstrap
-    )
-    value, low, high = (float(estimate[0]) for estimate in estimates)
-    return value, low, high
+    costs, of_control = (means[label].to_numpy()[:, None] for label in (model, control))
+    return tuple(estimate.item() for estimate in probabilities_of_improvement(costs, of_control, **bootstrap))
 
 
-def paired_difference(
-    records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
-) -> tuple[float, float, float]:
+def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any) -> tuple[float, ...]:
     """
     Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
 
-    Pairing removes the differences between seeds where both methods start from the same policy and meet the same
-    episodes.
+    Pairing removes the differences between seeds where both methods start from one policy and meet the same episodes.
 
-    :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
-    :param model: Label of the method.
     :param control: Label of the method to compare with; it must have the same seeds.
     :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
-    :raises ValueError: if the seeds are not the same.
     """
     means = _seed_means(records_by_seed)
-    if sorted(means[model].index) != sorted(means[control].index):
-        raise ValueError(
-            f"the seeds of {model!r} are {sorted(means[model].index)}, those of {control!r} "
-            f"{sorted(means[control].index)}: a paired difference needs the same of both"
-        )
-    differences = (means[model] - means[control]).to_numpy()
-    estimates = _bootstrap(lambda x: np.array([x.mean()]), differences[:, None], **bootstrap)
-    value, low, high = (float(estimate[0]) for estimate in estimates)
-    return value, low, high
+    seeds, of_control = (sorted(means[label].index) for label in (model, control))
+    if seeds != of_control:
+        raise ValueError(f"the seeds of {model!r} are {seeds}, those of {control!r} {of_control}: they must match")
+    differences = (means[model] - means[control]).to_numpy()[:, None]
+    return tuple(estimate.item() for estimate in _bootstrap(lambda x: x.mean(axis=0), differences, **bootstrap))
 
 
 def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Compute the interquartile mean over seeds for many rows at once; see :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
 
-    :param scores: ``(seeds, rows)``
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`; each row is resampled on
-        its own.
+    :param scores: ``(seeds, rows)``; each row is resampled on its own.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the means and the ends of their intervals, each ``(rows,)``
     """
-    cut = len(scores) // 4
+    return _bootstrap(_interquartile_mean, scores, **bootstrap)
 
-    def means(x: np.ndarray) -> np.ndarray:  # scipy.stats.trim_mean, in a tenth of the time
-        return np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0)
 
-    return _bootstrap(means, scores, **bootstrap)
+def _interquartile_mean(x: np.ndarray) -> np.ndarray:
+    """Compute the mean of the middle half along the first axis, as scipy's ``trim_mean`` in a tenth of the time."""
+    cut = len(x) // 4
+    return np.asarray(np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0))
 
 
 def probabilities_of_improvement(
@@ -125,10 +105,9 @@ def probabilities_of_improvement(
     """
     Estimate, row by row, the probability that a seed has a lower cost than a seed of the control; ties count half.
 
-    :param costs: ``(seeds, rows)``
+    :param costs: ``(seeds, rows)``; each row is resampled on its own.
     :param of_control: ``(seeds of the control, rows)``
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`; each row is resampled on
-        its own.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
     :return: the probabilities and the ends of their intervals, each ``(rows,)``
     """
 
@@ -144,36 +123,21 @@ def _seed_means(records_by_seed: pd.DataFrame) -> pd.Series:
 
 
 def _bootstrap(
-    statistic: Callable[..., np.ndarray],
-    *scores: np.ndarray,
-    level: float = 0.95,
-    n_bootstrap: int = 2000,
-    seed: int = 0,
+    statistic: Callable[..., Any], *scores: np.ndarray, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Resample the seeds, and return a statistic with the ends of its percentile interval, each ``(rows,)``.
-
-    :param scores: One array ``(seeds, rows)``, or two.
-    """
-    library, _ = _import_rliable()
+    """Resample the seeds of arrays ``(seeds, rows)``; return a statistic and the ends of its percentile interval."""
+    try:
+        from rliable import library
+    except ImportError as e:
+        raise ImportError("statistics over seeds need rliable: pip install sb3_tdpg[plots]") from e
     # rliable draws from NumPy's global generator, whatever random_state it is given.
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
+        of_scores = {"scores": scores if len(scores) > 1 else scores[0]}
         points, intervals = library.get_interval_estimates(
-            {"scores": scores if len(scores) > 1 else scores[0]},
-            statistic,
-            reps=n_bootstrap,
-            confidence_interval_size=level,
+            of_scores, statistic, reps=n_bootstrap, confidence_interval_size=level
         )
     finally:
         np.random.set_state(state)  # noqa: NPY002
     return points["scores"], *intervals["scores"]
-
-
-def _import_rliable() -> tuple[Any, Any]:
-    try:
-        from rliable import library, metrics
-    except ImportError as e:
-        raise ImportError("statistics over seeds need rliable: pip install sb3_tdpg[plots]") from e
-    return library, metrics

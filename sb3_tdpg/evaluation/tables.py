@@ -12,16 +12,15 @@ from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.envs.scenarios import PaperResult, Scenario
 
 
-def summary_table(records: pd.DataFrame, by: Sequence[str] = ("model", "scenario")) -> pd.DataFrame:
+def summary_table(records: pd.DataFrame) -> pd.DataFrame:
     """
-    Summarise the cost over the episodes of each model in each scenario.
+    Summarise the cost over the episodes of each model in each scenario, and of each ``train_seed`` if there are any.
 
     :param records: What :func:`~sb3_tdpg.evaluation.evaluate_scenarios` returned.
-    :param by: The columns to group by. A column ``train_seed`` is added in front by itself.
-    :return: the columns of ``by`` and ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem`` (standard error of the
-        mean), ``median``; ``failure_share`` if the records have a column ``failure``; ``seed`` and ``deterministic``
+    :return: the columns ``model``, ``scenario``, ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem`` (standard
+        error of the mean), ``median``; ``failure_share`` if there is a column ``failure``; ``seed``, ``deterministic``
     """
-    keys = [*(["train_seed"] if "train_seed" in records.columns and "train_seed" not in by else []), *by]
+    keys = [*(["train_seed"] if "train_seed" in records.columns else []), "model", "scenario"]
     require_columns(records, [*keys, "cost", "seed", "deterministic"])
     groups = records.groupby(keys, sort=False)
     cost = groups["cost"]
@@ -36,15 +35,11 @@ def add_ratio(summary: pd.DataFrame, reference: str = "Training") -> pd.DataFram
     """
     Add a column ``ratio``: the mean cost divided by the same model's mean cost in a reference scenario.
 
-    A robust model stays near 1.
-
     :param summary: From :func:`summary_table`.
     :param reference: Name of the scenario to divide by.
     """
-    if reference not in set(summary["scenario"]):
-        raise ValueError(
-            f"reference={reference!r} is not a scenario of the table: {list(summary['scenario'].unique())}"
-        )
+    if reference not in (names := list(summary["scenario"].unique())):
+        raise ValueError(f"reference={reference!r} is not a scenario of the table: {names}")
     keys = [name for name in summary.columns[: summary.columns.get_loc("n")] if name != "scenario"]
     base = summary.loc[summary["scenario"] == reference, [*keys, "mean"]]
     means = summary[keys].merge(base, on=keys, how="left", validate="m:1")["mean"]
@@ -62,18 +57,13 @@ def comparison_markdown(
     :param scenarios: The rows, in this order. The paper's numbers are shown for models whose label is a key of
         ``scenario.paper``.
     :param quantity: Name of the numbers, for the line below the table.
-    :param digits: Number of decimals.
-    :return: the table, with our lowest and the paper's lowest number of each row in bold, and a line that says how it
-        was made
+    :return: the table with the lowest numbers of each row in bold, ours and the paper's, and a line on how it was made
     """
     over_seeds = "iqm" in summary.columns
     require_columns(summary, ["model", "scenario", *(("iqm", "low", "high") if over_seeds else ("mean", "std"))])
     if summary.duplicated(["model", "scenario"]).any():
-        raise ValueError(
-            "the summary has several rows for a model in a scenario: use aggregate_seeds, or select one seed"
-        )
-    missing = [scenario.name for scenario in scenarios if scenario.name not in set(summary["scenario"])]
-    if missing:
+        raise ValueError("the summary has several rows for a model in a scenario: use aggregate_seeds or select a seed")
+    if missing := [scenario.name for scenario in scenarios if scenario.name not in set(summary["scenario"])]:
         raise ValueError(f"the summary has no row for the scenarios {missing}: evaluate them, or leave them out")
     models = [str(model) for model in summary["model"].unique()]
     results = [scenario.paper[model] for scenario in scenarios for model in models if model in scenario.paper]
@@ -92,9 +82,8 @@ def comparison_markdown(
 
 def _cells(entries: Mapping[str, tuple[str, float]]) -> dict[str, str]:
     """Return the texts, the one with the lowest value in bold; a single value is not marked."""
-    lowest = min((value for _, value in entries.values()), default=None)
-    is_marked = len(entries) > 1
-    return {name: f"**{text}**" if is_marked and value == lowest else text for name, (text, value) in entries.items()}
+    lowest = min(value for _, value in entries.values()) if len(entries) > 1 else None
+    return {name: f"**{text}**" if value == lowest else text for name, (text, value) in entries.items()}
 
 
 def _paper_text(result: PaperResult, digits: int) -> str:
@@ -102,11 +91,10 @@ def _paper_text(result: PaperResult, digits: int) -> str:
 
 
 def _text(row: pd.Series, digits: int) -> str:
-    if row.get("n_seeds") == 1:
-        return f"{row['iqm']:.{digits}f}"  # one seed says nothing about the others
-    if "iqm" in row:
-        return f"{row['iqm']:.{digits}f} [{row['low']:.{digits}f}, {row['high']:.{digits}f}]"
-    return f"{row['mean']:.{digits}f} ({row['std']:.{digits}f})"
+    if "iqm" not in row:
+        return f"{row['mean']:.{digits}f} ({row['std']:.{digits}f})"
+    interval = "" if row["n_seeds"] == 1 else f" [{row['low']:.{digits}f}, {row['high']:.{digits}f}]"
+    return f"{row['iqm']:.{digits}f}{interval}"
 
 
 def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult], quantity: str) -> str:
@@ -123,15 +111,10 @@ def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult], quantity: str) 
     if paper:
         what += "; the paper's columns: mean"
         what += " (standard deviation)" if any(result.std is not None for result in paper) else ""
-    how = []
-    if "n" in summary.columns:
-        how.append(f"{_all(summary['n'])} episodes per scenario")
-    if "seed" in summary.columns:
-        how.append(f"evaluation seed {_all(summary['seed'])}")
-    if "deterministic" in summary.columns:
-        kinds = summary["deterministic"].map({False: "stochastic policy", True: "deterministic policy"})
-        how.append(_all(kinds.fillna("stochastic and deterministic policies")))
-    return f"{what}. {', '.join(how)}. Lowest in bold." if how else f"{what}. Lowest in bold."
+    kinds = summary["deterministic"].map({False: "stochastic policy", True: "deterministic policy"})
+    kinds = kinds.fillna("stochastic and deterministic policies")
+    how = f"{_all(summary['n'])} episodes per scenario, evaluation seed {_all(summary['seed'])}, {_all(kinds)}"
+    return f"{what}. {how}. Lowest in bold."
 
 
 def _all(values: pd.Series) -> str:

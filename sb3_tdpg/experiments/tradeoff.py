@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.figures import INK, WIDTH, _import_matplotlib, _log_axis, _new_figure, _short, _tidy
+from sb3_tdpg.evaluation.figures import INK, WIDTH, import_matplotlib, log_axis, new_figure, short_name, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,9 +38,9 @@ def tradeoff_figure(
     :param selected: Label and seed of the run to mark.
     :param quantity: Label of the cost axis.
     """
-    matplotlib = _import_matplotlib()
+    matplotlib = import_matplotlib()
     has_rows = len(rows) > 1
-    figure = _new_figure(WIDTH, 4.2)
+    figure = new_figure(WIDTH, 4.2)
     panels = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.15)) if has_rows else [figure.add_subplot()]
     labels = list(runs["label"].unique())
     shades = matplotlib.colormaps["viridis_r"](np.linspace(0.12, 1.0, len(labels)))
@@ -55,7 +55,7 @@ def tradeoff_figure(
     ring: dict[str, Any] = dict(s=150, facecolors="none", edgecolors=LIMIT_COLOR, linewidths=2, zorder=4)
     scatter.scatter(information[chosen], runs["cost"][chosen], label="selected" if any(chosen) else None, **ring)
     low, high = 0.6 * information.min(), 1.7 * information.max()
-    _log_axis(scatter, "x", subs=(1,))
+    log_axis(scatter, "x", subs=(1,))
     scatter.set_xlim(low, max(high, 12 * low))  # at least one tick
     if low < ABOUT_NOTHING:
         span = low, min(ABOUT_NOTHING, high)
@@ -64,7 +64,7 @@ def tradeoff_figure(
     scatter.set_ylabel(quantity, fontsize=9)
     costs = runs[list(rows.values())].to_numpy()
     if costs.min() > 0 and costs.max() > 4 * costs.min():
-        _log_axis(scatter, "y", subs=(1, 2, 5))
+        log_axis(scatter, "y", subs=(1, 2, 5))
     if has_rows:
         _draw_rows(panels[1], runs, rows, colors)
     for axes in panels:
@@ -72,7 +72,7 @@ def tradeoff_figure(
             axes.axhline(cost_limit, color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
         axes.grid(alpha=0.25)
         axes.margins(y=0.08)
-        _tidy(axes)
+        tidy(axes)
     if cost_limit is not None:
         where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(0, 3))
         style: dict[str, Any] = dict(ha="right", fontsize=8, color=LIMIT_COLOR)
@@ -94,7 +94,7 @@ def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: 
         axes.plot(at, seeds.T, ".", color=colors[label], markersize=4, alpha=0.7)
         axes.plot(at, median, "_", color=colors[label], markersize=8, markeredgewidth=1.6)
         axes.plot(at[:in_order], median[:in_order], color=colors[label], linewidth=1.0, alpha=0.6)
-    texts = ["train" if name == "Training" else _short(name) for name in names]
-    kinds = dict.fromkeys(name.rsplit(" ", 1)[0].lower() for name in names[1:] if _short(name) != name)
+    texts = ["train" if name == "Training" else short_name(name) for name in names]
+    kinds = dict.fromkeys(name.rsplit(" ", 1)[0].lower() for name in names[1:] if short_name(name) != name)
     axes.set_xticks(range(len(names)), texts, rotation=30 if sum(map(len, texts)) > 36 else 0)
     axes.set_xlabel(f"{', then '.join(kinds) or 'scenario'} (bar: median over seeds)", fontsize=9)

@@ -15,12 +15,12 @@ from sb3_tdpg.evaluation.figures import (
     INK,
     PALETTE,
     WIDTH,
-    _import_matplotlib,
-    _legend_above,
-    _log_axis,
-    _new_figure,
-    _short,
-    _tidy,
+    import_matplotlib,
+    legend_above,
+    log_axis,
+    new_figure,
+    short_name,
+    tidy,
 )  # fmt: skip
 from sb3_tdpg.evaluation.records import rollout_states
 
@@ -42,7 +42,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
     shown = records[records["scenario"].isin(names)]
     if missing := sorted(set(names) - set(shown["scenario"])):
         raise ValueError(f"the records have no episodes of the scenarios {missing}")
-    figure = _new_figure(WIDTH, 2.9)
+    figure = new_figure(WIDTH, 2.9)
     panels = _panels(figure, 1, len(scenarios))[0]
     low, high = shown["cost"].min(), shown["cost"].max()
     is_positive = low > 0
@@ -60,10 +60,10 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
             axes.axvline(costs.mean(), color=color, linestyle=(0, (3, 2)), linewidth=1.2)
         axes.set_title(_title(scenario), fontsize=9)
     if is_positive:
-        _log_axis(panels[0], "x", subs=(1, 3))
+        log_axis(panels[0], "x", subs=(1, 3))
     panels[0].set_ylabel("share of episodes", fontsize=9)
     figure.supxlabel(f"episode cost{' (logarithmic axis)' if is_positive else ''}; dashed: mean", fontsize=9)
-    _legend_above(figure, panels[0])
+    legend_above(figure, panels[0])
     return figure
 
 
@@ -86,8 +86,8 @@ def lava_trajectories(
     :param noise_variances: sigma^2 of the sensor in each row.
     :param deterministic: Act without noise.
     """
-    matplotlib = _import_matplotlib()
-    figure = _new_figure(WIDTH, 0.6 + 2.4 * len(noise_variances))
+    matplotlib = import_matplotlib()
+    figure = new_figure(WIDTH, 0.6 + 2.4 * len(noise_variances))
     panels = _panels(figure, len(noise_variances), len(models))
     norm = matplotlib.colors.Normalize(WALL, LAVA)
     colors = matplotlib.cm.ScalarMappable(norm, "viridis")
@@ -121,7 +121,7 @@ def robustness_curves(
     :param other_rows: Unordered scenarios for the right panel.
     :param reference: The scenario of the training.
     """
-    figure = _new_figure(WIDTH, 3.6)
+    figure = new_figure(WIDTH, 3.6)
     panels = figure.subplots(1, 2, sharey=True, width_ratios=(len(noise_rows) + 1, len(other_rows)))
     means = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean()
     models = list(records["model"].unique())
@@ -132,13 +132,13 @@ def robustness_curves(
             axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4, alpha=0.7)
             style = "-" if axes is panels[0] else ""
             axes.plot(at, seeds.median().to_numpy(), style + "_", color=color, linewidth=1.2, markersize=9, label=model)
-        axes.set_xticks(range(len(rows)), [_short(row) for row in rows])
-        _tidy(axes)
-    _log_axis(panels[0], "y", subs=(1, 2, 5))
+        axes.set_xticks(range(len(rows)), [short_name(row) for row in rows])
+        tidy(axes)
+    log_axis(panels[0], "y", subs=(1, 2, 5))
     panels[0].set_ylabel("mean episode cost", fontsize=9)
     panels[0].set_xlabel("standard deviation of the pixel noise", fontsize=9)
     panels[1].set_xlabel("test background", fontsize=9)
-    _legend_above(figure, panels[0])
+    legend_above(figure, panels[0])
     return figure
 
 
@@ -148,7 +148,7 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
 
     :param records: With the columns ``train_seed`` and ``distance`` (m).
     """
-    figure = _new_figure(WIDTH, 3.2)
+    figure = new_figure(WIDTH, 3.2)
     axes = figure.add_subplot()
     distances = records.groupby(["model", "train_seed", "scenario"], sort=False)["distance"].mean()
     models, rows = list(records["model"].unique()), list(records["scenario"].unique())
@@ -159,10 +159,10 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
         axes.bar(at, seeds.median(), width=0.9 * width, color=color, alpha=0.45, label=model)
         axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4)
     axes.set_xticks(range(len(rows)), rows)
-    _tidy(axes)
-    _log_axis(axes, "y", subs=(1, 2, 5))
+    tidy(axes)
+    log_axis(axes, "y", subs=(1, 2, 5))
     axes.set_ylabel("final distance from the ball (m)", fontsize=9)
-    _legend_above(figure, axes)
+    legend_above(figure, axes)
     return figure
 
 
@@ -173,7 +173,7 @@ def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
     :param records: Episodes with the columns ``model``, ``yaw`` (rad) and ``cost`` (1 for a failure).
     :param n_bins: Number of sectors.
     """
-    figure = _new_figure(5.2, 5.2)
+    figure = new_figure(5.2, 5.2)
     axes = figure.add_subplot(projection="polar")
     edges = np.linspace(0, 2 * np.pi, n_bins + 1)
     middles = (edges[:-1] + edges[1:]) / 2
@@ -195,9 +195,9 @@ def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
     :param records: Episodes with the columns ``model``, ``camera`` (m) and ``cost`` (1 for a failure).
     :param n_bins: Number of intervals of the height.
     """
-    figure = _new_figure(WIDTH * 0.7, 3.2)
+    figure = new_figure(WIDTH * 0.7, 3.2)
     axes = figure.add_subplot()
-    _tidy(axes)
+    tidy(axes)
     centimetres = 100 * records["camera"]
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
     for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
@@ -214,7 +214,7 @@ def _panels(figure: Figure, n_rows: int, n_columns: int) -> np.ndarray:
     """Panels with common axes: ``(n_rows, n_columns)``."""
     panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
     for axes in panels.flat:
-        _tidy(axes)
+        tidy(axes)
     return panels
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from gymnasium import spaces
 
-from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, _import_matplotlib, _log_axis, _new_figure, _tidy
+from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, log_axis, new_figure, tidy
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.numbers import CLEAR, Numbers
@@ -41,7 +41,7 @@ def degradation_curves(numbers: Numbers) -> Figure:
             axes.plot(curve["severity"], curve["iqm"], **style, markersize=3.5, linewidth=1.3, label=label)
         axes.set_title(name, fontsize=9)
         axes.grid(alpha=0.25)
-        _tidy(axes)
+        tidy(axes)
     panels[0, 0].set_xticks(sorted({0, *levels["severity"]}))
     _log_if_wide(panels[0, 0], levels, "y")
     figure.supxlabel("severity (0: unperturbed)", fontsize=9)
@@ -78,7 +78,7 @@ def comparison_figure(numbers: Numbers) -> Figure:
 def _intervals(numbers: Numbers, frame: pd.DataFrame, columns: Sequence[str]) -> tuple[Figure, Axes]:
     """Draw an interval for each perturbation (rows) and method; the columns hold the value and the two ends."""
     names, labels = list(frame["perturbation"].unique()), list(frame["model"].unique())
-    figure = _new_figure(WIDTH, 1.1 + 0.24 * len(names))
+    figure = new_figure(WIDTH, 1.1 + 0.24 * len(names))
     axes = figure.add_subplot()
     for i, label in enumerate(labels):
         style = _styles(numbers)[label]
@@ -88,7 +88,7 @@ def _intervals(numbers: Numbers, frame: pd.DataFrame, columns: Sequence[str]) ->
         axes.plot(value, at, style["marker"], color=style["color"], markersize=4.5, label=label)
     axes.set_yticks(range(len(names)), names, fontsize=9)
     axes.invert_yaxis()
-    _tidy(axes)
+    tidy(axes)
     return figure, axes
 
 
@@ -106,7 +106,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     component = int(np.argmax(flat.std(axis=0) / np.where(scale > 0, scale, np.inf)))
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
-    shades = _import_matplotlib().colormaps["viridis_r"]
+    shades = import_matplotlib().colormaps["viridis_r"]
     dots = "." if len(flat) <= 30 else ""
     for axes, name in zip(panels.flat, names, strict=False):
         for row in (row for row in rows if row.perturbation == name):
@@ -116,7 +116,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
             axes.plot(seen, dots + "-", color=color, linewidth=0.9, markersize=4, label=f"severity {row.severity}")
         axes.plot(flat[:, component], dots + "-", color=INK, linewidth=1.6, markersize=5, label=UNPERTURBED, zorder=0)
         axes.set_title(name, fontsize=9)
-        _tidy(axes)
+        tidy(axes)
     figure.supxlabel("time step $t$", fontsize=9)
     figure.supylabel(f"component {component} of the observation", fontsize=9)
     _legend(figure, panels[0, 0], n_columns=6)
@@ -139,7 +139,7 @@ def _grid(n: int) -> tuple[Figure, np.ndarray]:
     """Make a figure with n panels that share their axes, in evenly filled rows of up to five."""
     n_columns = n if n <= 5 else min((5, 4, 3), key=lambda columns: -n % columns)
     n_rows = -(-n // n_columns)
-    figure = _new_figure(WIDTH, 0.7 + 1.8 * n_rows)
+    figure = new_figure(WIDTH, 0.7 + 1.8 * n_rows)
     panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
     for axes in panels.flat[n:]:
         axes.set_axis_off()
@@ -158,7 +158,7 @@ def _log_if_wide(axes: Axes, frame: pd.DataFrame, which: str) -> None:
     """Make an axis logarithmic if all costs are positive and range over more than a decade."""
     low, high = frame[["low", "iqm"]].min().min(), frame["iqm"].max()
     if low > 0 and high > 10 * low:
-        _log_axis(axes, which, subs=(1, 3) if high < 300 * low else (1,))
+        log_axis(axes, which, subs=(1, 3) if high < 300 * low else (1,))
 
 
 def _legend(figure: Figure, axes: Axes, n_columns: int = 4) -> None:

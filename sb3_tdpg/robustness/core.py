@@ -25,12 +25,7 @@ class Perturber:
     The perturbation has its own random generator, so the random numbers of the environment do not change.
 
     :param perturbation: A perturbation that applies to the space.
-    :param severity: 1 to 5.
-    :param space: The observation space.
-    :param n_envs: Number of environments N.
-    :param seed: Seed of the generator; ``None``: a random one.
     :param scale: Scales of the components of a vector, in the space's shape; unused for images.
-    :raises ValueError: if the severity is unknown.
     """
 
     def __init__(
@@ -70,22 +65,20 @@ class Perturber:
 
     def __call__(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
         """
-        Perturb the next observation of each episode.
+        Perturb the next observation of each episode, and return a new array ``(n, *obs)``.
 
-        :param observations: ``(n, *obs)``; they are not changed.
         :param which: Indices of their environments, ``(n,)``; ``None``: all.
-        :return: a new array in the observation space, ``(n, *obs)``
         """
         index = slice(None) if which is None else which
-        episode = {name: values[index] for name, values in self._episode.items()}
+        episode = {name: values[index] for name, values in self._episode.items()}  # views of all, or copies
         if self.perturbation.raw:
             perturbed = self.perturbation.apply(observations, self.value, episode, self._rng)
         else:
             perturbed = self._in_units(observations, episode)
-        if which is not None and self.perturbation.raw:  # the memory was a copy
+        episode["t"] += 1
+        if which is not None:
             for name, values in episode.items():
                 self._episode[name][which] = values
-        self._episode["t"][index] += 1
         return perturbed
 
     def _in_units(self, observations: np.ndarray, episode: dict[str, np.ndarray]) -> np.ndarray:

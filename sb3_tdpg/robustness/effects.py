@@ -2,8 +2,7 @@
 All perturbations, each a function of a batch of observations with its row of the registry above it.
 
 Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Lost and late
-observations (``raw``) are ``(n, *obs)`` in the units of their space. The first line of a docstring is the summary in
-the tables of the documentation and of the report.
+observations (``raw``) are ``(n, *obs)`` in the units of their space.
 
 Dimension key: n episodes side by side, C channels, H and W rows and columns, D components, K steps of delay.
 """
@@ -83,13 +82,12 @@ def blur(images: np.ndarray, width: float, episode: Episode, rng: np.random.Gene
 def draw_square(rng: np.random.Generator, n: int, side: float, sensor: Sensor) -> dict[str, np.ndarray]:
     """Draw the place and the colour of each episode's occluder."""
     channels, *lengths = sensor.shape
-    spans = []
+    inside = []
     for length in lengths:
         size = max(1, round(side * length))
-        start = rng.integers(0, length - size + 1, (n, 1))
-        at = np.arange(length)
-        spans.append((at >= start) & (at < start + size))
-    return dict(rows=spans[0], columns=spans[1], color=rng.random((n, channels, 1, 1), dtype=np.float32))
+        place = np.arange(length) - rng.integers(0, length - size + 1, (n, 1))
+        inside.append((place >= 0) & (place < size))
+    return dict(rows=inside[0], columns=inside[1], color=rng.random((n, channels, 1, 1), dtype=np.float32))
 
 
 @perturbation("image", "side, share of the image's", (0.2, 0.3, 0.4, 0.5, 0.6), draw=draw_square)
@@ -102,21 +100,12 @@ def occlusion(images: np.ndarray, side: float, episode: Episode, rng: np.random.
 @perturbation("image", "share of the pixels", (0.01, 0.05, 0.1, 0.2, 0.4))
 def dropped_pixels(images: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Set random pixels to the lowest value, new ones in every frame."""
-    n, _, height, width = images.shape
-    is_dead = rng.random((n, 1, height, width), dtype=np.float32) < share
+    is_dead = rng.random(images[:, :1].shape, dtype=np.float32) < share
     return np.where(is_dead, np.float32(0), images)
 
 
 def evenly(number: np.ndarray, share: float, phase: np.ndarray) -> np.ndarray:
-    """
-    Choose a share of consecutive numbers at even distances (systematic sampling): one of any 1 / share, at least.
-
-    Independent choices would leave out some short episodes altogether.
-
-    :param number: 0, 1, ...
-    :param share: In [0, 1].
-    :param phase: In [0, 1): the position of the first one.
-    """
+    """Choose a share of the numbers 0, 1, ... evenly; independent choices would leave out some short episodes."""
     return np.floor(share * (number + 1) + phase) > np.floor(share * number + phase)
 
 
@@ -176,21 +165,19 @@ def texture_overlay(images: np.ndarray, opacity: float, episode: Episode, rng: n
 
 def draw_shift(rng: np.random.Generator, n: int, distance: float, sensor: Sensor) -> dict[str, np.ndarray]:
     """Draw in which direction the camera of each episode is turned, in whole pixels."""
-    _, height, width = sensor.shape
+    _, *lengths = sensor.shape
     angle = rng.uniform(0, 2 * np.pi, n)
-    shift = max(1.0, distance * height) * np.stack([np.sin(angle), np.cos(angle)])
-    down, right = np.rint(shift).astype(int)[..., None]  # (n, 1) each
-    return dict(
-        from_rows=np.clip(np.arange(height) + down, 0, height - 1),
-        from_columns=np.clip(np.arange(width) + right, 0, width - 1),
-    )
+    shift = max(1.0, distance * lengths[0]) * np.stack([np.sin(angle), np.cos(angle)])
+    shifts = np.rint(shift).astype(int)[..., None]  # (2, n, 1), down and right
+    rows, columns = (np.clip(np.arange(m) + by, 0, m - 1) for m, by in zip(lengths, shifts, strict=True))
+    return dict(rows=rows, columns=columns)
 
 
 @perturbation("image", "distance, share of the height", (0.02, 0.04, 0.07, 0.10, 0.15), draw=draw_shift)
 def camera_shift(images: np.ndarray, distance: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Shift all images of an episode in one direction, as if the camera were turned a little."""
-    shifted = np.take_along_axis(images, episode["from_rows"][:, None, :, None], axis=2)
-    return np.take_along_axis(shifted, episode["from_columns"][:, None, None, :], axis=3)
+    shifted = np.take_along_axis(images, episode["rows"][:, None, :, None], axis=2)
+    return np.take_along_axis(shifted, episode["columns"][:, None, None, :], axis=3)
 
 
 @perturbation("vector", "standard deviation, scales", (0.05, 0.1, 0.2, 0.4, 0.8))

@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdpg.evaluation.figures import new_figure
 from sb3_tdpg.robustness.core import Perturber
-from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find
+from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find_applicable
 from sb3_tdpg.robustness.scenes import scene_perturbations
 from sb3_tdpg.robustness.sensor import Sensor, horizon_of, kind_of
 from sb3_tdpg.vec_env import make_episodes_env
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PANEL = 1.1  # inches a side
+N_STEPS = 8  # before the image is taken
 
 
 def perturbation_gallery(
@@ -27,20 +29,18 @@ def perturbation_gallery(
     names: Sequence[str] | None = None,
     *,
     env_kwargs: Mapping[str, Any] | None = None,
-    n_steps: int = 8,
     seed: int = 0,
 ) -> Figure:
     """
     Draw one image under each perturbation (rows) in each severity (columns), beside the unperturbed image.
 
-    The image is the last one of the first environment after ``n_steps`` steps with the action 0, or the last one of a
-    shorter episode, so that late and lost frames can be seen. For an id, the perturbations of its scene
-    (:func:`.scene_perturbations`) are drawn, too.
+    The image is that of the first environment after 8 steps with the action 0, or the last one of a shorter episode, so
+    that late and lost frames can be seen. For an id, the perturbations of its scene (:func:`.scene_perturbations`) are
+    drawn, too.
 
     :param env: An environment with images, or a registered id.
     :param names: The rows; default: all perturbations that apply.
     :param env_kwargs: Keywords for the environment's constructor, with an id.
-    :param n_steps: Steps before the image is taken.
     :param seed: Seed of environment and perturbations.
     :raises ValueError: if the observations are not images, or a perturbation does not apply.
     """
@@ -57,28 +57,26 @@ def perturbation_gallery(
             return stack.enter_context(contextlib.closing(own))
 
         plain = made({})
-        space, horizon, frames = plain.observation_space, horizon_of(plain), _frames(plain, n_steps, seed)
+        space, horizon, frames = plain.observation_space, horizon_of(plain), _frames(plain, seed)
         if not isinstance(space, spaces.Box) or kind_of(space) != "image":
             raise ValueError(f"a gallery shows images, and the observation space is {space}")
         rows: dict[str, list[np.ndarray]] = {}
         for name in [*applicable(space, horizon), *scenes] if names is None else names:
             if name in scenes:
-                rows[name] = [_frames(made(scene_kwargs), n_steps, seed)[-1] for scene_kwargs in scenes[name]]
+                rows[name] = [_frames(made(scene_kwargs), seed)[-1] for scene_kwargs in scenes[name]]
                 continue
-            if (objection := find(name).objection(space, horizon)) is not None:
-                raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
-            perturbers = [Perturber(find(name), severity, space, 1, seed=seed) for severity in range(1, 6)]
+            perturbation = find_applicable(name, space, horizon)
+            perturbers = [Perturber(perturbation, severity, space, 1, seed=seed) for severity in range(1, 6)]
             rows[name] = [[perturber(frame[None]) for frame in frames][-1][0] for perturber in perturbers]
     return _draw(frames[-1], rows, Sensor(space))
 
 
-def _frames(env: VecEnv, n_steps: int, seed: int) -> list[np.ndarray]:
+def _frames(env: VecEnv, seed: int) -> list[np.ndarray]:
     """Return the images of an episode of the first environment, up to the one that is drawn."""
     env.seed(seed)
     frames = [np.asarray(env.reset())[0]]
-    horizon = horizon_of(env)
     actions = np.zeros((env.num_envs, *(env.action_space.shape or ())), env.action_space.dtype)
-    for _ in range(n_steps if horizon is None else min(n_steps, horizon - 1)):
+    for _ in range(min(N_STEPS, (horizon_of(env) or N_STEPS + 1) - 1)):
         observations, _, dones, _ = env.step(actions)
         if dones[0]:
             break
@@ -87,10 +85,8 @@ def _frames(env: VecEnv, n_steps: int, seed: int) -> list[np.ndarray]:
 
 
 def _draw(unperturbed: np.ndarray, rows: Mapping[str, Sequence[np.ndarray]], sensor: Sensor) -> Figure:
-    from matplotlib.figure import Figure
-
     n_columns = N_SEVERITIES + 1
-    figure = Figure(figsize=(PANEL * n_columns + 1.2, PANEL * len(rows) + 0.3), layout="constrained")
+    figure = new_figure(PANEL * n_columns + 1.2, PANEL * len(rows) + 0.3)
     panels = figure.subplots(len(rows), n_columns, squeeze=False)
     for axes_of_row, (name, images) in zip(panels, rows.items(), strict=True):
         for axes, image in zip(axes_of_row, (unperturbed, *images), strict=True):

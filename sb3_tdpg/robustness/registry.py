@@ -12,12 +12,17 @@ from gymnasium import spaces
 
 from sb3_tdpg.robustness.sensor import Sensor, kind_of
 
-KINDS = ("image", "vector")
 N_SEVERITIES = 5
 
 Episode = Mapping[str, np.ndarray]  # what was drawn for the episodes of a batch, and their time
 Draw = Callable[[np.random.Generator, int, float, Sensor], dict[str, np.ndarray]]
 Apply = Callable[[np.ndarray, float, Episode, np.random.Generator], np.ndarray]
+
+
+def check_severities(name: str, severities: Sequence[Any]) -> None:
+    """Raise a ``ValueError`` unless there are five severities."""
+    if (n := len(severities)) != N_SEVERITIES:
+        raise ValueError(f"{name} has {n} severities, expected {N_SEVERITIES}: from the mildest to the strongest")
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,9 @@ class Perturbation:
     where an episode begins and returns arrays with a leading dimension of n. ``apply`` finds them in ``episode``,
     beside the time ``episode["t"]``, ``(n,)``, which is 0 at the first observation.
 
-    :param name: Name of the perturbation.
     :param kind: ``"image"`` or ``"vector"``.
     :param parameter: The quantity that the severities are values of, with its unit.
     :param severities: Five values, from the mildest to the strongest.
-    :param apply: See above.
-    :param draw: See above; ``None``: nothing is drawn for an episode.
     :param summary: The effect in a few words.
     :param channels: Permitted numbers of image channels; ``None``: any.
     :param on_depth: Whether it makes sense on depth images: floats of one channel.
@@ -58,31 +60,19 @@ class Perturbation:
     raw: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind={self.kind!r} of {self.name!r} must be one of {list(KINDS)}")
-        if len(self.severities) != N_SEVERITIES:
-            raise ValueError(
-                f"{self.name!r} has {len(self.severities)} severities {self.severities}, expected {N_SEVERITIES}: "
-                "from the mildest to the strongest"
-            )
+        if self.kind not in ("image", "vector"):
+            raise ValueError(f"kind={self.kind!r} of {self.name!r} must be one of ['image', 'vector']")
+        check_severities(repr(self.name), self.severities)
 
     def value(self, severity: int) -> float:
-        """
-        Return the value of the parameter at a severity.
-
-        :raises ValueError: if the severity is not an integer from 1 to 5.
-        """
+        """Return the value of the parameter at a severity, an integer from 1 to 5."""
         is_whole = isinstance(severity, (int, np.integer)) and not isinstance(severity, bool)
         if not (is_whole and 1 <= severity <= N_SEVERITIES):
             raise ValueError(f"severity={severity!r} of {self.name!r} must be an integer from 1 to {N_SEVERITIES}")
         return self.severities[severity - 1]
 
     def objection(self, space: spaces.Space, horizon: int | None = None) -> str | None:
-        """
-        Explain why this perturbation does not apply to an observation space; ``None`` if it applies.
-
-        :param horizon: Number of controls in an episode, if known.
-        """
+        """Explain why this perturbation does not apply to an observation space (and a horizon); ``None`` if it does."""
         kind = kind_of(space)
         if kind is None or not isinstance(space, spaces.Box):
             return f"the observation space {space} is not a Box: use gymnasium.wrappers.FlattenObservation first"
@@ -104,16 +94,11 @@ class Perturbation:
         return self.objection(space, horizon) is None
 
 
-PERTURBATIONS: dict[str, Perturbation] = {}
-"""The perturbations by name; :mod:`sb3_tdpg.robustness.effects` adds those of this package."""
+PERTURBATIONS: dict[str, Perturbation] = {}  # by name, filled by :mod:`sb3_tdpg.robustness.effects`
 
 
 def register(perturbation: Perturbation) -> None:
-    """
-    Add a perturbation to :data:`PERTURBATIONS`.
-
-    :raises ValueError: if the name is taken.
-    """
+    """Add a perturbation with a new name to :data:`PERTURBATIONS`."""
     if perturbation.name in PERTURBATIONS:
         raise ValueError(f"a perturbation {perturbation.name!r} exists already: choose another name")
     PERTURBATIONS[perturbation.name] = perturbation
@@ -122,11 +107,7 @@ def register(perturbation: Perturbation) -> None:
 def perturbation(
     kind: str, parameter: str, severities: tuple[float, ...], *, name: str | None = None, **settings: Any
 ) -> Callable[[Apply], Apply]:
-    """
-    Register a function as a :class:`Perturbation`, by its own name unless another one is given.
-
-    The summary is the first line of its docstring.
-    """
+    """Register a function as a :class:`Perturbation`; its docstring's first line is the summary."""
 
     def add(apply: Apply) -> Apply:
         summary = (apply.__doc__ or "").strip().split("\n")[0].rstrip(".")
@@ -138,13 +119,16 @@ def perturbation(
 
 
 def find(name: str) -> Perturbation:
-    """
-    Return a perturbation by its name.
-
-    :raises ValueError: if the name is unknown.
-    """
+    """Return a perturbation by its name."""
     if name not in PERTURBATIONS:
         raise ValueError(f"perturbation={name!r} is unknown: use one of {list(PERTURBATIONS)}")
+    return PERTURBATIONS[name]
+
+
+def find_applicable(name: str, space: spaces.Space, horizon: int | None) -> Perturbation:
+    """Return a perturbation by its name, if it applies to an observation space."""
+    if (objection := find(name).objection(space, horizon)) is not None:
+        raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
     return PERTURBATIONS[name]
 
 
@@ -154,14 +138,10 @@ def applicable(space: spaces.Space, horizon: int | None = None) -> list[str]:
 
 
 def severity_table(kind: str | None = None) -> pd.DataFrame:
-    """
-    Return the table of severities: a row for each perturbation, with its parameter and columns 1 to 5.
-
-    :param kind: ``"image"`` or ``"vector"``; ``None``: both.
-    """
-    rows = [
-        dict(perturbation=row.name, kind=row.kind, parameter=row.parameter, **dict(zip("12345", row.severities)))  # noqa: B905
-        for row in PERTURBATIONS.values()
+    """Return a table of the perturbations of a kind, or of all, with parameter and severities (columns 1 to 5)."""
+    rows = {
+        name: dict(kind=row.kind, parameter=row.parameter, **dict(zip("12345", row.severities)))  # noqa: B905
+        for name, row in PERTURBATIONS.items()
         if kind in (None, row.kind)
-    ]
-    return pd.DataFrame(rows).set_index("perturbation")
+    }
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("perturbation")

@@ -28,13 +28,9 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> np.ndarray:
 
     The rollout lasts until every environment has ended an episode and 500 observations have been seen, at most 200
     steps. The environments must be reset afterwards. Their random generators, and a seed that waits for the first
-    reset, are restored, so the next episodes are the same as without the rollout. (A ``Monitor`` does record the
-    episodes of the rollout.)
+    reset, are restored, so the next episodes are the same as without the rollout.
 
-    :param env: One environment or several, unperturbed.
-    :param model: SB3 model that acts, for observations as in its training. ``None``: Gaussian actions with a standard
-        deviation of 1, clipped to the bounds, like those of an untrained policy; other action spaces than ``Box`` are
-        sampled.
+    :param model: SB3 model that acts; ``None``: clipped standard Gaussian actions, as of an untrained policy.
     :return: in the shape of the observation space, float64
     """
     vec_env = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
@@ -51,7 +47,7 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> np.ndarray:
 
 
 class _Untrained:
-    """Acts as a policy at the beginning of a training does."""
+    """An untrained policy: it draws standard Gaussian actions, or samples a space that is not a ``Box``."""
 
     def __init__(self, action_space: spaces.Space) -> None:
         self.rng, self.space = np.random.default_rng(_SEED), copy.deepcopy(action_space)
@@ -71,7 +67,7 @@ def _observations(env: VecEnv, model: Any) -> np.ndarray:
     observe = None if normalize is None else normalize.normalize_obs
     seen: list[np.ndarray] = []
     has_ended = np.zeros(env.num_envs, dtype=bool)
-    for step in rollout(_Untrained(env.action_space) if model is None else model, env, observe=observe):
+    for step in rollout(model or _Untrained(env.action_space), env, observe=observe):
         seen += [step.next_observations] if seen else [step.observations, step.next_observations]
         has_ended |= step.dones
         if len(seen) > MAX_STEPS or (has_ended.all() and len(seen) * env.num_envs >= N_OBSERVATIONS):
@@ -84,29 +80,23 @@ def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None)
     Return the scale of the components of a vector; ``None`` for an image.
 
     A component with finite bounds has the standard deviation of a uniform distribution between them,
-    :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The other components are measured by
-    :func:`observation_scale`.
+    :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The others are measured by :func:`observation_scale`.
 
-    :param space: The observation space.
-    :param env: The environment, for the measurement.
     :param scale: Given by the user and used instead: a number, or one for each component.
-    :raises ValueError: if it has another shape or is negative, or no component varies.
     """
     if not isinstance(space, spaces.Box) or kind_of(space) != "vector":
         if scale is not None:
             raise ValueError(f"scale={scale} is for vectors, and the observation space is {space}: leave it out")
         return None
-    if scale is not None:
-        result = np.asarray(scale, dtype=np.float64)
-        if result.shape not in ((), space.shape) or not (np.isfinite(result).all() and (result >= 0).all()):
-            raise ValueError(
-                f"scale={scale} must be a number, or an array of shape {space.shape}, finite and not negative"
-            )
-        result = np.broadcast_to(result, space.shape)
-    else:
+    if scale is None:
         result = finite_range(space) / np.sqrt(12)
         if not np.isfinite(result).all():
             result = np.where(np.isfinite(result), result, observation_scale(env))
+    else:
+        result = np.asarray(scale, dtype=np.float64)
+        if result.shape not in ((), space.shape) or not (np.isfinite(result) & (result >= 0)).all():
+            raise ValueError(f"scale={scale} must be a number, or an array of shape {space.shape}, and not negative")
+        result = np.broadcast_to(result, space.shape)
     if not result.any():
         raise ValueError("no component of the observations varied in the calibration: give `scale`")
     return result

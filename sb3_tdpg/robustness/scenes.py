@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sb3_tdpg.robustness.registry import N_SEVERITIES
+from sb3_tdpg.robustness.registry import check_severities
 
 Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each
 
@@ -29,17 +29,11 @@ SCENES: dict[str, dict[str, Severities]] = {
 
 def scene_perturbations(env_id: str) -> dict[str, Severities]:
     """
-    Return the perturbations of an environment's scene: the ``env_kwargs`` of the five severities by name.
+    Return the perturbations in :data:`SCENES` of an environment: the ``env_kwargs`` of the five severities by name.
 
-    :param env_id: A registered Gymnasium id, also in the ``module:id`` form. An id that is not in :data:`SCENES` has no
-        perturbations.
-    :raises ValueError: if a perturbation does not have five severities.
+    :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     """
     rows = SCENES.get(env_id.rpartition(":")[2], {})
     for name, severities in rows.items():
-        if len(severities) != N_SEVERITIES:
-            raise ValueError(
-                f"SCENES[{env_id!r}][{name!r}] has {len(severities)} severities, expected {N_SEVERITIES}: "
-                "from the mildest to the strongest"
-            )
+        check_severities(f"SCENES[{env_id!r}][{name!r}]", severities)
     return dict(rows)

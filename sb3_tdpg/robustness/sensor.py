@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-VAST = 1e6
-"""Bounds further apart count as infinite: some environments use the largest float for "unbounded"."""
+VAST = 1e6  # bounds further apart count as infinite: some environments use the largest float for "unbounded"
 
 
 def finite_range(space: spaces.Box) -> np.ndarray:
@@ -26,10 +25,9 @@ def finite_range(space: spaces.Box) -> np.ndarray:
 
 def kind_of(space: spaces.Space) -> str | None:
     """
-    Return the kind of observation.
+    Return ``"image"``, ``"vector"`` or, if it is not a ``Box``, ``None``.
 
-    :return: ``"image"``: a ``Box`` of three dimensions, one of them the channels, or of two with bytes, and finite
-        bounds; ``"vector"``: any other ``Box``; ``None``: not a ``Box``
+    An image has finite bounds and three dimensions, one of them the channels, or two dimensions and bytes.
     """
     if not isinstance(space, spaces.Box):
         return None
@@ -52,7 +50,6 @@ class Sensor:
     An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
     becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed.
 
-    :param space: The observation space.
     :param scale: Scale of the components of a vector, in the space's shape; see :func:`.observation_scale`.
     """
 
@@ -70,11 +67,9 @@ class Sensor:
         return self.is_image and np.issubdtype(self.space.dtype, np.floating) and self.shape[0] == 1
 
     @property
-    def channel_axis(self) -> int | None:
-        """Axis of the channels: as for Stable-Baselines3, the shortest side, unless it is the middle one."""
-        if len(self.space.shape) == 2:
-            return None
-        return 0 if int(np.argmin(self.space.shape)) == 0 else 2
+    def channels_last(self) -> bool:
+        """Whether the last axis holds the channels: as for Stable-Baselines3, unless the first one is the shortest."""
+        return len(self.space.shape) == 3 and int(np.argmin(self.space.shape)) != 0
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -82,9 +77,8 @@ class Sensor:
         shape = self.space.shape
         if not self.is_image:
             return (int(np.prod(shape)),)
-        if self.channel_axis is None:
-            return (1, *shape)
-        return shape if self.channel_axis == 0 else (shape[2], *shape[:2])
+        channels = (1,) if len(shape) == 2 else ()
+        return (shape[2], *shape[:2]) if self.channels_last else (*channels, *shape)
 
     def to_units(self, observations: np.ndarray) -> np.ndarray:
         """Convert ``(N, *obs)`` to a new array ``(N, C, H, W)`` or ``(N, D)``."""
@@ -96,22 +90,13 @@ class Sensor:
         units = np.multiply(observations, np.float32(1 / (high - low)), dtype=np.float32)
         if low != 0:
             units -= np.float32(low / (high - low))
-        if self.channel_axis is None:
-            return units[:, None]
-        return units if self.channel_axis == 0 else np.moveaxis(units, 3, 1)
+        return np.moveaxis(units, 3, 1) if self.channels_last else units.reshape(len(units), *self.shape)
 
     def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        """
-        Convert back to the order, the bounds and the type of the space.
-
-        :param units: ``(N, C, H, W)`` or ``(N, D)``
-        :param observations: The unperturbed observations, ``(N, *obs)``.
-        :return: ``(N, *obs)``, a new array
-        """
+        """Convert back to the order, bounds and type of the space; components without a scale stay unperturbed."""
         low, high = self.space.low, self.space.high
         if self.is_image:
-            units = units.reshape(observations.shape) if self.channel_axis is None else units
-            units = np.moveaxis(units, 1, 3) if self.channel_axis == 2 else units
+            units = np.moveaxis(units, 1, 3) if self.channels_last else units.reshape(observations.shape)
             if (low == low.flat[0]).all() and (high == high.flat[0]).all():
                 low, high = low.flat[0], high.flat[0]  # much faster than arrays
             lowest, highest = float(np.min(low)), float(np.max(high))

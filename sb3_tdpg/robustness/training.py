@@ -14,8 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch.nn.functional import interpolate
 
-PATTERN_SIZES = (2, 4, 8, 16, 32, 64)
-"""Cells a side of the random patterns: from two halves of the image to single pixels of 64 x 64."""
+PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
 
 
 class VecImagePerturbation(VecEnvWrapper):

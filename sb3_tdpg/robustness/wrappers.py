@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tdpg.robustness.core import Perturber
-from sb3_tdpg.robustness.registry import find
+from sb3_tdpg.robustness.registry import find_applicable
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.sensor import horizon_of
 
@@ -75,15 +75,10 @@ class PerturbedVecEnv(VecEnvWrapper):
         self, venv: VecEnv, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
     ) -> None:
         if not isinstance(venv, VecEnv):
-            raise ValueError(
-                f"{type(venv).__name__} is not a VecEnv of Stable-Baselines3: use make_vec_env, or "
-                "PerturbedObservation for one environment"
-            )
+            name = type(venv).__name__
+            raise ValueError(f"{name} is not a VecEnv of Stable-Baselines3: use make_vec_env, or PerturbedObservation")
         if isinstance(venv, VecNormalize) and venv.norm_obs:
-            raise ValueError(
-                "observations must be perturbed before they are normalised: VecNormalize(PerturbedVecEnv(env, ...)), "
-                "not the other way round"
-            )
+            raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)
         self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale)
 
@@ -107,13 +102,12 @@ class PerturbedVecEnv(VecEnvWrapper):
             return self._perturber(observations), rewards, dones, infos
         # First the observations of the running episodes up to their end, then the first ones of the next episodes.
         last = observations.copy()
-        for i in ended:
-            last[i] = infos[i].get("terminal_observation", observations[i])
-        perturbed = self._perturber(last)
-        infos = list(infos)
-        for i in ended:
-            if "terminal_observation" in infos[i]:
-                infos[i] = {**infos[i], "terminal_observation": perturbed[i].copy()}
+        reported = [i for i in ended if "terminal_observation" in infos[i]]
+        for i in reported:
+            last[i] = infos[i]["terminal_observation"]
+        perturbed, infos = self._perturber(last), list(infos)
+        for i in reported:
+            infos[i] = {**infos[i], "terminal_observation": perturbed[i].copy()}
         self._perturber.begin(ended)
         perturbed[ended] = self._perturber(observations[ended], ended)
         self.reset_infos = self.unwrapped.reset_infos
@@ -123,11 +117,9 @@ class PerturbedVecEnv(VecEnvWrapper):
 def _perturber(
     name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale
 ) -> Perturber:
-    perturbation, space = find(name), env.observation_space
-    perturbation.value(severity)
-    # Checked before the calibration, which takes time.
-    if (objection := perturbation.objection(space, horizon_of(env))) is not None:
-        raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
+    space = env.observation_space
+    perturbation = find_applicable(name, space, horizon_of(env))
+    perturbation.value(severity)  # checked before the calibration, which takes time
     if seed is not None and (isinstance(seed, bool) or seed < 0):
         raise ValueError(f"seed={seed} must be None or an integer of at least 0")
     return Perturber(perturbation, severity, space, n_envs, seed=seed, scale=default_scale(space, env, scale))  # type: ignore[arg-type]

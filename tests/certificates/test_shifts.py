@@ -273,7 +273,7 @@ def test_certify_on_the_command_line(model, tmp_path, capsys):
     [
         (["nothing.zip"], "nothing.zip cannot be read"),
         (["nothing.zip", "--env", "sb3_tdpg:Lava-v0"], "nothing.zip cannot be read"),
-        (["nothing.zip", "--env", "BallCatch-v0"], "certify knows the shifts of Lava-v0 only"),
+        (["nothing.zip", "--env", "BallCatch-v0"], "certify has declared shifts for Lava-v0 only"),
         (["model.zip", "model.zip"], "model.zip is given twice"),
         (["model.zip", "--seed", "-1"], "seed=-1 must be at least 0"),
         (["model.zip", "--n-test-episodes", "1"], "n_test_episodes=1 must be at least 2"),

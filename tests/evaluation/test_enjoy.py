@@ -278,7 +278,7 @@ def no_zip(path):
 
 def a_model_of_ppo(path):
     PPO("MlpPolicy", "Lava-v0", device="cpu").save(path)
-    return "saved by another algorithm"
+    return "another algorithm saved it"
 
 
 @pytest.mark.parametrize("make", [a_missing_file, a_folder, no_zip, a_model_of_ppo])
