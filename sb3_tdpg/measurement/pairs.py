@@ -21,14 +21,7 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator, Scores
 from sb3_tdpg.information.infonce import InfoNCE
 from sb3_tdpg.information.nwj import Nwj
-from sb3_tdpg.measurement.copula_start import (
-    NORMAL,
-    Start,
-    add_up,
-    choose_start,
-    degrees_of_freedom,
-    t_scores,
-)
+from sb3_tdpg.measurement.copula_start import NORMAL, Start, add_up, choose_start, degrees_of_freedom, t_scores
 from sb3_tdpg.networks import BatchedMLP, ELUGradient, flatten_parameters
 
 STEPS_PER_CHECK = 50
@@ -148,9 +141,6 @@ def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor,
     return first, second, single
 
 
-# -- inputs of the critics ------------------------------------------------------------------------------------
-
-
 def _ranks(x: th.Tensor) -> th.Tensor:
     """Return the relative rank of every value in its component, in (0, 1), with ties averaged: ``(..., N, D)``."""
     values = x.mT.contiguous()
@@ -167,12 +157,7 @@ def _features(ranks: th.Tensor) -> th.Tensor:
 
 
 def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """
-    Find the means and the matrices that whiten the features of each kind in all rows.
-
-    :param features: features of x and z, ``(rows, n, J, D)``
-    :return: ``(rows, 1, J, D)`` and ``(rows, J, D, D)``
-    """
+    """Find means and matrices that whiten: ``(rows, n, J, D) -> (rows, 1, J, D), (rows, J, D, D)``."""
     mean = features.mean(1, keepdim=True)
     centred = features - mean
     variances, axes = th.linalg.eigh(th.einsum("rnjd,rnje->rjde", centred, centred) / features.shape[1])
@@ -234,9 +219,6 @@ class _StartedGradient(ELUGradient):
         return start + super().forward(inputs)
 
 
-# -- folds ----------------------------------------------------------------------------------------------------
-
-
 def _cross_fit(
     x: th.Tensor,
     z: th.Tensor,
@@ -288,10 +270,11 @@ def _cross_fit(
     choice = _Choice(estimator.refit_below, estimator.refit_above, first, read(start, seen))
     best = first.mean(-1)
     n_stale, n_done = th.zeros_like(best), 0  # (M,)
-    samples = on_train[..., None], on_train[..., None] + n_places, None, th.arange(n_rows)
+    partners = on_train[..., None] + n_places
+    samples = InformationBatch(on_train[..., None], partners, partners, partners)
     while n_done < max_gradient_steps and (training := n_stale < patience).any():
         n_steps = min(STEPS_PER_CHECK, max_gradient_steps - n_done)
-        estimator._ascend(critic, optimizer, *samples, n_steps)
+        estimator._ascend(critic, optimizer, samples, th.arange(n_rows), n_steps)
         n_done += n_steps
         current = read(averaged, fresh)
         choice.consider(current, lambda: read(averaged, seen), training)
@@ -358,15 +341,10 @@ def _read(estimator: CriticEstimator, critic: nn.Module, x: th.Tensor, z: th.Ten
 
 class _Choice:
     """
-    Choose the length of training for each fold by the estimates of the other folds.
+    Choose the length of training for each fold by the estimates of the other folds, ``(M, K)`` for each critic.
 
     Critics with an estimate out of bounds in any fold have diverged and are not chosen. Estimates on training pairs are
     computed only where a critic may be chosen.
-
-    :param lowest: lower bound of the estimates
-    :param highest: upper bound of the estimates
-    :param held_out: estimates of the start, ``(M, K)``
-    :param trained_on: estimates of the start, ``(M, K)``
     """
 
     def __init__(self, lowest: float, highest: float, held_out: th.Tensor, trained_on: th.Tensor) -> None:
@@ -375,13 +353,7 @@ class _Choice:
         self._best = self._others(held_out).where(self._counts(held_out) & self._counts(trained_on), -th.inf)
 
     def consider(self, held_out: th.Tensor, trained_on: Callable[[], th.Tensor], training: th.Tensor) -> None:
-        """
-        Choose a critic for the folds where it is better than the earlier ones.
-
-        :param held_out: ``(M, K)``
-        :param trained_on: returns ``(M, K)``
-        :param training: whether each problem is still in training, ``(M,)``
-        """
+        """Choose a critic for the folds where it is better than the earlier ones, in the problems in training."""
         others = self._others(held_out)
         better = (others > self._best) & self._counts(held_out) & training[:, None]
         if better.any():
