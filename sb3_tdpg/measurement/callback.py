@@ -48,10 +48,8 @@ class InformationCallback(TDPGCallback):
             return
         batch = model.rollout_buffer.episode_batch().information_batch()
         self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
-        lower, upper = self.interval.total
-        self.logger.record("mi/lower", lower)
-        self.logger.record("mi/upper", upper)
-        for limit in ("lower", "upper"):
+        for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
+            self.logger.record(f"mi/{limit}", total)
             for t, value in enumerate(getattr(self.interval, limit).tolist()):
                 if np.isfinite(value):
                     self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))

@@ -27,8 +27,7 @@ class TrustCheck:
     name: str
     value: float
     threshold: float
-    meaning: str
-    """The meaning of the value, and its unit."""
+    meaning: str  # of the value, with its unit
 
     @property
     def passed(self) -> bool:
@@ -97,15 +96,13 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
             f"no time step has an interval to check: at most {interval.n_episodes.max(initial=0)} episodes are alive"
         )
     miss = FALSE_ALARM / len(steps)
-    quantile = normal_quantile(miss)
     checks = (
         _shuffled_pairs(batch, steps, normal_quantile(miss / len(LOWER_BOUNDS)), seed),
-        _data_processing(batch, interval, steps, quantile, seed),
+        _data_processing(batch, interval, steps, normal_quantile(miss), seed),
         _encoder_density(batch, steps, normal_quantile(miss / 2)),  # either sign counts
     )
-    cap = np.log(interval.n_episodes[steps])
     lower = np.maximum(*(interval.estimates[name][steps] for name in LOWER_BOUNDS))
-    capped = steps[lower >= NEAR_THE_CAP * cap]
+    capped = steps[lower >= NEAR_THE_CAP * np.log(interval.n_episodes[steps])]
     return TrustBadge(checks, tuple(capped.tolist()))
 
 
@@ -116,12 +113,8 @@ def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float,
         order = rng.permutation(np.flatnonzero(batch.living[t].cpu()))
         states[t, order] = batch.states[t, np.roll(order, 1)]  # one cycle, so no episode keeps its own state
     null = information_interval(batch._replace(states=states), seed=seed)
-    return _worst(
-        "shuffled pairs",
-        np.concatenate([null.estimates[name][steps] for name in LOWER_BOUNDS]),
-        quantile * np.concatenate([null.errors[name][steps] for name in LOWER_BOUNDS]),
-        "nats that a lower bound finds without any information",
-    )
+    found, errors = (np.concatenate([of[name][steps] for name in LOWER_BOUNDS]) for of in (null.estimates, null.errors))
+    return _worst("shuffled pairs", found, quantile * errors, "nats that a lower bound finds without any information")
 
 
 def _data_processing(
@@ -133,16 +126,14 @@ def _data_processing(
     stds = (batch.stds.square() + ADDED_VARIANCE * total / living.sum(1, keepdim=True).clamp(min=1)).sqrt()
     noisier = batch._replace(trvs=batch.means + (batch.trvs - batch.means) * stds / batch.stds, stds=stds)
     copy = information_interval(noisier, confidence=interval.confidence, seed=seed)
-    name = "data processing"
-    in_order = _worst(
-        name,
-        (copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0))[steps],
-        quantile * np.hypot(copy.errors["critic"], interval.errors["critic"])[steps],
-        "nats by which the critic's bound of a noisier copy of the TRVs is higher",
-    )
-    meaning = "nats by which the lower limit of a noisier copy of the TRVs is above the upper limit"
-    crossed = _worst(name, (copy.lower - interval.upper)[steps], np.zeros(len(steps)), meaning)
-    return in_order if crossed.passed else crossed
+    crossed = (copy.lower - interval.upper)[steps]
+    if not (crossed <= 0).all():
+        meaning = "nats by which the lower limit of a noisier copy of the TRVs is above the upper limit"
+        return _worst("data processing", crossed, np.zeros(len(steps)), meaning)
+    excess = copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0)
+    errors = np.hypot(copy.errors["critic"], interval.errors["critic"])
+    meaning = "nats by which the critic's bound of a noisier copy of the TRVs is higher"
+    return _worst("data processing", excess[steps], quantile * errors[steps], meaning)
 
 
 def _encoder_density(batch: InformationBatch, steps: np.ndarray, quantile: float) -> TrustCheck:

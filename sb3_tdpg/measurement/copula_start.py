@@ -33,17 +33,13 @@ def _quadratic(y: th.Tensor, matrix: th.Tensor) -> th.Tensor:
 
 
 def _scatter(y: th.Tensor, nu: th.Tensor) -> th.Tensor:
-    """
-    Fit the scatter matrix of a multivariate t around 0 by expectation-maximisation: ``(rows, n, D) -> (rows, D, D)``.
-
-    It stays invertible where components are constant or copies of each other.
-    """
+    """Fit the scatter matrix of a multivariate t around 0 by expectation-maximisation: ``(rows, D, D)``."""
     n, dim = y.shape[1:]
     nu = nu[:, None, None]
     scatter = th.eye(dim, dtype=y.dtype).expand(len(y), -1, -1)
     for _ in range(N_SCATTER_STEPS):
         weights = (nu + dim) / (nu + _quadratic(y, th.linalg.inv(scatter)))
-        scatter = (weights * y).mT @ y / n + 1e-4 * th.eye(dim, dtype=y.dtype)
+        scatter = (weights * y).mT @ y / n + 1e-4 * th.eye(dim, dtype=y.dtype)  # invertible if components are copies
     return scatter
 
 
@@ -115,8 +111,7 @@ class Start(nn.Module):
             logarithm = half * th.log1p(_quadratic(own, th.linalg.inv(block)) / nu)
             terms.append(th.cat([own @ root[..., part, :], logarithm], -1))
         terms[0][..., -1:] += constant
-        factor = ((nu + dim) / 2).expand(-1, n_folds, -1, -1)
-        return cls(th.stack(terms).flatten(0, 3), factor.flatten(0, 1))
+        return cls(th.stack(terms).flatten(0, 3), ((nu + dim) / 2).expand(-1, n_folds, -1, -1).flatten(0, 1))
 
     def flat_like(self, level: float) -> Start:
         """Return a start of the same shape that is ``level`` everywhere."""
@@ -136,8 +131,7 @@ class Start(nn.Module):
 
 def choose_start(starts: Sequence[Start], chosen: th.Tensor) -> Start:
     """Take for each row the start with the index ``chosen``, ``(rows,)``."""
-    n_rows = len(chosen)
-    rows = th.arange(n_rows)
-    tables = th.stack([start.table.unflatten(0, (2, n_rows, -1)) for start in starts], 2)
-    table = tables[:, rows, chosen]  # (2, rows, N, X + Z + 1)
-    return Start(table.flatten(0, 2), th.stack([start.factor for start in starts])[chosen, rows])
+    rows = th.arange(len(chosen))
+    tables = th.stack([start.table.unflatten(0, (2, len(rows), -1)) for start in starts], 2)
+    factors = th.stack([start.factor for start in starts])
+    return Start(tables[:, rows, chosen].flatten(0, 2), factors[chosen, rows])

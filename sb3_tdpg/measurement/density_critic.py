@@ -57,9 +57,8 @@ class DensityCritic:
         self._regression = Regression(train.states, np.concatenate([train.means, log_stds], axis=1))
         residuals = self._regression.residuals[:, : train.means.shape[1]]
         # Coordinates in which both the encoder's variance and the covariance of the residuals are diagonal.
-        self._noise_rotation, self._residual_variance, self._noise_log_volume = whiten(
-            noise, residuals.T @ residuals / len(residuals)
-        )
+        covariance = residuals.T @ residuals / len(residuals)
+        self._noise_rotation, self._residual_variance, self._noise_log_volume = whiten(noise, covariance)
 
         n, n_draws, dim = train.trvs.shape
         self._centre = train.means.mean(axis=0)
@@ -75,8 +74,7 @@ class DensityCritic:
 
     def log_marginal(self, trvs: np.ndarray) -> np.ndarray:
         """Return log a(x~), a normalised density: ``(M, Z) -> (M,)``."""
-        points = (trvs - self._centre) @ self._rotation.T
-        return self._log_mixture(points, self._smoothing) + self._log_volume
+        return self._log_mixture((trvs - self._centre) @ self._rotation.T, self._smoothing) + self._log_volume
 
     def scores(self, states: np.ndarray, trvs: np.ndarray, log_marginal: np.ndarray) -> np.ndarray:
         """Evaluate F for every x~ with every x, given log a(x~): ``(n, X), (M, Z), (M,) -> (M, n)``."""
@@ -92,14 +90,11 @@ class DensityCritic:
 
     def _log_mixture(self, points: np.ndarray, smoothing: float, own: np.ndarray | None = None) -> np.ndarray:
         """Return the log-density of the smoothed mixture at rotated points, without their ``own`` components."""
-        log_density = log_gaussians(
-            points, math.sqrt(1 - smoothing) * self._components, self._variances + smoothing * self._spread
-        )
-        n = log_density.shape[1]
+        variances = self._variances + smoothing * self._spread
+        log_density = log_gaussians(points, math.sqrt(1 - smoothing) * self._components, variances)
         if own is not None:
             log_density[np.arange(len(points)), own] = -np.inf
-            n -= 1
-        return logsumexp(log_density, axis=1) - math.log(n)
+        return logsumexp(log_density, axis=1) - math.log(log_density.shape[1] - (own is not None))
 
 
 class GaussianCritic:

@@ -30,8 +30,7 @@ from sb3_tdpg.measurement.interval_bounds import (
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
-# Shares of the probability to miss that the lower and the upper limit spend. The rest allows for skewness, which the
-# limits neglect: it makes the upper limits too low and the lower ones too cautious (2 % become about 3 % and 1.5 %).
+# Shares of the probability to miss. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
 LOWER_BOUNDS = ("critic", "gaussian")
@@ -190,11 +189,10 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of
     the probability to miss, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
-    contributions of episodes, which resembles that of a chi-square: means that are too low come with standard errors
-    that are too small, so the upper limits miss more often than a Gaussian would. The shares depend on the gap between
-    the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since the tightest is
-    chosen (``joint_quantile``). The confidence is that of each step alone, not of all steps together. Above about
-    ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
+    contributions of episodes: means that are too low come with standard errors that are too small. The shares depend on
+    the gap between the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since
+    the tightest is chosen (``joint_quantile``). The confidence is that of each step alone. Above about ``ln N`` nats
+    the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
     :param confidence: Probability, at least, that the interval of a step contains the truth.
@@ -203,9 +201,8 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
-    names = (*LOWER_BOUNDS, *UPPER_BOUNDS)
     horizon, n_episodes = len(batch.trvs), batch.living.sum(1).cpu().numpy()
-    estimates, errors = ({name: np.full(horizon, np.nan) for name in names} for _ in range(2))
+    estimates, errors = ({name: np.full(horizon, np.nan) for name in LOWER_BOUNDS + UPPER_BOUNDS} for _ in range(2))
     limits = np.full((2, horizon), np.nan)
     lower_by, upper_by = [""] * horizon, [""] * horizon
     for t, step, rng in _steps(batch, seed):
@@ -214,15 +211,11 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
         above = dict(logdet=log_det_bound(step), loo=leave_one_out_bound(step), marginal=marginal)
         for name, bound in (below | above).items():
             estimates[name][t], errors[name][t] = bound.value, bound.error
-        below, above = (
-            {name: bound for name, bound in side.items() if np.isfinite(bound.value)} for side in (below, above)
-        )
+        below, above = ({name: b for name, b in side.items() if np.isfinite(b.value)} for side in (below, above))
         gap = _gap(below.values(), above.values())
-        miss_below, miss_above = (
-            miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)
-        )
-        lower_by[t], lower = limit(below, miss_below, sign=-1)
-        upper_by[t], upper = limit(above, miss_above, sign=1)
+        miss = [miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)]
+        lower_by[t], lower = limit(below, miss[0], sign=-1)
+        upper_by[t], upper = limit(above, miss[1], sign=1)
         if lower <= 0:
             lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
@@ -265,9 +258,8 @@ def check_batch(batch: InformationBatch) -> None:
         raise ValueError(
             f"the batch has shapes {shapes}: expected (T, N, X) for the states and (T, N, Z) for trvs, means and stds"
         )
-    alive = slice(None) if batch.alive is None else batch.alive
     for name in shapes:
-        if not th.isfinite(getattr(batch, name)[alive]).all():
+        if not th.isfinite(getattr(batch, name)[batch.living]).all():
             raise ValueError(f"the batch's {name} are not all finite")
-    if not (batch.stds[alive] > 0).all():
+    if not (batch.stds[batch.living] > 0).all():
         raise ValueError("the batch's stds must be positive: they are the encoder's standard deviations")

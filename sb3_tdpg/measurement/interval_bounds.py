@@ -104,8 +104,7 @@ class FreshPairs:
 
     def bound(self) -> Estimate:
         """Bound the information from below; all episodes must have been fresh equally often, and at least once."""
-        times = self._pair_times.copy()
-        np.fill_diagonal(times, 0)  # no episode is paired with itself
+        times = np.where(np.eye(len(self._times)), 0, self._pair_times)  # no episode is paired with itself
         ratios = np.divide(self._ratios, times, out=np.zeros_like(times), where=times > 0)
         return donsker_varadhan(self._joint / self._times, ratios, int((times > 0).sum()), self.log_clip)
 
@@ -142,14 +141,13 @@ def gaussian_bound(step: Encoded, rng: np.random.Generator) -> Estimate:
     n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
     some = np.arange(max(1, 2 * n_mirrored // 3))  # fewer draws, since there are many critics
     draws = step._replace(trvs=step.trvs[:, np.concatenate([some, some + n_mirrored])])
-    moments = step._replace(trvs=step.trvs[:, :0])
     groups = np.array_split(rng.permutation(n), GROUPS[n > MAX_REDIVIDED])
     pairs = FreshPairs(n)
     for left_out in combinations(range(len(groups)), 2):
         fresh = np.concatenate([groups[g] for g in left_out])
         train = np.concatenate([group for g, group in enumerate(groups) if g not in left_out])
         evaluated = draws.select(fresh)
-        critic = GaussianCritic(moments.select(train))
+        critic = GaussianCritic(draws.select(train))
         pairs.add(fresh, critic.scores(evaluated.states, evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])))
     return pairs.bound().less_noise(noise_controls(draws))
 
@@ -159,10 +157,8 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
     Compute the Donsker-Varadhan bound from the scores.
 
     With several critics, e^F is averaged over all of them before the logarithm. By Jensen's inequality the result is
-    still a lower bound, and its mean is estimated from more pairs.
-
-    The mean is at least that of a few clipped pairs. Otherwise it would be 0, and the bound infinite, where no
-    episode's TRVs fit the state of another.
+    still a lower bound, and its mean is estimated from more pairs. The mean is at least that of a few clipped pairs, so
+    that the bound stays finite where no episode's TRVs fit the state of another.
 
     :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
     :param ratios: e^F of the TRVs of each episode with the state of each, ``(n, n)``; 0 where they are not paired.
