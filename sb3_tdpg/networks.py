@@ -55,12 +55,7 @@ class BatchedMLP(nn.Module):
     :param activation_fn: Nonlinearity after each layer but the last.
     """
 
-    def __init__(
-        self,
-        n_maps: int,
-        sizes: Sequence[int],
-        activation_fn: type[nn.Module] = nn.ELU,
-    ) -> None:
+    def __init__(self, n_maps: int, sizes: Sequence[int], activation_fn: type[nn.Module] = nn.ELU) -> None:
         super().__init__()
         self.n_maps = n_maps
         self.layers = nn.ModuleList(BatchedLinear(n_maps, i, o) for i, o in pairwise(sizes))
@@ -170,12 +165,7 @@ class TimeMLP(nn.Module):
     """
 
     def __init__(
-        self,
-        horizon: int,
-        sizes: Sequence[int],
-        activation_fn: type[nn.Module] = nn.ELU,
-        *,
-        time_varying: bool = True,
+        self, horizon: int, sizes: Sequence[int], activation_fn: type[nn.Module] = nn.ELU, *, time_varying: bool = True
     ) -> None:
         super().__init__()
         self.horizon = horizon

@@ -27,9 +27,8 @@ ESTIMATORS: dict[str, type[InformationEstimator]] = {
 
 def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[InformationEstimator]:
     """
-    Return the class of an estimator.
+    Return the class of an estimator that is named in :data:`ESTIMATORS` or is such a class itself.
 
-    :param estimator: A name in :data:`ESTIMATORS`, or a subclass of :class:`InformationEstimator`.
     :raises ValueError: if it is neither.
     """
     if isinstance(estimator, str) and estimator in ESTIMATORS:

@@ -22,6 +22,11 @@ class InformationBatch(NamedTuple):
     stds: th.Tensor  # (T, N, Z)
     alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
 
+    @property
+    def living(self) -> th.Tensor:
+        """Which episodes are alive, also if ``alive`` is None: ``(T, N)`` bool."""
+        return self.trvs.new_ones(self.trvs.shape[:2], dtype=th.bool) if self.alive is None else self.alive
+
     def at(self, t: int) -> InformationBatch:
         """Select step t and its living episodes: ``(1, n, ...)``."""
         keep = slice(None) if self.alive is None else self.alive[t]
@@ -38,8 +43,8 @@ class InformationEstimator(nn.Module):
     Estimates I[x_t; x~_t] in nats for every time step at once.
 
     :param horizon: Number of time steps T.
-    :param state_dim: X
-    :param trv_dim: Z
+    :param state_dim: Number of components X of the state.
+    :param trv_dim: Number of TRVs Z.
     """
 
     bound: ClassVar[Literal["lower", "upper", "neither"]]
@@ -52,11 +57,7 @@ class InformationEstimator(nn.Module):
         self.trv_dim = trv_dim
 
     def fit(self, batch: InformationBatch) -> dict[str, float]:
-        """
-        Fit the estimator to detached samples; does nothing for a bound without parameters.
-
-        :return: diagnostics for the log
-        """
+        """Fit the estimator, if it has parameters, to detached samples, and return diagnostics for the log."""
         return {}
 
     def forward(self, batch: InformationBatch) -> th.Tensor:
@@ -80,8 +81,4 @@ class InformationEstimator(nn.Module):
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        """
-        Estimate all steps (``t=None``, ``(T, N, ...) -> (T,)``) or only step t (``(1, n, ...) -> (1,)``).
-
-        All episodes of the batch are alive.
-        """
+        """Estimate all steps (``t=None``, ``(T, N, ...) -> (T,)``) or one (``(1, n, ...) -> (1,)``) where all live."""

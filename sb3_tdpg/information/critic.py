@@ -42,9 +42,6 @@ class CriticEstimator(InformationEstimator):
 
     A subclass defines the bound (:meth:`_bound`), and the critics' objective (:meth:`_objective`) if it is another one.
 
-    :param horizon: Number of time steps T.
-    :param state_dim: X
-    :param trv_dim: Z
     :param hidden_sizes: Hidden layers of each critic.
     :param activation_fn: Nonlinearity of the critics.
     :param learning_rate: Adam's learning rate.
@@ -60,8 +57,7 @@ class CriticEstimator(InformationEstimator):
     :param reset_moments: Whether Adam's moments start from zero in each epoch, since the data have changed.
     :param standardize: Whether to standardise each component of the state at each time step.
     :param held_out: Share of the episodes, drawn in each fit, that the critics are not trained on. :meth:`fit` reports
-        the estimates on these and on the others, summed over the time steps, as ``"held_out"`` and ``"trained_on"``. If
-        the latter is much larger, the critics overfit.
+        both estimates, summed over time, as ``"held_out"`` and ``"trained_on"``: a large gap means overfitting.
     """
 
     def __init__(
@@ -128,14 +124,7 @@ class CriticEstimator(InformationEstimator):
         return self._bound(scores)
 
     def _pair(self, states: th.Tensor, trvs: th.Tensor, other_trvs: th.Tensor) -> th.Tensor:
-        """
-        Build the critic's inputs: the joint samples, then the marginal ones.
-
-        :param states: ``(..., B, X)``
-        :param trvs: TRVs of the same episodes, ``(..., B, Z)``
-        :param other_trvs: TRVs of other episodes, ``(..., B, Z)``
-        :return: ``(..., B + B * K, X + Z)``
-        """
+        """Pair states ``(..., B, X)`` with their TRVs, then with those of others: ``(..., B + B * K, X + Z)``."""
         return th.cat([th.cat([states, trvs], -1), th.cat([states, other_trvs], -1)], dim=-2)
 
     def _split(self, values: th.Tensor, n: int) -> Scores:
@@ -143,34 +132,32 @@ class CriticEstimator(InformationEstimator):
         values = values.squeeze(-1)
         return Scores(values[:, :n], values[:, n:].unflatten(1, (n, -1)))
 
+    @th.no_grad()
     def fit(self, batch: InformationBatch) -> dict[str, float]:
         """Train the critics on the epoch's samples (Algorithm 1); see :class:`InformationEstimator`."""
         train, held_out = self._hold_out(batch)
-        states, trvs = train.states.detach(), train.trvs.detach()
         if self.standardize:
             self._update_scaling(train)
-        states = self._scale(states)
-        steps = th.arange(self.horizon, device=trvs.device)
-        if train.alive is not None:
-            steps = steps[train.alive.sum(1) >= self.min_episodes(train.alive.shape[1])]
-        if len(steps) == 0:
-            return self._report(0, train, held_out, steps)
-
-        optimizer = self.make_optimizer(self.critic)
-        (vector,) = optimizer.param_groups[0]["params"]
-        if self.moments and not self.reset_moments:
-            optimizer.state[vector] = {name: moment.to(vector.device) for name, moment in self.moments.items()}
-        n_steps = self.gradient_steps if self.is_warm else max(self.warmup_gradient_steps, self.gradient_steps)
-        self._ascend(self.critic, optimizer, states, trvs, train.alive, steps, n_steps)
-        self.moments = optimizer.state[vector]
-        self.is_warm = True
-
-        with th.no_grad():
+        steps = (train.living.sum(1) >= self.min_episodes(train.trvs.shape[1])).nonzero()[:, 0]
+        broken = steps
+        if len(steps) > 0:
+            samples = train._replace(states=self._scale(train.states))
+            optimizer = self.make_optimizer(self.critic)
+            (vector,) = optimizer.param_groups[0]["params"]
+            if self.moments and not self.reset_moments:
+                optimizer.state[vector] = {name: moment.to(vector.device) for name, moment in self.moments.items()}
+            n_steps = self.gradient_steps if self.is_warm else max(self.warmup_gradient_steps, self.gradient_steps)
+            self._ascend(self.critic, optimizer, samples, steps, n_steps)
+            self.moments = optimizer.state[vector]
+            self.is_warm = True
             estimate = self(batch)[steps]  # on all episodes, like the policy's loss
-        broken = steps[~((estimate >= self.refit_below) & (estimate <= self.refit_above))]  # NaN compares false
-        if len(broken) > 0:
-            self._refit(states, trvs, train.alive, broken)
-        return self._report(len(broken), train, held_out, steps)
+            broken = steps[~((estimate >= self.refit_below) & (estimate <= self.refit_above))]  # NaN compares false
+            if len(broken) > 0:
+                self._refit(samples, broken)
+        report = {"critic_refits": float(len(broken))}
+        if held_out is not None:
+            report |= {"trained_on": self._total(train, steps), "held_out": self._total(held_out, steps)}
+        return report
 
     def make_optimizer(self, critic: BatchedMLP) -> th.optim.Adam:
         """Make an Adam that moves all parameters of a network as one vector, which is much faster."""
@@ -190,17 +177,6 @@ class CriticEstimator(InformationEstimator):
         order = th.randperm(n, device=batch.trvs.device)
         return batch.select(order[n_held_out:]), batch.select(order[:n_held_out])
 
-    @th.no_grad()
-    def _report(
-        self, n_refits: int, train: InformationBatch, held_out: InformationBatch | None, steps: th.Tensor
-    ) -> dict[str, float]:
-        """Build the result of :meth:`fit`; ``steps`` are the trained ones."""
-        report = {"critic_refits": float(n_refits)}
-        if held_out is not None:
-            report["trained_on"] = self._total(train, steps)
-            report["held_out"] = self._total(held_out, steps)
-        return report
-
     def _total(self, batch: InformationBatch, steps: th.Tensor) -> float:
         """Sum the estimates of some steps over those with enough living episodes."""
         living = ((t, batch.at(t)) for t in steps.tolist())
@@ -208,22 +184,15 @@ class CriticEstimator(InformationEstimator):
 
     @th.no_grad()
     def _ascend(
-        self,
-        critic: BatchedMLP,
-        optimizer: th.optim.Optimizer,
-        states: th.Tensor,
-        trvs: th.Tensor,
-        alive: th.Tensor | None,
-        steps: th.Tensor,
-        n_gradient_steps: int,
+        self, critic: BatchedMLP, optimizer: th.optim.Optimizer, batch: InformationBatch, steps: th.Tensor, n_steps: int
     ) -> None:
-        """Maximise the objective; ``critic`` has one network for each row of ``states`` and ``trvs``."""
-        n_rows, n_episodes = trvs.shape[:2]
+        """Maximise the objective; ``critic`` has one network for each row of the batch."""
+        n_rows, n_episodes = batch.trvs.shape[:2]
         n = min(self.batch_size, n_episodes // 2)
         # In a refit the rows are those of `steps`; otherwise `steps` selects rows.
         rows = slice(None) if len(steps) == n_rows else steps
         by_hand = critic.gradient_by_hand() if self.activation_fn is nn.ELU else None
-        for inputs in self._minibatches(states, trvs, alive, n, n_gradient_steps):
+        for inputs in self._minibatches(batch, n, n_steps):
             if by_hand is not None:
                 by_hand.backward(self._objective_gradient(by_hand.forward(inputs), n, rows, steps))
             else:
@@ -233,67 +202,52 @@ class CriticEstimator(InformationEstimator):
                 values.backward(self._objective_gradient(values.detach(), n, rows, steps))
             optimizer.step()
 
-    def _minibatches(
-        self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, n: int, n_gradient_steps: int
-    ) -> Iterator[th.Tensor]:
+    def _minibatches(self, batch: InformationBatch, n: int, n_steps: int) -> Iterator[th.Tensor]:
         """Draw the critics' inputs for each gradient step from n joint samples and the TRVs of n other episodes."""
-        n_rows, n_episodes = trvs.shape[:2]
+        (n_rows, n_episodes), device, alive = batch.trvs.shape[:2], batch.trvs.device, batch.alive
         # Draw as many steps at once as memory allows: a call takes as long as a gradient step.
         per_step = n_rows * (n_episodes + self._n_pairs(n) * sum(self.sizes[:1]))
-        chunk = max(1, min(n_gradient_steps, 4_000_000 // per_step))
-        for start in range(0, n_gradient_steps, chunk):
-            size = min(chunk, n_gradient_steps - start)
+        chunk = max(1, min(n_steps, 4_000_000 // per_step))
+        for start in range(0, n_steps, chunk):
+            size = min(chunk, n_steps - start)
             if alive is None:
-                chosen = th.rand(size, 1, n_episodes, device=trvs.device).topk(2 * n, dim=2).indices
+                chosen = th.rand(size, 1, n_episodes, device=device).topk(2 * n, dim=2).indices
             else:
                 # Dead episodes come last; steps with fewer than 2n living ones are not trained.
-                priority = th.rand(size, *alive.shape, device=trvs.device).masked_fill(~alive, 2.0)
+                priority = th.rand(size, *alive.shape, device=device).masked_fill(~alive, 2.0)
                 chosen = priority.topk(2 * n, dim=2, largest=False).indices
             # Selecting rows of (T * N, .) is faster than indexing two dimensions.
-            index = (chosen + n_episodes * th.arange(n_rows, device=trvs.device)[:, None]).flatten()
-            chosen_states, chosen_trvs = (
-                x.flatten(0, 1).index_select(0, index).view(size, n_rows, 2 * n, -1) for x in (states, trvs)
-            )
-            yield from self._pair(chosen_states[..., :n, :], chosen_trvs[..., :n, :], chosen_trvs[..., n:, :])
+            index = (chosen + n_episodes * th.arange(n_rows, device=device)[:, None]).flatten()
+            states, trvs = (x.flatten(0, 1).index_select(0, index).view(size, n_rows, 2 * n, -1) for x in batch[:2])
+            yield from self._pair(states[..., :n, :], trvs[..., :n, :], trvs[..., n:, :])
 
     def _n_pairs(self, n: int) -> int:
         """Return the number of the critic's inputs for a minibatch of n."""
         return 2 * n
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """
-        Differentiate the negative objective with respect to the critic's outputs.
-
-        :param values: outputs for the inputs of :meth:`_pair`, ``(T, B + B * K, 1)``
-        :param n: minibatch size B
-        :param rows: the rows of ``values`` to train
-        :param steps: their time steps
-        :return: ``(T, B + B * K, 1)``
-        """
+        """Differentiate the negative objective of the time steps ``steps``, in these rows, by the critic's outputs."""
         with th.enable_grad():
             values = values.requires_grad_()
             scores = self._split(values, n)
             loss = -self._objective(Scores(scores.joint[rows], scores.marginal[rows]), steps).sum()
             return th.autograd.grad(loss, values)[0]
 
-    def _refit(self, states: th.Tensor, trvs: th.Tensor, alive: th.Tensor | None, broken: th.Tensor) -> None:
+    def _refit(self, batch: InformationBatch, broken: th.Tensor) -> None:
         """Fit the critics of the steps ``broken`` from new weights."""
-        fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(trvs)
+        fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(batch.trvs)
         self._forget(broken)
         self.moments = {}  # the old moments may not be finite, either
-        rows = None if alive is None else alive[broken]
-        optimizer = self.make_optimizer(fresh)
-        self._ascend(fresh, optimizer, states[broken], trvs[broken], rows, broken, self.refit_gradient_steps)
-        with th.no_grad():
-            for parameter, fresh_parameter in zip(self.critic.parameters(), fresh.parameters(), strict=True):
-                parameter[broken] = fresh_parameter
+        rows = InformationBatch(*(None if x is None else x[broken] for x in batch))
+        self._ascend(fresh, self.make_optimizer(fresh), rows, broken, self.refit_gradient_steps)
+        for parameter, fresh_parameter in zip(self.critic.parameters(), fresh.parameters(), strict=True):
+            parameter[broken] = fresh_parameter
 
     def _forget(self, steps: th.Tensor) -> None:
         """Reset what a subclass stores for these steps in addition to the weights."""
 
-    @th.no_grad()
     def _update_scaling(self, batch: InformationBatch) -> None:
-        weight = th.ones_like(batch.states[..., :1]) if batch.alive is None else batch.alive[..., None].float()
+        weight = batch.living[..., None].float()
         total = weight.sum(1, keepdim=True).clamp(min=1)
         self.state_mean = (batch.states * weight).sum(1, keepdim=True) / total
         variance = (weight * (batch.states - self.state_mean) ** 2).sum(1, keepdim=True) / total
@@ -311,8 +265,7 @@ class CriticEstimator(InformationEstimator):
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         states, trvs = self._scale(batch.states, t), batch.trvs
         n = trvs.shape[1]
-        other_trvs = trvs[:, derange(n, trvs.device)]
-        inputs = self._pair(states, trvs, other_trvs)
+        inputs = self._pair(states, trvs, trvs[:, derange(n, trvs.device)])
         values = self.critic(inputs) if t is None else self.critic.at(inputs[0], t)[None]
         return self._bound(self._split(values, n))
 

@@ -8,6 +8,8 @@ import torch as th
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
+Prior = tuple[th.Tensor, th.Tensor, th.Tensor]  # means and variances, (T, K, Z), and logarithms of the weights, (T, K)
+
 
 class VariationalBottleneck(InformationEstimator):
     r"""
@@ -34,9 +36,6 @@ class VariationalBottleneck(InformationEstimator):
     Before the first fit the prior is the standard normal. On the samples of the fit, the estimate is too low by about
     d / N for d TRVs and each component.
 
-    :param horizon: Number of time steps T.
-    :param state_dim: X
-    :param trv_dim: Z
     :param n_components: Number of Gaussians K in the prior of a time step.
     :param em_steps: Steps of expectation-maximisation in each fit; unused with one component.
     :raises ValueError: if a number is below 1.
@@ -69,27 +68,19 @@ class VariationalBottleneck(InformationEstimator):
         It does not change at steps with fewer than ``min_episodes`` of them.
         """
         means, variances = batch.means.detach(), batch.stds.detach().square()  # (T, N, Z)
-        alive = th.ones(means.shape[:2], dtype=th.bool, device=means.device) if batch.alive is None else batch.alive
-        enough = alive.sum(1) >= self.min_episodes(alive.shape[1])
-        means, variances, alive = means[enough], variances[enough], alive[enough]
-        if len(means) == 0:
-            return {}
+        enough = batch.living.sum(1) >= self.min_episodes(means.shape[1])
+        means, variances, alive = means[enough], variances[enough], batch.living[enough]
         # Values after the end of an episode are arbitrary.
         means, variances = (x.masked_fill(~alive[:, :, None], 1.0) for x in (means, variances))
         weight = alive.to(means.dtype)
-        one = _moments(means, variances, weight[:, :, None])  # one Gaussian: (T, 1, Z)
-        if self.n_components == 1:
-            self._set_prior(enough, one)
-            return {}
-        prior = _moments(means, variances, self._slices(means, alive) * weight[:, :, None], pseudo=one)
-        for _ in range(self.em_steps):
-            responsibility = th.softmax(_log_joint(means, variances, prior), dim=2)
-            prior = _moments(means, variances, responsibility * weight[:, :, None], pseudo=one)
-        self._set_prior(enough, prior)
+        prior = one = _moments(means, variances, weight[:, :, None])  # one Gaussian: (T, 1, Z)
+        if self.n_components > 1:
+            prior = _moments(means, variances, self._slices(means, alive) * weight[:, :, None], pseudo=one)
+            for _ in range(self.em_steps):
+                responsibility = th.softmax(_log_joint(means, variances, prior), dim=2)
+                prior = _moments(means, variances, responsibility * weight[:, :, None], pseudo=one)
+        self.prior_mean[enough], self.prior_var[enough], self.prior_log_weight[enough] = prior
         return {}
-
-    def _set_prior(self, steps: th.Tensor, prior: tuple[th.Tensor, th.Tensor, th.Tensor]) -> None:
-        self.prior_mean[steps], self.prior_var[steps], self.prior_log_weight[steps] = prior
 
     def _slices(self, means: th.Tensor, alive: th.Tensor) -> th.Tensor:
         """Cut the episodes into K slices of equal size along the direction of most variance: ``(T, N, K)``."""
@@ -107,7 +98,7 @@ class VariationalBottleneck(InformationEstimator):
         return -th.logsumexp(_log_joint(batch.means, batch.stds.square(), prior), dim=2).mean(dim=1)
 
 
-def _log_joint(means: th.Tensor, variances: th.Tensor, prior: tuple[th.Tensor, th.Tensor, th.Tensor]) -> th.Tensor:
+def _log_joint(means: th.Tensor, variances: th.Tensor, prior: Prior) -> th.Tensor:
     """Return log w_k - D[q || N_k] for every episode and component: ``(T, N, K)``."""
     mean, var, log_weight = (x[:, None] for x in prior)  # (T, 1, K, Z), and (T, 1, K)
     ratio = variances[:, :, None] / var
@@ -115,20 +106,12 @@ def _log_joint(means: th.Tensor, variances: th.Tensor, prior: tuple[th.Tensor, t
     return log_weight - divergence
 
 
-def _moments(
-    means: th.Tensor,
-    variances: th.Tensor,
-    responsibility: th.Tensor,
-    pseudo: tuple[th.Tensor, th.Tensor, th.Tensor] | None = None,
-) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+def _moments(means: th.Tensor, variances: th.Tensor, responsibility: th.Tensor, pseudo: Prior | None = None) -> Prior:
     """
     Fit the moments of each component to its densities by the law of total variance.
 
-    :param means: ``(T, N, Z)``
-    :param variances: ``(T, N, Z)``
     :param responsibility: ``(T, N, K)``
     :param pseudo: A Gaussian that counts as an additional episode of every component, so that none is empty.
-    :return: means and variances, ``(T, K, Z)``, and logarithms of the weights, ``(T, K)``
     """
     # Around the mean of the living episodes: second moments lose digits far from it.
     weight = responsibility.sum(2, keepdim=True)

@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_tdpg.callbacks import TDPGCallback
-from sb3_tdpg.measurement.interval import (
-    InformationInterval,
-    component_estimates,
-    information_interval,
-    min_episodes,
-)
+from sb3_tdpg.measurement.interval import InformationInterval, component_estimates, information_interval, min_episodes
 from sb3_tdpg.problem import read_problem
 
 
@@ -53,10 +48,8 @@ class InformationCallback(TDPGCallback):
             return
         batch = model.rollout_buffer.episode_batch().information_batch()
         self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
-        lower, upper = self.interval.total
-        self.logger.record("mi/lower", lower)
-        self.logger.record("mi/upper", upper)
-        for limit in ("lower", "upper"):
+        for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
+            self.logger.record(f"mi/{limit}", total)
             for t, value in enumerate(getattr(self.interval, limit).tolist()):
                 if np.isfinite(value):
                     self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.measurement.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
@@ -26,8 +27,7 @@ class TrustCheck:
     name: str
     value: float
     threshold: float
-    meaning: str
-    """The meaning of the value, and its unit."""
+    meaning: str  # of the value, with its unit
 
     @property
     def passed(self) -> bool:
@@ -54,13 +54,12 @@ class TrustBadge:
 
     def markdown(self) -> str:
         """Return a Markdown table with a row for each check, and the warning below it."""
-        lines = ["| check | | value | at most | meaning |", "|---|---|---|---|---|"]
-        for check in self.checks:
-            outcome = "ok" if check.passed else "**failed**"
-            lines.append(f"| {check.name} | {outcome} | {check.value:.3f} | {check.threshold:.3f} | {check.meaning} |")
-        if self.capped_steps:
-            lines += ["", f"Warning{self._warning().removeprefix('; warning')}"]
-        return "\n".join(lines)
+        rows = [
+            [check.name, "ok" if check.passed else "**failed**", f"{check.value:.3f}", check.threshold, check.meaning]
+            for check in self.checks
+        ]
+        table = markdown_table(rows, ["check", "", "value", "at most", "meaning"], align="l")
+        return table + self._warning().replace("; warning", "\n\nWarning")
 
     def _warning(self) -> str:
         if not self.capped_steps:
@@ -97,15 +96,13 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
             f"no time step has an interval to check: at most {interval.n_episodes.max(initial=0)} episodes are alive"
         )
     miss = FALSE_ALARM / len(steps)
-    quantile = normal_quantile(miss)
     checks = (
         _shuffled_pairs(batch, steps, normal_quantile(miss / len(LOWER_BOUNDS)), seed),
-        _data_processing(batch, interval, steps, quantile, seed),
+        _data_processing(batch, interval, steps, normal_quantile(miss), seed),
         _encoder_density(batch, steps, normal_quantile(miss / 2)),  # either sign counts
     )
-    cap = np.log(interval.n_episodes[steps])
     lower = np.maximum(*(interval.estimates[name][steps] for name in LOWER_BOUNDS))
-    capped = steps[lower >= NEAR_THE_CAP * cap]
+    capped = steps[lower >= NEAR_THE_CAP * np.log(interval.n_episodes[steps])]
     return TrustBadge(checks, tuple(capped.tolist()))
 
 
@@ -113,55 +110,37 @@ def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float,
     rng = np.random.default_rng(seed)
     states = batch.states.clone()
     for t in steps:
-        living = np.flatnonzero(np.ones(states.shape[1]) if batch.alive is None else batch.alive[t].cpu().numpy())
-        order = rng.permutation(living)
+        order = rng.permutation(np.flatnonzero(batch.living[t].cpu()))
         states[t, order] = batch.states[t, np.roll(order, 1)]  # one cycle, so no episode keeps its own state
     null = information_interval(batch._replace(states=states), seed=seed)
-    return _worst(
-        "shuffled pairs",
-        np.concatenate([null.estimates[name][steps] for name in LOWER_BOUNDS]),
-        quantile * np.concatenate([null.errors[name][steps] for name in LOWER_BOUNDS]),
-        "nats that a lower bound finds without any information",
-    )
+    found, errors = (np.concatenate([of[name][steps] for name in LOWER_BOUNDS]) for of in (null.estimates, null.errors))
+    return _worst("shuffled pairs", found, quantile * errors, "nats that a lower bound finds without any information")
 
 
 def _data_processing(
     batch: InformationBatch, interval: InformationInterval, steps: np.ndarray, quantile: float, seed: int
 ) -> TrustCheck:
     # One variance for all episodes of a time step: noise that depends on the encoder's would carry information.
-    variances = batch.stds.square()
-    if batch.alive is not None:
-        variances = variances.masked_fill(~batch.alive[..., None], 0.0)
-    n_living = batch.trvs.shape[1] if batch.alive is None else batch.alive.sum(1)[:, None, None].clamp(min=1)
-    stds = (batch.stds.square() + ADDED_VARIANCE * variances.sum(1, keepdim=True) / n_living).sqrt()
+    living = batch.living[..., None]
+    total = batch.stds.square().masked_fill(~living, 0.0).sum(1, keepdim=True)
+    stds = (batch.stds.square() + ADDED_VARIANCE * total / living.sum(1, keepdim=True).clamp(min=1)).sqrt()
     noisier = batch._replace(trvs=batch.means + (batch.trvs - batch.means) * stds / batch.stds, stds=stds)
     copy = information_interval(noisier, confidence=interval.confidence, seed=seed)
-    name = "data processing"
-    in_order = _worst(
-        name,
-        (copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0))[steps],
-        quantile * np.hypot(copy.errors["critic"], interval.errors["critic"])[steps],
-        "nats by which the critic's bound of a noisier copy of the TRVs is higher",
-    )
-    crossed = TrustCheck(
-        name,
-        float((copy.lower - interval.upper)[steps].max()),
-        0.0,
-        "nats by which the lower limit of a noisier copy of the TRVs is above the upper limit",
-    )
-    return in_order if crossed.passed else crossed
+    crossed = (copy.lower - interval.upper)[steps]
+    if not (crossed <= 0).all():
+        meaning = "nats by which the lower limit of a noisier copy of the TRVs is above the upper limit"
+        return _worst("data processing", crossed, np.zeros(len(steps)), meaning)
+    excess = copy.estimates["critic"].clip(min=0) - interval.estimates["critic"].clip(min=0)
+    errors = np.hypot(copy.errors["critic"], interval.errors["critic"])
+    meaning = "nats by which the critic's bound of a noisier copy of the TRVs is higher"
+    return _worst("data processing", excess[steps], quantile * errors[steps], meaning)
 
 
 def _encoder_density(batch: InformationBatch, steps: np.ndarray, quantile: float) -> TrustCheck:
-    trv_dim = batch.trvs.shape[2]
-    excess, n_noises = [], []
-    for t in steps.tolist():
-        at_t = batch.at(t)
-        noise = (at_t.trvs - at_t.means) / at_t.stds
-        n_noises.append(noise.shape[1] * trv_dim)
-        excess.append(abs(noise.double().square().mean().item() - 1))
-    threshold = quantile * np.sqrt(2 / np.asarray(n_noises))  # the square of a standard normal has variance 2
-    return _worst("encoder density", np.asarray(excess), threshold, "distance of the mean square of the noise from 1")
+    noises = [((at_t.trvs - at_t.means) / at_t.stds).double() for at_t in map(batch.at, steps.tolist())]
+    excess = np.array([abs(noise.square().mean().item() - 1) for noise in noises])
+    threshold = quantile * np.sqrt(2 / np.array([noise.numel() for noise in noises]))  # squares have variance 2
+    return _worst("encoder density", excess, threshold, "distance of the mean square of the noise from 1")
 
 
 def _worst(name: str, values: np.ndarray, thresholds: np.ndarray, meaning: str) -> TrustCheck:

@@ -33,21 +33,13 @@ def _quadratic(y: th.Tensor, matrix: th.Tensor) -> th.Tensor:
 
 
 def _scatter(y: th.Tensor, nu: th.Tensor) -> th.Tensor:
-    """
-    Fit the scatter matrix of a multivariate t around 0 with a few steps of expectation-maximisation.
-
-    It stays invertible where components are constant or copies of each other.
-
-    :param y: ``(rows, n, D)``
-    :param nu: degrees of freedom, ``(rows,)``
-    :return: ``(rows, D, D)``
-    """
+    """Fit the scatter matrix of a multivariate t around 0 by expectation-maximisation: ``(rows, D, D)``."""
     n, dim = y.shape[1:]
     nu = nu[:, None, None]
     scatter = th.eye(dim, dtype=y.dtype).expand(len(y), -1, -1)
     for _ in range(N_SCATTER_STEPS):
         weights = (nu + dim) / (nu + _quadratic(y, th.linalg.inv(scatter)))
-        scatter = (weights * y).mT @ y / n + 1e-4 * th.eye(dim, dtype=y.dtype)
+        scatter = (weights * y).mT @ y / n + 1e-4 * th.eye(dim, dtype=y.dtype)  # invertible if components are copies
     return scatter
 
 
@@ -67,11 +59,10 @@ def degrees_of_freedom(ranks: th.Tensor) -> th.Tensor:
 
 def add_up(table: th.Tensor, pairs: th.Tensor) -> th.Tensor:
     """
-    Add the table's entries of the x and of the z of every pair.
+    Add the table's entries of the x and of the z of every pair: ``(rows, n, C)``.
 
     :param table: ``(2 * rows * N, C)``: the entries of every x, then those of every z, row by row
     :param pairs: their places, ``row * N + i`` and ``rows * N + row * N + j``: ``(rows, n, 2)``, integers
-    :return: ``(rows, n, C)``
     """
     return embedding_bag(pairs.flatten(0, 1).int(), table, mode="sum").view(*pairs.shape[:2], -1)
 
@@ -103,27 +94,24 @@ class Start(nn.Module):
         """
         Fit the scatter matrix of each fold to the t-scores of its training pairs.
 
-        :param y: t-scores of x and z, ``(M, N, X + Z)``
+        :param y: t-scores of x and z with ``nu`` degrees of freedom, ``(M, N, X + Z)`` and ``(M,)``
         :param train: the training pairs of each fold, ``(K, n)``
-        :param n_x: X
-        :param nu: degrees of freedom, ``(M,)``
         :param level: the critic's score that means "no information"; it is added
         """
         n_folds, dim = len(train), y.shape[-1]
         scatter = _scatter(y[:, train].flatten(0, 1), nu.repeat_interleave(n_folds)).unflatten(0, (-1, n_folds))
         nu = nu[:, None, None, None]
         root = th.linalg.inv(th.linalg.cholesky(scatter)).mT / nu.sqrt()  # W
-        constant = level + th.lgamma(nu / 2) + th.lgamma((nu + dim) / 2) - _half_log_det(scatter)
+        constant = level + th.lgamma(nu / 2) + th.lgamma((nu + dim) / 2) - th.logdet(scatter)[..., None, None] / 2
         terms = []
         for part in (slice(n_x), slice(n_x, None)):
             block, own = scatter[..., part, part], y[:, None, :, part]  # (M, 1, N, .): the same for all folds
             half = (nu + block.shape[-1]) / 2
-            constant = constant - th.lgamma(half) + _half_log_det(block)
+            constant = constant - th.lgamma(half) + th.logdet(block)[..., None, None] / 2
             logarithm = half * th.log1p(_quadratic(own, th.linalg.inv(block)) / nu)
             terms.append(th.cat([own @ root[..., part, :], logarithm], -1))
         terms[0][..., -1:] += constant
-        factor = ((nu + dim) / 2).expand(-1, n_folds, -1, -1)
-        return cls(th.stack(terms).flatten(0, 3), factor.flatten(0, 1))
+        return cls(th.stack(terms).flatten(0, 3), ((nu + dim) / 2).expand(-1, n_folds, -1, -1).flatten(0, 1))
 
     def flat_like(self, level: float) -> Start:
         """Return a start of the same shape that is ``level`` everywhere."""
@@ -141,14 +129,9 @@ class Start(nn.Module):
         return sums[..., -1:].addcmul(self.factor, quadratic.log1p_(), value=-1)
 
 
-def _half_log_det(matrices: th.Tensor) -> th.Tensor:
-    return th.logdet(matrices)[..., None, None] / 2
-
-
 def choose_start(starts: Sequence[Start], chosen: th.Tensor) -> Start:
     """Take for each row the start with the index ``chosen``, ``(rows,)``."""
-    n_rows = len(chosen)
-    rows = th.arange(n_rows)
-    tables = th.stack([start.table.unflatten(0, (2, n_rows, -1)) for start in starts], 2)
-    table = tables[:, rows, chosen]  # (2, rows, N, X + Z + 1)
-    return Start(table.flatten(0, 2), th.stack([start.factor for start in starts])[chosen, rows])
+    rows = th.arange(len(chosen))
+    tables = th.stack([start.table.unflatten(0, (2, len(rows), -1)) for start in starts], 2)
+    factors = th.stack([start.factor for start in starts])
+    return Start(tables[:, rows, chosen].flatten(0, 2), factors[chosen, rows])

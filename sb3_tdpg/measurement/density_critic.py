@@ -1,5 +1,5 @@
 """
-A critic in closed form: the logarithm of a fitted conditional density over a fitted marginal density.
+Critics in closed form: the logarithm of a fitted conditional density over a fitted marginal density.
 
 Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode, M points.
 """
@@ -17,6 +17,7 @@ LENGTHS = (0.3, 1.0)  # widths of the kernel, relative to the median distance
 RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # of the regressions, for each episode
 SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 the mixture of the encoder's densities, 1 a Gaussian
 CONSTANT = 1e-9  # a component that varies by less than this, relative to its size, is constant
+CUTOFF = 1e-9  # relative eigenvalue of the states' correlations below which a component is redundant
 LOG_2_PI = math.log(2 * math.pi)
 
 
@@ -26,7 +27,7 @@ class Encoded(NamedTuple):
     states: np.ndarray  # (n, X)
     means: np.ndarray  # (n, Z) of q(x~ | e)
     stds: np.ndarray  # (n, Z)
-    trvs: np.ndarray  # (n, K, Z): draws from q(x~ | e)
+    trvs: np.ndarray  # (n, K, Z): draws from q(x~ | e); the second half has the noise of the first with opposite sign
 
     def select(self, episodes: np.ndarray) -> Encoded:
         """Only some episodes, given by their indices."""
@@ -51,24 +52,33 @@ class DensityCritic:
     """
 
     def __init__(self, train: Encoded) -> None:
-        self._fit_conditional(train)
-        self._fit_marginal(train)
+        noise, log_stds = np.square(train.stds).mean(axis=0), np.log(train.stds)
+        self._log_std_range = log_stds.min(axis=0), log_stds.max(axis=0)
+        self._regression = Regression(train.states, np.concatenate([train.means, log_stds], axis=1))
+        residuals = self._regression.residuals[:, : train.means.shape[1]]
+        # Coordinates in which both the encoder's variance and the covariance of the residuals are diagonal.
+        covariance = residuals.T @ residuals / len(residuals)
+        self._noise_rotation, self._residual_variance, self._noise_log_volume = whiten(noise, covariance)
+
+        n, n_draws, dim = train.trvs.shape
+        self._centre = train.means.mean(axis=0)
+        centred = train.means - self._centre
+        self._rotation, self._spread, self._log_volume = whiten(noise, centred.T @ centred / (n - 1))
+        self._components = centred @ self._rotation.T  # (n, Z)
+        self._variances = np.square(train.stds) @ self._rotation.T**2
+        n_draws = min(n_draws, 2)
+        points = ((train.trvs[:, :n_draws] - self._centre) @ self._rotation.T).reshape(-1, dim)
+        own = np.repeat(np.arange(n), n_draws)
+        scores = [self._log_mixture(points, smoothing, own).mean() for smoothing in SMOOTHINGS]
+        self._smoothing = SMOOTHINGS[int(np.argmax(scores))]
 
     def log_marginal(self, trvs: np.ndarray) -> np.ndarray:
         """Return log a(x~), a normalised density: ``(M, Z) -> (M,)``."""
-        points = (trvs - self._centre) @ self._rotation.T
-        return self._log_mixture(points, self._smoothing) + self._log_volume
+        return self._log_mixture((trvs - self._centre) @ self._rotation.T, self._smoothing) + self._log_volume
 
     def scores(self, states: np.ndarray, trvs: np.ndarray, log_marginal: np.ndarray) -> np.ndarray:
-        """
-        Evaluate F for every x~ with every x: ``(M, n)``.
-
-        :param states: ``(n, X)``
-        :param trvs: ``(M, Z)``
-        :param log_marginal: The result of :meth:`log_marginal`, ``(M,)``.
-        """
-        log_ratio = self._log_conditional(states, trvs) - log_marginal[:, None]
-        return np.logaddexp(log_ratio, LOG_FLOOR)
+        """Evaluate F for every x~ with every x, given log a(x~): ``(n, X), (M, Z), (M,) -> (M, n)``."""
+        return np.logaddexp(self._log_conditional(states, trvs) - log_marginal[:, None], LOG_FLOOR)
 
     def _log_conditional(self, states: np.ndarray, trvs: np.ndarray) -> np.ndarray:
         """Return log r(x~ | x) of every x~ for every x: ``(n, X), (M, Z) -> (M, n)``."""
@@ -78,47 +88,45 @@ class DensityCritic:
         log_density = log_gaussians(trvs @ self._noise_rotation.T, means @ self._noise_rotation.T, variances)
         return log_density + self._noise_log_volume
 
-    def _fit_conditional(self, train: Encoded) -> None:
-        log_stds = np.log(train.stds)
-        self._log_std_range = log_stds.min(axis=0), log_stds.max(axis=0)
-        targets = np.concatenate([train.means, log_stds], axis=1)
-        self._regression = Regression(train.states, targets)
-        residuals = self._regression.residuals[:, : train.means.shape[1]]
-        # Coordinates in which both the encoder's variance and the covariance of the residuals are diagonal.
-        self._noise_rotation, self._residual_variance, self._noise_log_volume = whiten(
-            np.square(train.stds).mean(axis=0), residuals.T @ residuals / len(residuals)
-        )
-
-    def _fit_marginal(self, train: Encoded) -> None:
-        n, n_draws, dim = train.trvs.shape
-        self._centre = train.means.mean(axis=0)
-        centred = train.means - self._centre
-        self._rotation, self._spread, self._log_volume = whiten(
-            np.square(train.stds).mean(axis=0), centred.T @ centred / (n - 1)
-        )
-        self._components = centred @ self._rotation.T  # (n, Z)
-        self._variances = np.square(train.stds) @ self._rotation.T**2
-        n_draws = min(n_draws, 2)
-        points = ((train.trvs[:, :n_draws] - self._centre) @ self._rotation.T).reshape(-1, dim)
-        own = np.repeat(np.arange(n), n_draws)
-        scores = [self._log_mixture(points, smoothing, own).mean() for smoothing in SMOOTHINGS]
-        self._smoothing = SMOOTHINGS[int(np.argmax(scores))]
-
     def _log_mixture(self, points: np.ndarray, smoothing: float, own: np.ndarray | None = None) -> np.ndarray:
-        """
-        Return the log-density of the smoothed mixture: ``(M,)``.
-
-        :param points: ``(M, Z)``, rotated
-        :param own: The component to leave out for each point, ``(M,)``.
-        """
-        log_density = log_gaussians(
-            points, math.sqrt(1 - smoothing) * self._components, self._variances + smoothing * self._spread
-        )
-        n = log_density.shape[1]
+        """Return the log-density of the smoothed mixture at rotated points, without their ``own`` components."""
+        variances = self._variances + smoothing * self._spread
+        log_density = log_gaussians(points, math.sqrt(1 - smoothing) * self._components, variances)
         if own is not None:
             log_density[np.arange(len(points)), own] = -np.inf
-            n -= 1
-        return logsumexp(log_density, axis=1) - math.log(n)
+        return logsumexp(log_density, axis=1) - math.log(log_density.shape[1] - (own is not None))
+
+
+class GaussianCritic:
+    r"""
+    The critic :math:`F(x, \tilde x) = \log r(\tilde x \mid x) / a(\tilde x)` of Gaussians with the episodes' moments.
+
+    r is a Gaussian around the linear regression of the encoder's means on the state, and a is a Gaussian with the mean
+    and covariance of the TRVs. The encoder's variance is known in both. This is the optimal critic for jointly Gaussian
+    states and TRVs. It has few parameters, so it can be fitted many times, each time to most of the episodes.
+
+    :param train: The episodes to fit; their draws of the TRVs are not used.
+    """
+
+    def __init__(self, train: Encoded) -> None:
+        n, noise = len(train.states), np.square(train.stds).mean(axis=0)
+        self._centre, self._mean = train.states.mean(axis=0), train.means.mean(axis=0)
+        self._scale = np.where(varies(train.states), train.states.std(axis=0), np.inf)
+        states, means = (train.states - self._centre) / self._scale, train.means - self._mean
+        self._coefficients = np.linalg.pinv(states.T @ states, rcond=CUTOFF, hermitian=True) @ (states.T @ means)
+        residuals = means - states @ self._coefficients
+        n_free = max(n - 1 - np.isfinite(self._scale).sum(), 1)
+        self._conditional = whiten(noise, residuals.T @ residuals / n_free)
+        self._marginal = whiten(noise, means.T @ means / (n - 1))
+
+    def scores(self, states: np.ndarray, trvs: np.ndarray) -> np.ndarray:
+        """Evaluate F for every x~ with every x: ``(n, X), (M, Z) -> (M, n)``."""
+        means = (states - self._centre) / self._scale @ self._coefficients
+        centred = trvs - self._mean
+        (rotation, spread, log_volume), (rotation_a, spread_a, log_volume_a) = self._conditional, self._marginal
+        log_conditional = log_gaussians(centred @ rotation.T, means @ rotation.T, 1 + spread[None]) + log_volume
+        log_marginal = log_gaussians(centred @ rotation_a.T, np.zeros_like(spread_a)[None], 1 + spread_a[None])
+        return log_conditional - (log_marginal + log_volume_a)
 
 
 def varies(inputs: np.ndarray) -> np.ndarray:
@@ -184,9 +192,7 @@ def _choose_ridge(
     """
     Choose a ridge for each target by the leave-one-out error, which has a closed form.
 
-    :param basis: Orthonormal columns, ``(n, R)``.
-    :param values: Their squared singular values, ``(R,)``.
-    :param targets: ``(n, Y)``
+    :param basis: Orthonormal columns ``(n, R)``, with their squared singular values ``values``, ``(R,)``.
     :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
     :param leverage: Leverage of each episode in the regression whose residuals the targets are.
     :return: the shrinkage factors of the projections, ``(R, Y)``, and the leave-one-out residuals, ``(n, Y)``
@@ -207,26 +213,14 @@ def _choose_ridge(
 
 
 def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """
-    Find coordinates in which the noise has variance 1 and the covariance is diagonal.
-
-    :param noise: Variances of the noise, ``(Z,)``.
-    :param covariance: ``(Z, Z)``
-    :return: the matrix of the map ``(Z, Z)``, the diagonal ``(Z,)``, and the logarithm of the matrix' determinant
-    """
+    """Map noise of these variances to variance 1, and the covariance to a diagonal: map, diagonal, log-determinant."""
     scale = 1 / np.sqrt(noise)
     values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
     return vectors.T * scale, np.maximum(values, 0.0), float(np.log(scale).sum())
 
 
 def log_gaussians(points: np.ndarray, means: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """
-    Return the log-density of every point under every diagonal Gaussian: ``(M, n)``.
-
-    :param points: ``(M, Z)``
-    :param means: ``(n, Z)``
-    :param variances: ``(n, Z)``
-    """
+    """Return the log-density of every point under every diagonal Gaussian: ``(M, Z), (n, Z), (n, Z) -> (M, n)``."""
     centre = means.mean(axis=0)  # the expansion of the square loses digits far from the origin
     points, means, precision = points - centre, means - centre, 1 / variances
     quadratic = points**2 @ precision.T - 2 * points @ (means * precision).T + (means**2 * precision).sum(axis=1)

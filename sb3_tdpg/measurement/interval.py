@@ -7,7 +7,7 @@ Dimension key: T time steps, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -18,7 +18,7 @@ from scipy.special import owens_t
 
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.measurement.density_critic import varies
+from sb3_tdpg.measurement.density_critic import Encoded, varies
 from sb3_tdpg.measurement.interval_bounds import (
     Estimate,
     critic_bounds,
@@ -30,8 +30,7 @@ from sb3_tdpg.measurement.interval_bounds import (
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
-# Shares of the probability to miss that the lower and the upper limit spend. The rest allows for skewness, which the
-# limits neglect: it makes the upper limits too low and the lower ones too cautious (2 % become about 3 % and 1.5 %).
+# Shares of the probability to miss. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
 LOWER_BOUNDS = ("critic", "gaussian")
@@ -40,11 +39,7 @@ UPPER_BOUNDS = ("logdet", "loo", "marginal")
 
 @dataclass(frozen=True)
 class InformationInterval:
-    """
-    Confidence limits of I[x_t; x~_t] at every time step, in nats.
-
-    Limits are NaN where fewer than ``min_episodes`` are alive.
-    """
+    """Confidence limits of I[x_t; x~_t] at every time step in nats, NaN where fewer than ``min_episodes`` live."""
 
     lower: np.ndarray
     """``(T,)``: lower confidence limits, never below 0."""
@@ -96,14 +91,14 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
 
     :param miss: Probability that either limit misses.
     :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.
-    :return: the probability to miss of each limit alone
     """
-    normal, gap = NormalDist(), max(0.0, gap)  # in this order NaN becomes 0
+    normal, gap, least = NormalDist(), max(0.0, gap), normal_quantile(miss)  # in this order NaN becomes 0
 
     def excess(c: float) -> float:
         return normal.cdf(-c) + normal.cdf(-c - gap) - miss
 
-    c = brentq(excess, normal_quantile(miss), normal_quantile(miss / 2) + 1e-9)
+    # With a wide gap, rounding can put the root just below its lower limit.
+    c = brentq(excess, least, normal_quantile(miss / 2) + 1e-9) if excess(least) > 0 else least
     return normal.cdf(-c)
 
 
@@ -114,10 +109,7 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     Hunter's inequality (1976, Journal of Applied Probability 13(3)) bounds this probability by the sum of the single
     probabilities minus the joint ones of the first Gaussian with each other. With Owen's function T this is
     :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
-    of one, independent ones about Bonferroni's.
-
-    :param miss: The probability, below 0.5.
-    :param correlations: Correlation of the first Gaussian with each other.
+    of one, independent ones about Bonferroni's. The probability must be below 0.5.
     """
     slopes = np.sqrt([(1 - rho) / (1 + rho) for rho in np.clip(correlations, -1 + 1e-9, 1)])
 
@@ -129,11 +121,9 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
 
 def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, float]:
     """
-    Return the name and the value of the tightest limit of several bounds.
+    Return the name and the value of the tightest upper limit (``sign=1``) or lower limit (``sign=-1``).
 
-    :param bounds: Bounds by name.
     :param miss: Probability that any limit is on the wrong side of its bound's expectation.
-    :param sign: 1 for upper limits, -1 for lower ones.
     """
     if not bounds:
         return "", sign * math.inf
@@ -157,6 +147,14 @@ def min_episodes(trv_dim: int) -> int:
     return max(MIN_EPISODES, 2 * trv_dim + 2)
 
 
+def _steps(batch: InformationBatch, seed: int) -> Iterator[tuple[int, Encoded, np.random.Generator]]:
+    """Yield the time steps with enough living episodes, with draws of the TRVs and a random generator for each."""
+    check_batch(batch)
+    for t in np.flatnonzero(batch.living.sum(1).cpu() >= min_episodes(batch.trvs.shape[2])).tolist():
+        rng = np.random.default_rng((seed, t))
+        yield t, draw_trvs(batch.at(t), rng), rng
+
+
 @threads(1)
 def information_interval(batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0) -> InformationInterval:
     r"""
@@ -171,7 +169,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     - ``"critic"``: :class:`~sb3_tdpg.measurement.density_critic.DensityCritic`, fitted to each half of the episodes and
       evaluated on the other. Up to 300 episodes are divided in three ways, since each division misses some pairs.
-    - ``"gaussian"``: :class:`~sb3_tdpg.measurement.gaussian_critic.GaussianCritic`, which is fitted fast and therefore
+    - ``"gaussian"``: :class:`~sb3_tdpg.measurement.density_critic.GaussianCritic`, which is fitted fast and therefore
       to more episodes: to all but two of eight groups, and evaluated on these two (of five groups with more than 300
       episodes). It is tighter where states and TRVs are about jointly Gaussian.
 
@@ -191,11 +189,10 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of
     the probability to miss, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
-    contributions of episodes, which resembles that of a chi-square: means that are too low come with standard errors
-    that are too small, so the upper limits miss more often than a Gaussian would. The shares depend on the gap between
-    the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since the tightest is
-    chosen (``joint_quantile``). The confidence is that of each step alone, not of all steps together. Above about
-    ``ln N`` nats the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
+    contributions of episodes: means that are too low come with standard errors that are too small. The shares depend on
+    the gap between the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since
+    the tightest is chosen (``joint_quantile``). The confidence is that of each step alone. Above about ``ln N`` nats
+    the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
     :param confidence: Probability, at least, that the interval of a step contains the truth.
@@ -204,35 +201,21 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
-    check_batch(batch)
-    names = (*LOWER_BOUNDS, *UPPER_BOUNDS)
-    horizon, _, trv_dim = batch.trvs.shape
-    estimates, errors = ({name: np.full(horizon, np.nan) for name in names} for _ in range(2))
+    horizon, n_episodes = len(batch.trvs), batch.living.sum(1).cpu().numpy()
+    estimates, errors = ({name: np.full(horizon, np.nan) for name in LOWER_BOUNDS + UPPER_BOUNDS} for _ in range(2))
     limits = np.full((2, horizon), np.nan)
     lower_by, upper_by = [""] * horizon, [""] * horizon
-    n_episodes = np.zeros(horizon, dtype=int)
-    for t in range(horizon):
-        at_t = batch.at(t)
-        n_episodes[t] = at_t.trvs.shape[1]
-        if n_episodes[t] < min_episodes(trv_dim):
-            continue
-        rng = np.random.default_rng((seed, t))
-        step = draw_trvs(at_t, rng)
+    for t, step, rng in _steps(batch, seed):
         critic, marginal = critic_bounds(step, rng)
         below = dict(critic=critic, gaussian=gaussian_bound(step, rng))
         above = dict(logdet=log_det_bound(step), loo=leave_one_out_bound(step), marginal=marginal)
-        bounds = below | above
-        for name, bound in bounds.items():
+        for name, bound in (below | above).items():
             estimates[name][t], errors[name][t] = bound.value, bound.error
-        below, above = (
-            {name: bound for name, bound in side.items() if np.isfinite(bound.value)} for side in (below, above)
-        )
+        below, above = ({name: b for name, b in side.items() if np.isfinite(b.value)} for side in (below, above))
         gap = _gap(below.values(), above.values())
-        miss_below, miss_above = (
-            miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)
-        )
-        lower_by[t], lower = limit(below, miss_below, sign=-1)
-        upper_by[t], upper = limit(above, miss_above, sign=1)
+        miss = [miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)]
+        lower_by[t], lower = limit(below, miss[0], sign=-1)
+        upper_by[t], upper = limit(above, miss[1], sign=1)
         if lower <= 0:
             lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
@@ -259,15 +242,8 @@ def component_estimates(
         too few episodes are alive
     :raises ValueError: as :func:`check_batch`.
     """
-    check_batch(batch)
-    horizon, _, n_components = batch.states.shape
-    values = np.full((2, horizon, n_components), np.nan)
-    for t in range(horizon):
-        at_t = batch.at(t)
-        if at_t.trvs.shape[1] < min_episodes(at_t.trvs.shape[2]):
-            continue
-        rng = np.random.default_rng((seed, t))
-        step = draw_trvs(at_t, rng)
+    values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
+    for t, step, rng in _steps(batch, seed):
         for k in np.flatnonzero(varies(step.states)):
             of_one = step._replace(states=step.states[:, [k]])
             bounds = dict(critic=critic_bounds(of_one, rng)[0], gaussian=gaussian_bound(of_one, rng))
@@ -277,20 +253,15 @@ def component_estimates(
 
 
 def check_batch(batch: InformationBatch) -> None:
-    """
-    Check the shapes and values of a batch.
-
-    :raises ValueError: if the shapes do not fit, a value is not finite, or a standard deviation is not positive.
-    """
+    """Raise a ValueError if the shapes do not fit, a value is not finite, or a standard deviation is not positive."""
     shapes = {name: tuple(getattr(batch, name).shape) for name in ("states", "trvs", "means", "stds")}
     states, *others = shapes.values()
     if len(states) != 3 or len(set(others)) != 1 or len(others[0]) != 3 or states[:2] != others[0][:2]:
         raise ValueError(
             f"the batch has shapes {shapes}: expected (T, N, X) for the states and (T, N, Z) for trvs, means and stds"
         )
-    alive = slice(None) if batch.alive is None else batch.alive
     for name in shapes:
-        if not th.isfinite(getattr(batch, name)[alive]).all():
+        if not th.isfinite(getattr(batch, name)[batch.living]).all():
             raise ValueError(f"the batch's {name} are not all finite")
-    if not (batch.stds[alive] > 0).all():
+    if not (batch.stds[batch.living] > 0).all():
         raise ValueError("the batch's stds must be positive: they are the encoder's standard deviations")

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.special import logsumexp, softmax
 
 from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.measurement.density_critic import LOG_2_PI, DensityCritic, Encoded, log_gaussians
-from sb3_tdpg.measurement.gaussian_critic import GaussianCritic
+from sb3_tdpg.measurement.density_critic import LOG_2_PI, DensityCritic, Encoded, GaussianCritic, log_gaussians
 
 MAX_DRAWS = 12  # of the TRVs for each episode
 GROUPS = (8, 5)  # groups of episodes, two of which evaluate a Gaussian critic; five above MAX_REDIVIDED episodes
@@ -44,23 +43,14 @@ class Estimate(NamedTuple):
         return float(own @ others / max(len(own) * own.std() * others.std(), 1e-300))
 
     def less_noise(self, controls: np.ndarray) -> Estimate:
-        """
-        Remove sampling noise of the encoder with control variates.
-
-        :param controls: ``(n, C)`` with expectation 0 in every episode, see :func:`noise_controls`.
-        """
+        """Remove sampling noise of the encoder with control variates of expectation 0, ``(n, C)``."""
         mean = controls.mean(axis=0)
         coefficients = np.linalg.lstsq(controls - mean, self.parts - self.parts.mean(), rcond=None)[0]
         return self._replace(value=float(self.value - mean @ coefficients), parts=self.parts - controls @ coefficients)
 
 
 def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
-    """
-    Draw further samples of the encoder's noise; the first draw is the one of the rollout.
-
-    :param batch: One time step, ``(1, n, ...)``, all episodes alive.
-    :param rng: Generator of the noise.
-    """
+    """Draw the encoder's noise again at one time step, ``(1, n, ...)``; the first draw is the one of the rollout."""
     states, trvs, means, stds = (x[0].detach().cpu().numpy().astype(np.float64) for x in batch[:4])
     n, dim = means.shape
     # Each noise is used with both signs, which cancels linear terms.
@@ -73,14 +63,12 @@ def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
 
 def noise_controls(step: Encoded) -> np.ndarray:
     r"""
-    Return two control variates: by how much each episode's noise exceeds its expected size.
+    Return two control variates, ``(n, 2)``: by how much each episode's noise exceeds its expected size.
 
     Log-densities are about quadratic in the noise: the encoder's in units of its standard deviations, the marginal one
     in units of the TRVs' covariance S. The control variates are :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and
     :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with :math:`\nu = \tilde x - \mu`, averaged over
     the draws. Their expectations are 0 for every distribution of the means and any S that is independent of the noise.
-
-    :return: ``(n, 2)``
     """
     scale = np.sqrt(np.square(step.stds).mean(axis=0))
     stds, centred = step.stds / scale, (step.means - step.means.mean(axis=0)) / scale
@@ -93,12 +81,10 @@ def noise_controls(step: Encoded) -> np.ndarray:
 
 class FreshPairs:
     """
-    Scores F of frozen critics on fresh episodes and all their pairs.
+    Scores F of frozen critics on fresh ones of n episodes and all their pairs.
 
     Scores are clipped from above so that single pairs do not dominate the mean of e^F. A clipped critic is a valid
     critic, too.
-
-    :param n: Number of episodes.
     """
 
     def __init__(self, n: int) -> None:
@@ -107,12 +93,7 @@ class FreshPairs:
         self._ratios, self._pair_times = np.zeros((2, n, n))
 
     def add(self, fresh: np.ndarray, scores: np.ndarray) -> None:
-        """
-        Add the scores of a critic.
-
-        :param fresh: Indices of m episodes that it was not fitted to.
-        :param scores: Scores of the K draws of the TRVs of each of them with the state of each, ``(m K, m)``.
-        """
+        """Add a critic's scores of K draws of each of m ``fresh`` episodes with the state of each, ``(m K, m)``."""
         m = len(fresh)
         each, pairs = np.arange(m), np.ix_(fresh, fresh)
         scores = np.minimum(scores, self.log_clip).reshape(m, -1, m)
@@ -123,8 +104,7 @@ class FreshPairs:
 
     def bound(self) -> Estimate:
         """Bound the information from below; all episodes must have been fresh equally often, and at least once."""
-        times = self._pair_times.copy()
-        np.fill_diagonal(times, 0)  # no episode is paired with itself
+        times = np.where(np.eye(len(self._times)), 0, self._pair_times)  # no episode is paired with itself
         ratios = np.divide(self._ratios, times, out=np.zeros_like(times), where=times > 0)
         return donsker_varadhan(self._joint / self._times, ratios, int((times > 0).sum()), self.log_clip)
 
@@ -135,8 +115,6 @@ def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Es
 
     A division misses the pairs of episodes from different halves. Three divisions of quarters cover all pairs.
 
-    :param step: n episodes with an even number of draws each; the second half has the noise of opposite sign.
-    :param rng: Generator of the quarters.
     :return: the lower bound of the critic and the upper bound of its marginal density
     """
     n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
@@ -159,23 +137,17 @@ def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Es
 
 
 def gaussian_bound(step: Encoded, rng: np.random.Generator) -> Estimate:
-    """
-    Fit Gaussian critics to all but two of several groups of episodes and evaluate each on the two left out.
-
-    :param step: n episodes with an even number of draws each; the second half has the noise of opposite sign.
-    :param rng: Generator of the groups.
-    """
+    """Fit Gaussian critics to all but two of several groups of episodes and evaluate each on the two left out."""
     n, n_mirrored = len(step.states), step.trvs.shape[1] // 2
     some = np.arange(max(1, 2 * n_mirrored // 3))  # fewer draws, since there are many critics
     draws = step._replace(trvs=step.trvs[:, np.concatenate([some, some + n_mirrored])])
-    moments = step._replace(trvs=step.trvs[:, :0])
     groups = np.array_split(rng.permutation(n), GROUPS[n > MAX_REDIVIDED])
     pairs = FreshPairs(n)
     for left_out in combinations(range(len(groups)), 2):
         fresh = np.concatenate([groups[g] for g in left_out])
         train = np.concatenate([group for g, group in enumerate(groups) if g not in left_out])
         evaluated = draws.select(fresh)
-        critic = GaussianCritic(moments.select(train))
+        critic = GaussianCritic(draws.select(train))
         pairs.add(fresh, critic.scores(evaluated.states, evaluated.trvs.reshape(-1, evaluated.trvs.shape[2])))
     return pairs.bound().less_noise(noise_controls(draws))
 
@@ -185,10 +157,8 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
     Compute the Donsker-Varadhan bound from the scores.
 
     With several critics, e^F is averaged over all of them before the logarithm. By Jensen's inequality the result is
-    still a lower bound, and its mean is estimated from more pairs.
-
-    The mean is at least that of a few clipped pairs. Otherwise it would be 0, and the bound infinite, where no
-    episode's TRVs fit the state of another.
+    still a lower bound, and its mean is estimated from more pairs. The mean is at least that of a few clipped pairs, so
+    that the bound stays finite where no episode's TRVs fit the state of another.
 
     :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
     :param ratios: e^F of the TRVs of each episode with the state of each, ``(n, n)``; 0 where they are not paired.
@@ -213,11 +183,7 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
 
 
 def _marginal_gaps(step: Encoded, log_marginal: np.ndarray) -> np.ndarray:
-    """
-    Average log q(x~ | e) - log a(x~) over the draws of an episode, ``(n,)``.
-
-    :param log_marginal: Log-density of a that was fitted to other episodes, ``(n K,)``.
-    """
+    """Average log q(x~ | e) - log a(x~) over the draws of an episode, given log a(x~): ``(n K,) -> (n,)``."""
     n, _, dim = step.trvs.shape
     noise = (step.trvs - step.means[:, None]) / step.stds[:, None]
     log_own = -0.5 * (np.square(noise).sum(axis=2) + dim * LOG_2_PI) - np.log(step.stds).sum(axis=1)[:, None]

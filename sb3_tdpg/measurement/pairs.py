@@ -14,21 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from scipy.stats import rankdata
 from torch import nn
 
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+from sb3_tdpg.information import InfoNCE, InformationBatch, InformationEstimator, Nwj, get_estimator_class
 from sb3_tdpg.information.critic import CriticEstimator, Scores
-from sb3_tdpg.information.infonce import InfoNCE
-from sb3_tdpg.information.nwj import Nwj
-from sb3_tdpg.measurement.copula_start import (
-    NORMAL,
-    Start,
-    add_up,
-    choose_start,
-    degrees_of_freedom,
-    t_scores,
-)
+from sb3_tdpg.measurement.copula_start import NORMAL, Start, add_up, choose_start, degrees_of_freedom, t_scores
 from sb3_tdpg.networks import BatchedMLP, ELUGradient, flatten_parameters
 
 STEPS_PER_CHECK = 50
@@ -96,8 +88,6 @@ def estimate_information(
     :raises ValueError: if shapes do not match, a value is not finite, there are fewer than ten pairs for each fold or
         too few for the number of components, or the estimator needs the encoder's density.
     """
-    from sb3_tdpg.information import get_estimator_class  # the registry is made of the modules in this folder
-
     estimator_class = get_estimator_class(estimator)
     if not issubclass(estimator_class, CriticEstimator):
         raise ValueError(
@@ -109,9 +99,10 @@ def estimate_information(
             raise ValueError(f"{name}={value} must be at least 1")
     if batch_size is None:
         batch_size = 32 if issubclass(estimator_class, InfoNCE) else 200
-    kwargs = dict(kwargs, learning_rate=learning_rate, batch_size=batch_size)
     with th.random.fork_rng(devices=[]), th.no_grad():
-        held_out, trained_on = _cross_fit(x, z, estimator_class, n_folds, max_gradient_steps, patience, seed, kwargs)
+        # One critic for each problem and fold, whose inputs are places of pairs.
+        fitted = estimator_class(len(x) * n_folds, 1, 1, learning_rate=learning_rate, batch_size=batch_size, **kwargs)
+        held_out, trained_on = _cross_fit(x, z, fitted, n_folds, max_gradient_steps, patience, seed)
     values = [((held_out + trained_on) / 2).numpy(), held_out.numpy(), trained_on.numpy()]
     return InformationEstimate(*(float(value[0]) if single else value for value in values))
 
@@ -148,16 +139,9 @@ def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor,
     return first, second, single
 
 
-# -- inputs of the critics ------------------------------------------------------------------------------------
-
-
 def _ranks(x: th.Tensor) -> th.Tensor:
     """Return the relative rank of every value in its component, in (0, 1), with ties averaged: ``(..., N, D)``."""
-    values = x.mT.contiguous()
-    ordered = values.sort(dim=-1).values
-    below = th.searchsorted(ordered, values)
-    not_above = th.searchsorted(ordered, values, right=True)
-    return (below + not_above).mT.double() / (2 * x.shape[-2])
+    return th.as_tensor((rankdata(x.numpy(), axis=-2) - 0.5) / x.shape[-2])
 
 
 def _features(ranks: th.Tensor) -> th.Tensor:
@@ -167,12 +151,7 @@ def _features(ranks: th.Tensor) -> th.Tensor:
 
 
 def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """
-    Find the means and the matrices that whiten the features of each kind in all rows.
-
-    :param features: features of x and z, ``(rows, n, J, D)``
-    :return: ``(rows, 1, J, D)`` and ``(rows, J, D, D)``
-    """
+    """Find means and matrices that whiten: ``(rows, n, J, D) -> (rows, 1, J, D), (rows, J, D, D)``."""
     mean = features.mean(1, keepdim=True)
     centred = features - mean
     variances, axes = th.linalg.eigh(th.einsum("rnjd,rnje->rjde", centred, centred) / features.shape[1])
@@ -181,11 +160,8 @@ def _whiten(features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
 def _inputs(features: th.Tensor, train: th.Tensor, n_x: int) -> th.Tensor:
     """
-    Compute the terms of x and of z in the network's inputs, whose sum is white on each fold's training pairs.
+    Compute the terms of x and of z in the network's inputs, whose sum is white on the training pairs ``(K, n)``.
 
-    :param features: features of x and z, ``(M, N, J, D)``
-    :param train: training pairs of each fold, ``(K, n)``
-    :param n_x: X
     :return: the terms of every x, then of every z: ``(2 * M * K * N, J * D)``
     """
     mean, axes = (found.unflatten(0, (-1, len(train))) for found in _whiten(features[:, train].flatten(0, 1)))
@@ -234,18 +210,8 @@ class _StartedGradient(ELUGradient):
         return start + super().forward(inputs)
 
 
-# -- folds ----------------------------------------------------------------------------------------------------
-
-
 def _cross_fit(
-    x: th.Tensor,
-    z: th.Tensor,
-    estimator_class: type[CriticEstimator],
-    n_folds: int,
-    max_gradient_steps: int,
-    patience: int,
-    seed: int,
-    kwargs: dict[str, Any],
+    x: th.Tensor, z: th.Tensor, estimator: CriticEstimator, n_folds: int, max_steps: int, patience: int, seed: int
 ) -> tuple[th.Tensor, th.Tensor]:
     """Train the critics of all problems and folds as one network; ``(M,)`` held out and trained on."""
     th.manual_seed(seed)
@@ -259,24 +225,21 @@ def _cross_fit(
     # that was fitted to it, and once by one that was not.
     parts = (train, held_out, held_out.roll(-1, 0))
     # Every row has places of its own for the pairs' x; those of z are `n_places` further on.
-    n_rows = n_problems * n_folds
-    n_places = n_rows * n
+    n_places = n_problems * n_folds * n
     places = th.arange(n_places, dtype=th.int32).view(n_problems, n_folds, n)
     on_train, fresh, seen = (places.gather(2, part.expand(n_problems, -1, -1)).flatten(0, 1) for part in parts)
-    estimator = estimator_class(n_rows, 1, 1, **kwargs)  # the critics' inputs are places of pairs
 
     def read(critic: nn.Module, pairs: th.Tensor) -> th.Tensor:
         """Estimate from pairs of every row: ``(rows, n) -> (M, K)``."""
         return _read(estimator, critic, pairs, pairs + n_places).view(n_problems, n_folds)
 
     # The held-out pairs of all folds choose the start: a Gaussian copula, a t-copula or none.
-    infinite = th.full((n_problems,), NORMAL, dtype=th.double)
-    starts = [
-        Start.fit(t_scores(ranks, nu[:, None])[:, 0], train, n_x, nu, _level(estimator))
-        for nu in (infinite, degrees_of_freedom(ranks))
-    ]
+    level = 1.0 if isinstance(estimator, Nwj) else 0.0  # no information: the optimal critic of NWJ is 1 + the log ratio
+    likely = degrees_of_freedom(ranks)
+    normal = th.full_like(likely, NORMAL)
+    starts = [Start.fit(t_scores(ranks, nu[:, None])[:, 0], train, n_x, nu, level) for nu in (normal, likely)]
     values = th.stack([read(start, fresh).mean(-1) for start in starts])  # (2, M)
-    starts.append(starts[0].flat_like(_level(estimator)))
+    starts.append(starts[0].flat_like(level))
     best_start = th.where((values > 0).any(0), values.nan_to_num(-th.inf).argmax(0), 2)
     start = choose_start(starts, best_start.repeat_interleave(n_folds))
 
@@ -288,10 +251,11 @@ def _cross_fit(
     choice = _Choice(estimator.refit_below, estimator.refit_above, first, read(start, seen))
     best = first.mean(-1)
     n_stale, n_done = th.zeros_like(best), 0  # (M,)
-    samples = on_train[..., None], on_train[..., None] + n_places, None, th.arange(n_rows)
-    while n_done < max_gradient_steps and (training := n_stale < patience).any():
-        n_steps = min(STEPS_PER_CHECK, max_gradient_steps - n_done)
-        estimator._ascend(critic, optimizer, *samples, n_steps)
+    partners = on_train[..., None] + n_places
+    samples = InformationBatch(on_train[..., None], partners, partners, partners)
+    while n_done < max_steps and (training := n_stale < patience).any():
+        n_steps = min(STEPS_PER_CHECK, max_steps - n_done)
+        estimator._ascend(critic, optimizer, samples, th.arange(len(on_train)), n_steps)
         n_done += n_steps
         current = read(averaged, fresh)
         choice.consider(current, lambda: read(averaged, seen), training)
@@ -305,8 +269,7 @@ def _average(critic: StartedMLP, optimizer: th.optim.Adam) -> StartedMLP:
     """
     Return a copy whose weights are the moving average of the critic's (Polyak and Juditsky, 1992).
 
-    The average is free of most of the noise of minibatches, so that the learning rate can be large. (The
-    ``AveragedModel`` of PyTorch takes longer for a step than all else.)
+    It has little of the noise of minibatches, which allows a large learning rate. PyTorch's ``AveragedModel`` is slow.
     """
     averaged = copy.deepcopy(critic)
     average, (weights,) = flatten_parameters(averaged), optimizer.param_groups[0]["params"]
@@ -319,11 +282,6 @@ def _average(critic: StartedMLP, optimizer: th.optim.Adam) -> StartedMLP:
     return averaged
 
 
-def _level(estimator: CriticEstimator) -> float:
-    """Return the score that means "no information": the optimal critic of the NWJ bound is 1 + the log ratio."""
-    return 1.0 if isinstance(estimator, Nwj) else 0.0
-
-
 def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_folds: int) -> StartedMLP:
     """Make critics that equal ``start``; their networks start with the same weights in every problem."""
     sizes = (inputs.shape[-1], *estimator.sizes[1:])
@@ -333,8 +291,7 @@ def _new_critic(estimator: CriticEstimator, start: Start, inputs: th.Tensor, n_f
     critic.start, critic.table = start, th.cat([inputs, start.table], -1)
     for parameter, fold in zip(critic.parameters(), networks.parameters(), strict=True):
         parameter.copy_(fold.repeat(len(parameter) // n_folds, 1, 1))
-    last = critic.layers[-1]
-    for parameter in last.parameters():
+    for parameter in critic.layers[-1].parameters():
         parameter.zero_()
     return critic
 
@@ -358,15 +315,10 @@ def _read(estimator: CriticEstimator, critic: nn.Module, x: th.Tensor, z: th.Ten
 
 class _Choice:
     """
-    Choose the length of training for each fold by the estimates of the other folds.
+    Choose the length of training for each fold by the estimates of the other folds, ``(M, K)`` for each critic.
 
     Critics with an estimate out of bounds in any fold have diverged and are not chosen. Estimates on training pairs are
     computed only where a critic may be chosen.
-
-    :param lowest: lower bound of the estimates
-    :param highest: upper bound of the estimates
-    :param held_out: estimates of the start, ``(M, K)``
-    :param trained_on: estimates of the start, ``(M, K)``
     """
 
     def __init__(self, lowest: float, highest: float, held_out: th.Tensor, trained_on: th.Tensor) -> None:
@@ -375,13 +327,7 @@ class _Choice:
         self._best = self._others(held_out).where(self._counts(held_out) & self._counts(trained_on), -th.inf)
 
     def consider(self, held_out: th.Tensor, trained_on: Callable[[], th.Tensor], training: th.Tensor) -> None:
-        """
-        Choose a critic for the folds where it is better than the earlier ones.
-
-        :param held_out: ``(M, K)``
-        :param trained_on: returns ``(M, K)``
-        :param training: whether each problem is still in training, ``(M,)``
-        """
+        """Choose a critic for the folds where it is better than the earlier ones, in the problems in training."""
         others = self._others(held_out)
         better = (others > self._best) & self._counts(held_out) & training[:, None]
         if better.any():

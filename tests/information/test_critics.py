@@ -222,10 +222,10 @@ def test_the_critics_never_see_an_episode_that_is_held_out(name, monkeypatch):
     batch = InformationBatch(numbers, numbers, numbers, th.ones_like(numbers))
     seen, ascend = [], estimator._ascend
 
-    def spy(critic, optimizer, states, trvs, *args):
-        assert th.equal(states, trvs)
-        seen.append(frozenset(states.unique().tolist()))
-        ascend(critic, optimizer, states, trvs, *args)
+    def spy(critic, optimizer, batch, *args):
+        assert th.equal(batch.states, batch.trvs)
+        seen.append(frozenset(batch.states.unique().tolist()))
+        ascend(critic, optimizer, batch, *args)
 
     estimated, estimate = [], estimator._estimate
     monkeypatch.setattr(estimator, "_ascend", spy)

@@ -57,7 +57,8 @@ def test_the_limits_spend_three_fifths_and_one_fifth_of_the_probability_to_miss(
 
 def test_the_probability_to_miss_is_shared_by_the_gap():
     assert miss_of_each_limit(0.05, 0) == pytest.approx(0.025)
-    assert miss_of_each_limit(0.05, math.inf) == pytest.approx(0.05)
+    for miss in np.geomspace(1e-4, 0.3, 50):
+        assert [miss_of_each_limit(miss, gap) for gap in (100.0, math.inf)] == pytest.approx([miss, miss])
     for no_gap in (-1.0, math.nan):
         assert miss_of_each_limit(0.05, no_gap) == miss_of_each_limit(0.05, 0)
     # The estimates of two bounds that are one standard error apart: the worst truths are the bounds themselves.

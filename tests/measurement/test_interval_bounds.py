@@ -11,8 +11,7 @@ from scipy.stats import multivariate_normal
 from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet
 from sb3_tdpg.measurement import density_critic, information_interval
 from sb3_tdpg.measurement import interval_bounds as bounds_module
-from sb3_tdpg.measurement.density_critic import DensityCritic, Regression
-from sb3_tdpg.measurement.gaussian_critic import GaussianCritic
+from sb3_tdpg.measurement.density_critic import DensityCritic, GaussianCritic, Regression
 from sb3_tdpg.measurement.interval_bounds import (
     Estimate,
     FreshPairs,
