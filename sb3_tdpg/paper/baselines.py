@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
@@ -18,7 +19,7 @@ from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper.ball import GROUPS, NO_PENALTY_PLAIN, with_groups
 from sb3_tdpg.paper.ball import SECOND_STAGE as BALL_SECOND_STAGE
 from sb3_tdpg.paper.baseline_runs import SB3Run, TimedRun, training_time
-from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, make_tasks, read_records, write_results
+from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, Options, make_tasks, read_records, write_results
 from sb3_tdpg.paper.grasp import TDPG_SECOND_STAGE as GRASP_SECOND_STAGE
 from sb3_tdpg.paper.lava import MAX_ATTEMPTS
 
@@ -99,7 +100,7 @@ class Comparison:
     recorded: Mapping[str, str]  # label of these methods in the records -> in the table
     digits: int = 2
 
-    def tasks(self, n_seeds: int, folder: Path, n_timesteps: int | None = None) -> list[Task]:
+    def tasks(self, n_seeds: int, folder: Path, overrides: Mapping[str, Any] = MappingProxyType({})) -> list[Task]:
         """List the runs seed by seed, so that an interrupted call has the same seeds of all baselines."""
         methods = [
             (baseline, self.first_seed + i)
@@ -107,7 +108,7 @@ class Comparison:
             for baseline in self.baselines
             if baseline.max_seeds is None or i < baseline.max_seeds
         ]
-        return make_tasks(self.env_id, folder / self.env_id, methods, lambda _: self.rows, n_timesteps)
+        return make_tasks(self.env_id, folder / self.env_id, methods, lambda _: self.rows, overrides)
 
     @property
     def labels(self) -> list[str]:
@@ -193,38 +194,31 @@ def reproduce_baselines(
     n_seeds: int = 5,
     n_ball_seeds: int = 5,
     n_grasp_seeds: int = 1,
-    n_eval_episodes: int = 1000,
-    n_timesteps: int | None = None,
-    jobs: int | None = None,
-    publish: Path | None = None,
     records: Path = RECORDS,
+    **options: Any,
 ) -> str:
     """
     Train the baselines with several seeds, evaluate them on the rows of the paper's tables; write table and records.
-
-    Finished runs are kept: the same call continues an interrupted one.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each baseline on the lava problem.
     :param n_ball_seeds: Training seeds of each baseline on ball catching; 0 leaves it out.
     :param n_grasp_seeds: Training seeds of each baseline on grasping; 0 leaves it out.
-    :param n_eval_episodes: Episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as many as TDPG has.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
     :param records: Folder of results, with the episodes of the methods that are not trained again.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     :raises ValueError: if these records are missing; nothing has been trained by then.
     """
+    given = Options(**options)
     numbers = ((LAVA_BASELINES, n_seeds), (BALL_BASELINES, n_ball_seeds), (GRASP_BASELINES, n_grasp_seeds))
-    comparisons = [(each, each.tasks(n, out / "runs", n_timesteps)) for each, n in numbers if n > 0]
+    comparisons = [(each, each.tasks(n, out / "runs", given.overrides)) for each, n in numbers if n > 0]
     if missing := [str(records / each.records) for each, _ in comparisons if not (records / each.records).exists()]:
         raise ValueError(
             f"{' and '.join(missing)} are missing: run this in the folder of the repository, or make them first with "
             "'make reproduce-lava reproduce-ball-controls reproduce-grasp'"
         )
     everything = [task for _, tasks in comparisons for task in tasks]
-    complete_runs(everything, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    complete_runs(everything, **given.of_runs)
 
     sections, seed_tables = ["# Baselines"], []
     for each, tasks in comparisons:
@@ -233,7 +227,7 @@ def reproduce_baselines(
         seed_tables.append(seeds)
         # A recorded method is trained again for its time only.
         new = trained[trained["model"].isin(set(each.labels) - set(each.recorded.values()))]
-        table = pd.concat([each.read_recorded(records, n_eval_episodes), new], ignore_index=True)
+        table = pd.concat([each.read_recorded(records, given.n_eval_episodes), new], ignore_index=True)
         has_groups = set(GROUPS) <= set(each.columns)
         table = with_groups(table) if has_groups else table
         table = table.sort_values("model", key=lambda column, each=each: column.map(each.labels.index), kind="stable")
@@ -243,7 +237,7 @@ def reproduce_baselines(
     frame = read_records(everything)[COLUMNS].round({"cost": 4})
     write_frame_atomically(frame, out / "episodes.csv.xz")
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True).round(4), out / "seeds.csv")
-    return write_results(out, [*sections, FOOTER], everything, "make reproduce-baselines", publish)
+    return write_results(out, [*sections, FOOTER], everything, "make reproduce-baselines", given.publish)
 
 
 def _seed_table(records: pd.DataFrame, tasks: Sequence[Task]) -> pd.DataFrame:

@@ -24,7 +24,7 @@ from sb3_tdpg.evaluation import (
     training_curves,
 )
 from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
-from sb3_tdpg.paper.common import RECORD_COLUMNS, folders_of, met, read_records, write_results
+from sb3_tdpg.paper.common import RECORD_COLUMNS, Options, folders_of, met, read_records, write_results
 from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
@@ -97,7 +97,7 @@ def demo(
     :param n_timesteps: Environment steps of each training; default: as in the block.
     :return: the table
     """
-    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    overrides = Options(n_timesteps=n_timesteps).overrides
     runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
     tasks: list[Task] = [(run, out / "runs" / run.folder_name, LAVA) for run in runs]
     folders = {run.method: folder for run, folder, _ in tasks}
@@ -139,31 +139,22 @@ def reproduce_lava(
     *,
     n_seeds: int = 10,
     n_paper_seeds: int = 3,
-    n_eval_episodes: int = 1000,
-    n_timesteps: int | None = None,
-    jobs: int | None = None,
-    publish: Path | None = None,
+    **options: Any,
 ) -> str:
     """
     Train every method with both cost definitions and many seeds, and the paper's own settings; write tables, figures
     and records.
 
-    Finished runs are kept: the same call continues an interrupted one.
-
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes_*.csv.gz``, figures, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each method.
     :param n_paper_seeds: Training seeds of the paper's own settings.
-    :param n_eval_episodes: Episodes of each row of Table I.
-    :param n_timesteps: Environment steps of each training; default: as in the blocks.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
-    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
-    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
+    given = Options(**options)
+    overrides, seeds = given.overrides, range(FIRST_SEED, FIRST_SEED + n_seeds)
     runs = {
-        reading: [lava_run(m, reading, seed, **overrides) for m in reversed(METHODS) for seed in seeds]
-        for reading in READINGS
+        reading: [lava_run(m, reading, seed, **overrides) for m in METHODS for seed in seeds] for reading in READINGS
     }
     runs["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
     tasks: dict[str, list[Task]] = {
@@ -172,13 +163,12 @@ def reproduce_lava(
     }
     everything = [task for of_group in tasks.values() for task in of_group]
     # The longest runs first, so that the cores finish together.
-    longest_first = sorted(everything, key=lambda task: task[0].method != "TDPG")
-    complete_runs(longest_first, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    longest_first = sorted(everything, key=lambda task: (task[0].method != "TDPG", task[0].method == "PG"))
+    complete_runs(longest_first, **given.of_runs)
 
     sections, seed_tables = ["# The lava problem (Table I)"], []
     for group, of_group in tasks.items():
         records = read_records(of_group)
-        records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
         write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
@@ -191,7 +181,7 @@ def reproduce_lava(
             one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]
             _write_figures(out, f"_{group}", one_seed, folders, models, group)
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True), out / "seeds.csv")
-    return write_results(out, sections, everything, "make reproduce-lava", publish)
+    return write_results(out, sections, everything, "make reproduce-lava", given.publish)
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
@@ -223,8 +213,3 @@ def _verdict(seeds: pd.DataFrame, mean: float, std: float | None, ratio: float |
     if ratio is not None:
         checks.append(f"ratio <= {ratio:g}: {(seeds['ratio'] <= ratio).sum()} of {len(seeds)} seeds")
     return "; ".join(checks)
-
-
-def _method_order(column: pd.Series) -> pd.Series:
-    order = {method: i for i, method in enumerate(METHODS)}
-    return column.map(lambda x: order.get(x, len(order))) if column.name == "model" else column
