@@ -15,14 +15,7 @@ from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
-from sb3_tdpg.paper.grasp_analysis import (
-    ESTIMATES,
-    KNOWLEDGE,
-    PENALTY,
-    estimates_table,
-    knowledge_table,
-    penalty_table,
-)
+from sb3_tdpg.paper.knowledge import ESTIMATES, KNOWLEDGE, PENALTY, estimates_table, knowledge_table, penalty_table
 from sb3_tdpg.tdpg import TDPG
 
 # Seeds below 100 were used to make the blocks.
