@@ -120,13 +120,11 @@ def reproduce_ball(
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     everything = [(method, seed) for method in methods for seed in seeds]
     everything += [(method, seed) for method in paper_methods for seed in seeds[:n_paper_seeds]]
-    tasks = common.make_tasks(
-        "BallCatch-v0",
-        out / "runs",
-        everything,
-        lambda method: [*(row.with_kwargs(renderer=method.renderer) for row in rows), *diagnosis],
-        given.overrides,
-    )
+
+    def rows_of(method: Method) -> list[Scenario]:
+        return [*(row.with_kwargs(renderer=method.renderer) for row in rows), *diagnosis]
+
+    tasks = common.make_tasks("BallCatch-v0", out / "runs", everything, rows_of, given.overrides)
     labels = {renderer: [m.label for m in methods if m.renderer == renderer] for renderer in ("pybullet", "fast")}
     # The longest runs first, so that the cores finish together.
     longest_first = sorted(tasks, key=lambda task: task[0].method in labels["fast"])
