@@ -60,10 +60,7 @@ def grasps() -> None:
         (RESULTS / "panda_grasp_camera", PANDA_GRASP_CAMERA[1], failures_by_camera, "camera.png"),
     ):
         records = episodes(folder)
-        figure = draw(records[records["scenario"] == row.name])
-        if draw is failures_by_yaw:  # where nothing fails
-            figure.axes[0].legend(loc="lower left", bbox_to_anchor=(-0.12, -0.1), fontsize=8, frameon=False)
-        save_figure(figure, folder / name)
+        save_figure(draw(records[records["scenario"] == row.name]), folder / name)
 
 
 def seed_means(seeds: pd.DataFrame, rows: list[str]) -> pd.DataFrame:

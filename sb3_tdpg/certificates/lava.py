@@ -150,12 +150,11 @@ def _theorem_row(episodes: TrainingEpisodes, inverse_beta: float) -> dict[str, A
     """Return the bound of Theorem II.1, and the divergence that its condition allows."""
     information = episodes.information
     bound = episodes.fixed_beta(1 / inverse_beta, information).bound
-    allowed = dict(corrected=information / inverse_beta, printed=information * inverse_beta)
-    return dict(beta=f"1/{inverse_beta}", information=information, bound=bound, **allowed)
+    row = dict(beta=f"1/{inverse_beta}", information=information, bound=bound)
+    return dict(**row, corrected=information / inverse_beta, printed=information * inverse_beta)
 
 
 def _sections(frames: Mapping[str, pd.DataFrame], confidence: float, cost_bound: float) -> list[str]:
-    """Return the sections of the summary."""
     clipped = f"The cost is clipped at {cost_bound:g}, except in the last column."
     sections = ["## The paper's shifts", _paper_table(frames["paper"], confidence), clipped]
     if "random" in frames:
@@ -186,8 +185,7 @@ def _random_table(random: pd.DataFrame, trivial: float) -> str:
     for label, group in random.groupby("model", sort=False):
         cost, bound, error = group["cost"], group["bound"], group["standard_error"]
         is_certified = bound < 0.999 * trivial
-        row = {"policy": label, "shifts": len(group)}
-        row["cost at most the bound"] = int((cost <= bound).sum())
+        row = {"policy": label, "shifts": len(group), "cost at most the bound": int((cost <= bound).sum())}
         row["cost + 3 standard errors at most the bound"] = int((cost + 3 * error <= bound).sum())
         row["bound below the trivial bound"] = int(is_certified.sum())
         row["bound - cost: median [range]"] = _spread((bound - cost)[is_certified])
@@ -206,15 +204,15 @@ def _theorem_table(theorem: pd.DataFrame, random: pd.DataFrame) -> str:
     rows = []
     for at in theorem.to_dict("records"):
         shifts = random[random["model"] == at["model"]]
-        row = dict(policy=at["model"], beta=at["beta"], information=f"{at['information']:.2g}")
-        row["bound"] = f"{at['bound']:.1f}"
+        row = dict(policy=at["model"], beta=at["beta"])
+        row.update(information=f"{at['information']:.2g}", bound=f"{at['bound']:.1f}")
         for condition in ("corrected", "printed"):
             meet = shifts[shifts["measured_kl"] <= at[condition]]
             above = meet["cost"] - at["bound"]
+            clearly_above = (above > 3 * meet["standard_error"]).sum()
             row[f"{condition} condition: divergence allowed"] = f"{at[condition]:.2g}"
             row[f"{condition} condition: shifts that meet it"] = str(len(meet))
-            counts = f"{(above > 0).sum()} ({(above > 3 * meet['standard_error']).sum()})"
-            row[f"{condition} condition: costs above the bound"] = counts
+            row[f"{condition} condition: costs above the bound"] = f"{(above > 0).sum()} ({clearly_above})"
         rows.append(row)
     return markdown_table(rows)
 

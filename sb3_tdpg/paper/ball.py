@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -94,15 +95,10 @@ def reproduce_ball(
     controls: bool = True,
     n_seeds: int = 5,
     n_paper_seeds: int = 1,
-    n_eval_episodes: int = 1000,
-    n_timesteps: int | None = None,
-    jobs: int | None = None,
-    publish: Path | None = None,
+    **options: Any,
 ) -> str:
     """
     Train every method with several seeds, evaluate it on the rows of Table II; write tables, figures and records.
-
-    Finished runs are kept: the same call continues an interrupted one.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
     :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own, without the paper's settings.
@@ -110,12 +106,10 @@ def reproduce_ball(
         them.
     :param n_seeds: Training seeds of each method.
     :param n_paper_seeds: Training seeds of the paper's own settings.
-    :param n_eval_episodes: Episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as in the blocks.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
+    given = common.Options(**options)
     is_fixed = launch == "fixed"
     methods, rows = (METHODS, BALL_CATCH) if is_fixed else (VARYING_METHODS, BALL_CATCH_VARYING_LAUNCH)
     launch_kwargs = {} if is_fixed else BALL_VARYING_LAUNCH
@@ -126,17 +120,15 @@ def reproduce_ball(
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     everything = [(method, seed) for method in methods for seed in seeds]
     everything += [(method, seed) for method in paper_methods for seed in seeds[:n_paper_seeds]]
-    tasks = common.make_tasks(
-        "BallCatch-v0",
-        out / "runs",
-        everything,
-        lambda method: [*(row.with_kwargs(renderer=method.renderer) for row in rows), *diagnosis],
-        n_timesteps,
-    )
+
+    def rows_of(method: Method) -> list[Scenario]:
+        return [*(row.with_kwargs(renderer=method.renderer) for row in rows), *diagnosis]
+
+    tasks = common.make_tasks("BallCatch-v0", out / "runs", everything, rows_of, given.overrides)
     labels = {renderer: [m.label for m in methods if m.renderer == renderer] for renderer in ("pybullet", "fast")}
     # The longest runs first, so that the cores finish together.
     longest_first = sorted(tasks, key=lambda task: task[0].method in labels["fast"])
-    complete_runs(longest_first, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    complete_runs(longest_first, **given.of_runs)
 
     records = common.read_records(tasks)
     is_row = records["scenario"].isin([row.name for row in rows])
@@ -181,7 +173,7 @@ def reproduce_ball(
         ]
     sections += ["## What the TRVs know", KNOWLEDGE, common.write_knowledge(pd.DataFrame(knowledge), ["model"], out)]
     command = "make reproduce-ball" + ("-varying" if not is_fixed else "-controls" if controls else "")
-    return common.write_results(out, sections, tasks, command, publish)
+    return common.write_results(out, sections, tasks, command, given.publish)
 
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:
@@ -194,15 +186,9 @@ def group_rows(rows: Sequence[Scenario]) -> list[Scenario]:
     """Return :data:`GROUPS` as rows of the table, with the mean of the paper's numbers."""
     result = []
     for name, members in GROUPS.items():
-        papers = [row.paper for row in rows if row.name in members]
-        paper = {
-            method: PaperResult(
-                float(np.mean([p[method].mean for p in papers])),
-                distance=float(np.mean([p[method].distance for p in papers])),
-            )
-            for method in ("PG", "TDPG")
-            if all(method in p for p in papers)
-        }
+        papers = pd.DataFrame([row.paper for row in rows if row.name in members]).map(lambda p: (p.mean, p.distance))
+        means = {method: np.mean(list(results), axis=0).tolist() for method, results in papers.items()}
+        paper = {method: PaperResult(mean, distance=distance) for method, (mean, distance) in means.items()}
         result.append(Scenario(name, "BallCatch-v0", paper=paper))
     return result
 

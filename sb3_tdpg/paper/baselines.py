@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import json
+import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
+from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, make_output_format
 
+from sb3_tdpg.common.files import replaced_atomically, write_atomically
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, PANDA_GRASP, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.experiments.runs import Run, Task, complete_runs
+from sb3_tdpg.experiments.training import read_schedule, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper.ball import GROUPS, NO_PENALTY_PLAIN, with_groups
 from sb3_tdpg.paper.ball import SECOND_STAGE as BALL_SECOND_STAGE
-from sb3_tdpg.paper.baseline_runs import SB3Run, TimedRun, training_time
-from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, make_tasks, read_records, write_results
+from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, Options, make_tasks, read_records, write_results
 from sb3_tdpg.paper.grasp import TDPG_SECOND_STAGE as GRASP_SECOND_STAGE
 from sb3_tdpg.paper.lava import MAX_ATTEMPTS
 
@@ -42,6 +51,74 @@ FOOTER = (
 
 
 @dataclass(frozen=True)
+class TimedRun(Run):
+    """A run that writes ``time.json``: the wall time and the CPU time of its training in seconds."""
+
+    def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+        """Train as the base class does; a resumed call adds to the time, an interrupted one does not."""
+        path = folder / "time.json"
+        before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
+        wall, cpu = time.perf_counter(), time.process_time()
+        trained = self._learn(attempt, folder, progress_bar)
+        wall, cpu = before["wall_s"] + time.perf_counter() - wall, before["cpu_s"] + time.process_time() - cpu
+        write_atomically(path, json.dumps(dict(wall_s=round(wall, 3), cpu_s=round(cpu, 3))))
+        return trained
+
+    def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+        return super().train(attempt, folder, progress_bar)
+
+
+@dataclass(frozen=True)
+class SB3Run(TimedRun):
+    """
+    A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew.
+
+    :param algo: ``"ppo"`` or ``"ppo_lstm"``; the block is in ``hyperparams/<algo>.yml``.
+    """
+
+    algo: str = "ppo"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The block with the overrides."""
+        return {**load_hyperparams(self.block, self.algo), **self.overrides}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The settings that make this run."""
+        return {**super().config, "algo": self.algo}
+
+    def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+        algorithm, path = _algorithm(self.algo), folder / "model.zip"
+        if path.exists():
+            return algorithm.load(path, device="cpu"), False
+        settings = self.settings
+        n_timesteps = int(settings.pop("n_timesteps"))
+        env = take_env(self.env_id, settings)
+        read_schedule(settings)
+        model = algorithm(settings.pop("policy"), env, **settings, seed=self.seed, device="cpu")
+        model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
+        model.learn(n_timesteps, progress_bar=progress_bar)
+        model.logger.close()
+        with replaced_atomically(path) as partial:
+            model.save(partial)
+        return model, False
+
+
+def _algorithm(name: str) -> Any:
+    try:
+        return PPO if name == "ppo" else import_module("sb3_contrib").RecurrentPPO
+    except ImportError as e:
+        raise ImportError("RecurrentPPO needs sb3-contrib: pip install sb3-contrib") from e
+
+
+def training_time(folder: Path) -> dict[str, float]:
+    """Return the total ``wall_s`` and ``cpu_s`` of the training of a run, including failed attempts."""
+    times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
+    return {name: sum(each[name] for each in times) for name in ("wall_s", "cpu_s")}
+
+
+@dataclass(frozen=True)
 class Baseline(Method):
     """
     One row of the table: how it is trained.
@@ -52,7 +129,7 @@ class Baseline(Method):
     """
 
     algo: str = "tdpg"
-    max_seeds: int | None = None
+    max_seeds: float = math.inf
     is_shown: bool = True
 
     def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
@@ -61,16 +138,11 @@ class Baseline(Method):
         return TimedRun(**vars(run)) if self.algo == "tdpg" else SB3Run(**vars(run), algo=self.algo)
 
 
-def with_weight_decay(block: str, weight_decay: float) -> dict[str, Any]:
-    """Return the override that gives the policy's optimiser of a block a weight decay (Adam's: an L2 penalty)."""
-    policy_kwargs = load_hyperparams(block)["policy_kwargs"]
-    return dict(policy_kwargs={**policy_kwargs, "optimizer_kwargs": dict(weight_decay=weight_decay)})
-
-
-def _with_weight_decay(block: str, n_timesteps: float) -> Baseline:
+def with_weight_decay(block: str, n_timesteps: float) -> Baseline:
+    """Return PG with a weight decay of the policy's optimiser (Adam's: an L2 penalty)."""
     # On seed 350 of the lava problem, 1e-3 was better than 1e-2.
-    overrides = dict(n_timesteps=n_timesteps, **with_weight_decay(block, 1e-3))
-    return Baseline("PG, weight decay", block, overrides=overrides)
+    policy_kwargs = {**load_hyperparams(block)["policy_kwargs"], "optimizer_kwargs": dict(weight_decay=1e-3)}
+    return Baseline("PG, weight decay", block, overrides=dict(n_timesteps=n_timesteps, policy_kwargs=policy_kwargs))
 
 
 def with_perturbation(**strengths: float) -> dict[str, Any]:
@@ -99,20 +171,20 @@ class Comparison:
     recorded: Mapping[str, str]  # label of these methods in the records -> in the table
     digits: int = 2
 
-    def tasks(self, n_seeds: int, folder: Path, n_timesteps: int | None = None) -> list[Task]:
+    def tasks(self, n_seeds: int, folder: Path, overrides: Mapping[str, Any] = MappingProxyType({})) -> list[Task]:
         """List the runs seed by seed, so that an interrupted call has the same seeds of all baselines."""
         methods = [
             (baseline, self.first_seed + i)
             for i in range(n_seeds)
             for baseline in self.baselines
-            if baseline.max_seeds is None or i < baseline.max_seeds
+            if i < baseline.max_seeds
         ]
-        return make_tasks(self.env_id, folder / self.env_id, methods, lambda _: self.rows, n_timesteps)
+        return make_tasks(self.env_id, folder / self.env_id, methods, lambda _: self.rows, overrides)
 
     @property
     def labels(self) -> list[str]:
         """The methods in the order of the table's rows."""
-        shown = [baseline.label for baseline in self.baselines if baseline.is_shown]
+        shown = (baseline.label for baseline in self.baselines if baseline.is_shown)
         return list(dict.fromkeys([*self.recorded.values(), *shown]))
 
     def read_recorded(self, folder: Path, n_eval_episodes: int) -> pd.DataFrame:
@@ -132,7 +204,7 @@ LAVA_BASELINES = Comparison(
         # One seed, for its time.
         Baseline("TDPG (log-det)", "Lava-v0-logdet", max_attempts=MAX_ATTEMPTS, max_seeds=1),
         Baseline("PG", "Lava-v0-pg", overrides=dict(n_timesteps=LAVA_STEPS)),
-        _with_weight_decay("Lava-v0-pg", LAVA_STEPS),
+        with_weight_decay("Lava-v0-pg", LAVA_STEPS),
         Baseline("VIB", "Lava-v0-logdet", overrides=VIB, max_attempts=MAX_ATTEMPTS),
         Baseline("PPO", "Lava-v0", algo="ppo", overrides=LAVA_PPO),
         Baseline("RecurrentPPO", "Lava-v0", algo="ppo_lstm", overrides=LAVA_PPO),
@@ -152,7 +224,7 @@ BALL_BASELINES = Comparison(
         # One seed, for its time.
         Baseline("TDPG, perturbed images", "BallCatch-v0", "first stage", overrides=BALL_SECOND_STAGE, max_seeds=1),
         Baseline("VIB, perturbed images", "BallCatch-v0", "first stage", overrides={**VIB, **BALL_SECOND_STAGE}),
-        _with_weight_decay("BallCatch-v0-pg", BALL_STEPS),
+        with_weight_decay("BallCatch-v0-pg", BALL_STEPS),
         Baseline("PPO", "BallCatch-v0", algo="ppo"),
         Baseline("PPO, pixel noise", "BallCatch-v0", overrides=NOISE, algo="ppo"),
         Baseline("PPO, random backgrounds", "BallCatch-v0", overrides=BACKGROUNDS, algo="ppo"),
@@ -173,7 +245,7 @@ GRASP_BASELINES = Comparison(
     baselines=(
         Baseline("first stage", "PandaGrasp-v0-pg", is_shown=False),
         Baseline("VIB", "PandaGrasp-v0", "first stage", overrides={**VIB, **GRASP_SECOND_STAGE}),
-        _with_weight_decay("PandaGrasp-v0-pg", GRASP_STEPS),
+        with_weight_decay("PandaGrasp-v0-pg", GRASP_STEPS),
         Baseline("PPO", "PandaGrasp-v0", algo="ppo", overrides=dict(n_timesteps=GRASP_STEPS)),
     ),
     rows=PANDA_GRASP,
@@ -193,38 +265,31 @@ def reproduce_baselines(
     n_seeds: int = 5,
     n_ball_seeds: int = 5,
     n_grasp_seeds: int = 1,
-    n_eval_episodes: int = 1000,
-    n_timesteps: int | None = None,
-    jobs: int | None = None,
-    publish: Path | None = None,
     records: Path = RECORDS,
+    **options: Any,
 ) -> str:
     """
     Train the baselines with several seeds, evaluate them on the rows of the paper's tables; write table and records.
-
-    Finished runs are kept: the same call continues an interrupted one.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each baseline on the lava problem.
     :param n_ball_seeds: Training seeds of each baseline on ball catching; 0 leaves it out.
     :param n_grasp_seeds: Training seeds of each baseline on grasping; 0 leaves it out.
-    :param n_eval_episodes: Episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as many as TDPG has.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
     :param records: Folder of results, with the episodes of the methods that are not trained again.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     :raises ValueError: if these records are missing; nothing has been trained by then.
     """
+    given = Options(**options)
     numbers = ((LAVA_BASELINES, n_seeds), (BALL_BASELINES, n_ball_seeds), (GRASP_BASELINES, n_grasp_seeds))
-    comparisons = [(each, each.tasks(n, out / "runs", n_timesteps)) for each, n in numbers if n > 0]
+    comparisons = [(each, each.tasks(n, out / "runs", given.overrides)) for each, n in numbers if n > 0]
     if missing := [str(records / each.records) for each, _ in comparisons if not (records / each.records).exists()]:
         raise ValueError(
             f"{' and '.join(missing)} are missing: run this in the folder of the repository, or make them first with "
             "'make reproduce-lava reproduce-ball-controls reproduce-grasp'"
         )
     everything = [task for _, tasks in comparisons for task in tasks]
-    complete_runs(everything, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    complete_runs(everything, **given.of_runs)
 
     sections, seed_tables = ["# Baselines"], []
     for each, tasks in comparisons:
@@ -233,7 +298,7 @@ def reproduce_baselines(
         seed_tables.append(seeds)
         # A recorded method is trained again for its time only.
         new = trained[trained["model"].isin(set(each.labels) - set(each.recorded.values()))]
-        table = pd.concat([each.read_recorded(records, n_eval_episodes), new], ignore_index=True)
+        table = pd.concat([each.read_recorded(records, given.n_eval_episodes), new], ignore_index=True)
         has_groups = set(GROUPS) <= set(each.columns)
         table = with_groups(table) if has_groups else table
         table = table.sort_values("model", key=lambda column, each=each: column.map(each.labels.index), kind="stable")
@@ -243,7 +308,7 @@ def reproduce_baselines(
     frame = read_records(everything)[COLUMNS].round({"cost": 4})
     write_frame_atomically(frame, out / "episodes.csv.xz")
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True).round(4), out / "seeds.csv")
-    return write_results(out, [*sections, FOOTER], everything, "make reproduce-baselines", publish)
+    return write_results(out, [*sections, FOOTER], everything, "make reproduce-baselines", given.publish)
 
 
 def _seed_table(records: pd.DataFrame, tasks: Sequence[Task]) -> pd.DataFrame:
@@ -278,8 +343,8 @@ def baselines_table(
                 text += f" [{cell['low']:.{digits}f}, {cell['high']:.{digits}f}]"
             line[row] = f"**{text}**" if cell["iqm"] == lowest[row] else text
         if seeds is not None:
+            times = seeds[seeds["model"] == model]
             for title, name in (("CPU time (s)", "cpu_s"), ("wall time (s)", "wall_s")):
-                times = seeds.loc[seeds["model"] == model, name]
-                line[title] = f"{times.median():.0f}" if len(times) else "-"
+                line[title] = f"{times[name].median():.0f}" if len(times) else "-"
         lines.append(line)
     return markdown_table(lines, align="lr")

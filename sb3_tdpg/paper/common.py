@@ -26,6 +26,33 @@ NO_PENALTY = "TDPG without the penalty"
 """Label of the ablation, which differs from TDPG in the missing penalty only."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """
+    The options of every reproduction. Finished runs are kept: the same call continues an interrupted one.
+
+    :param n_eval_episodes: Episodes of each row.
+    :param n_timesteps: Environment steps of each training; default: as in the blocks.
+    :param jobs: Parallel runs; default: the number of cores.
+    :param publish: Folder that gets a copy of everything but ``runs/``.
+    """
+
+    n_eval_episodes: int = 1000
+    n_timesteps: int | None = None
+    jobs: int | None = None
+    publish: Path | None = None
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """The settings that replace those of every block."""
+        return {} if self.n_timesteps is None else {"n_timesteps": self.n_timesteps}
+
+    @property
+    def of_runs(self) -> dict[str, Any]:
+        """The arguments of :func:`~sb3_tdpg.experiments.runs.complete_runs`."""
+        return dict(n_eval_episodes=self.n_eval_episodes, jobs=self.jobs)
+
+
 @dataclass(frozen=True)
 class Method:
     """
@@ -48,8 +75,7 @@ class Method:
 
     def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
         """Return the run of this method with one seed."""
-        settings = {**self.overrides, **overrides}
-        return Run(self.label, env_id, self.block, seed, settings, self.max_attempts, start)
+        return Run(self.label, env_id, self.block, seed, {**self.overrides, **overrides}, self.max_attempts, start)
 
 
 def make_tasks(
@@ -57,21 +83,19 @@ def make_tasks(
     folder: Path,
     methods: Iterable[tuple[Method, int]],
     rows: Callable[[Method], Sequence[Scenario]],
-    n_timesteps: int | None = None,
+    overrides: Mapping[str, Any],
 ) -> list[Task]:
     """
     Make the runs of several methods, some of which start from the policy of another one with the same seed.
 
     :param methods: Methods with their seeds, each after the method that it starts from.
     :param rows: Returns the rows that a method is evaluated on.
+    :param overrides: Settings that replace those of every block.
     """
-    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
     tasks: list[Task] = []
-    folders: dict[tuple[str, int], Path] = {}
     for method, seed in methods:
-        start = None if method.start is None else folders[method.start, seed]
+        start = None if method.start is None else folders_of(tasks)[method.start, seed]
         run = method.run(env_id, seed, start, **overrides)
-        folders[method.label, seed] = folder / run.folder_name
         tasks.append((run, folder / run.folder_name, rows(method)))
     return tasks
 
@@ -116,26 +140,17 @@ def comparisons_table(
     :param kinds: Rows over which the mean is taken, by name.
     :param quantity: Name of the mean in the header.
     """
+    columns = ["method", "compared with", "rows", "probability of being better [95 %]"]
+    columns += [f"{quantity} of the method", f"{quantity} of the other", "difference [95 %]"]
     rows = []
-    for model, other in comparisons:
-        if not {model, other} <= set(table["model"]):
-            continue
+    for model, other in [pair for pair in comparisons if set(pair) <= set(table["model"])]:
         for name, members in kinds.items():
             part = table[table["scenario"].isin(members)]
-            better, difference = (f(part, model, other) for f in (probability_of_improvement, paired_difference))
-            cost = part.groupby("model")["cost"].mean()
-            rows.append(
-                {
-                    "method": model,
-                    "compared with": other,
-                    "rows": name,
-                    "probability of being better [95 %]": "{:.2f} [{:.2f}, {:.2f}]".format(*better),
-                    f"{quantity} of the method": f"{cost[model]:.3g}",
-                    f"{quantity} of the other": f"{cost[other]:.3g}",
-                    "difference [95 %]": "{:+.3g} [{:+.3g}, {:+.3g}]".format(*difference),
-                }
-            )
-    return markdown_table(rows)
+            better = "{:.2f} [{:.2f}, {:.2f}]".format(*probability_of_improvement(part, model, other))
+            difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*paired_difference(part, model, other))
+            costs = part.groupby("model")["cost"].mean()[[model, other]].map("{:.3g}".format)
+            rows.append([model, other, name, better, *costs, difference])
+    return markdown_table(rows, columns)
 
 
 def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> str:
@@ -163,7 +178,6 @@ def write_results(
     write_atomically(out / "summary.md", summary)
     if publish is not None:
         publish.mkdir(parents=True, exist_ok=True)
-        for path in out.iterdir():
-            if path.is_file():
-                shutil.copy2(path, publish / path.name)
+        for path in filter(Path.is_file, out.iterdir()):
+            shutil.copy2(path, publish)
     return summary

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -28,14 +28,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+N_BINS = 40  # of a histogram
+NOISE_VARIANCES = (1e-4, 1.0)  # of the sensor in the trajectories
 
-def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_bins: int = 40) -> Figure:
+
+def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Figure:
     """
     Draw histograms of the episode cost, as in the paper's Fig. 3: one panel for each scenario.
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :param scenarios: The panels from left to right.
-    :param n_bins: Number of bins, the same in all panels. They are equal on a logarithmic axis, since costs range over
+    :param scenarios: The panels from left to right. Their bins are equal on a logarithmic axis, since costs range over
         two decades, unless a cost is zero or negative.
     """
     names = [scenario.name for scenario in scenarios]
@@ -48,9 +50,9 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
     is_positive = low > 0
     if is_positive:
         low = max(low, high / 1e3)  # a few costs near 0 must not stretch the axis: they go into the first bin
-        bins = np.geomspace(low, high * 1.001, n_bins + 1)
+        bins = np.geomspace(low, high * 1.001, N_BINS + 1)
     else:
-        bins = np.histogram_bin_edges(shown["cost"], n_bins)
+        bins = np.histogram_bin_edges(shown["cost"], N_BINS)
     for axes, scenario in zip(panels, scenarios, strict=True):
         for color, (label, group) in zip(cycle(PALETTE), shown.groupby("model", sort=False), strict=False):
             costs = group.loc[group["scenario"] == scenario.name, "cost"].clip(lower=low)
@@ -68,13 +70,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario], *, n_b
 
 
 def lava_trajectories(
-    models: Mapping[str, Any],
-    env_kwargs: Mapping[str, Any] | None = None,
-    n_episodes: int = 60,
-    seed: int = 0,
-    *,
-    noise_variances: Sequence[float] = (1e-4, 1.0),
-    deterministic: bool = False,
+    models: Mapping[str, Any], env_kwargs: Mapping[str, Any] | None = None, n_episodes: int = 60
 ) -> Figure:
     """
     Draw the position of the robot of the lava problem over time: one column per model, one row per noise level.
@@ -82,19 +78,15 @@ def lava_trajectories(
     :param models: SB3 models by their label.
     :param env_kwargs: Keywords of the environment other than its noise.
     :param n_episodes: Number of episodes in a panel; all panels have the same start positions.
-    :param seed: Seed of the episodes.
-    :param noise_variances: sigma^2 of the sensor in each row.
-    :param deterministic: Act without noise.
     """
     matplotlib = import_matplotlib()
-    figure = new_figure(WIDTH, 0.6 + 2.4 * len(noise_variances))
-    panels = _panels(figure, len(noise_variances), len(models))
-    norm = matplotlib.colors.Normalize(WALL, LAVA)
-    colors = matplotlib.cm.ScalarMappable(norm, "viridis")
-    for row, variance in zip(panels, noise_variances, strict=True):
+    figure = new_figure(WIDTH, 0.6 + 2.4 * len(NOISE_VARIANCES))
+    panels = _panels(figure, len(NOISE_VARIANCES), len(models))
+    colors = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(WALL, LAVA), "viridis")
+    for row, variance in zip(panels, NOISE_VARIANCES, strict=True):
         for axes, (label, model) in zip(row, models.items(), strict=True):
             scenario = Scenario(label, "Lava-v0", {**(env_kwargs or {}), "sensor_noise_std": variance**0.5})
-            states, costs = rollout_states(model, scenario, n_episodes, seed=seed, deterministic=deterministic)
+            states, costs = rollout_states(model, scenario, n_episodes)
             d = states[:, :, 0]  # (T + 1, N)
             _draw_corridor(axes, horizon=len(d) - 1)
             for path in d.T:
@@ -105,30 +97,22 @@ def lava_trajectories(
     for axes in panels[-1]:
         axes.set_xlabel("time step $t$", fontsize=9)
     figure.supylabel("distance from the wall $d_t$ (m)", fontsize=9)
-    bar = figure.colorbar(colors, ax=panels, pad=0.01, aspect=40)
-    bar.set_label("start $d_0$ (m)", fontsize=9)
+    figure.colorbar(colors, ax=panels, pad=0.01, aspect=40).set_label("start $d_0$ (m)", fontsize=9)
     return figure
 
 
-def robustness_curves(
-    records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str], reference: str = "Training"
-) -> Figure:
+def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str]) -> Figure:
     """
     Draw each method's mean cost over the rows of a table: a line for the median seed, a dot for each seed.
 
     :param records: With a column ``train_seed``.
-    :param noise_rows: Ordered scenarios, which follow the reference in the left panel.
+    :param noise_rows: Ordered scenarios, which follow the training row in the left panel.
     :param other_rows: Unordered scenarios for the right panel.
-    :param reference: The scenario of the training.
     """
     figure = new_figure(WIDTH, 3.6)
     panels = figure.subplots(1, 2, sharey=True, width_ratios=(len(noise_rows) + 1, len(other_rows)))
-    means = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean()
-    models = list(records["model"].unique())
-    for axes, rows in zip(panels, ([reference, *noise_rows], list(other_rows)), strict=True):
-        for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
-            seeds = means[model].unstack("scenario")[rows]  # (seeds, rows)
-            at = np.arange(len(rows)) + 0.1 * (i - (len(models) - 1) / 2)
+    for axes, rows in zip(panels, (["Training", *noise_rows], list(other_rows)), strict=True):
+        for color, model, at, seeds in _seed_means(records, "cost", rows, spacing=0.1):
             axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4, alpha=0.7)
             style = "-" if axes is panels[0] else ""
             axes.plot(at, seeds.median().to_numpy(), style + "_", color=color, linewidth=1.2, markersize=9, label=model)
@@ -150,12 +134,8 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
     """
     figure = new_figure(WIDTH, 3.2)
     axes = figure.add_subplot()
-    distances = records.groupby(["model", "train_seed", "scenario"], sort=False)["distance"].mean()
-    models, rows = list(records["model"].unique()), list(records["scenario"].unique())
-    width = 0.8 / len(models)
-    for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
-        seeds = distances[model].unstack("scenario")[rows]
-        at = np.arange(len(rows)) + width * (i - (len(models) - 1) / 2)
+    rows, width = list(records["scenario"].unique()), 0.8 / records["model"].nunique()
+    for color, model, at, seeds in _seed_means(records, "distance", rows, spacing=width):
         axes.bar(at, seeds.median(), width=0.9 * width, color=color, alpha=0.45, label=model)
         axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4)
     axes.set_xticks(range(len(rows)), rows)
@@ -166,25 +146,28 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
     return figure
 
 
-def failures_by_yaw(records: pd.DataFrame, *, n_bins: int = 24) -> Figure:
+def _seed_means(
+    records: pd.DataFrame, column: str, rows: list[str], spacing: float
+) -> Iterator[tuple[str, str, np.ndarray, pd.DataFrame]]:
+    """Yield the colour and the label of each method, its places on the axis, and its means ``(seeds, rows)``."""
+    means = records.groupby(["model", "train_seed", "scenario"], sort=False)[column].mean()
+    models = records["model"].unique()
+    for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
+        at = np.arange(len(rows)) + spacing * (i - (len(models) - 1) / 2)
+        yield color, model, at, means[model].unstack("scenario")[rows]
+
+
+def failures_by_yaw(records: pd.DataFrame) -> Figure:
     """
     Draw the share of failed grasps over the mug's yaw in polar coordinates, which shows the effect of the handle.
 
     :param records: Episodes with the columns ``model``, ``yaw`` (rad) and ``cost`` (1 for a failure).
-    :param n_bins: Number of sectors.
     """
     figure = new_figure(5.2, 5.2)
     axes = figure.add_subplot(projection="polar")
-    edges = np.linspace(0, 2 * np.pi, n_bins + 1)
-    middles = (edges[:-1] + edges[1:]) / 2
-    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
-        sector = np.digitize(group["yaw"].to_numpy() % (2 * np.pi), edges) - 1
-        share = group["cost"].groupby(sector).mean().reindex(range(n_bins)).to_numpy()
-        axes.plot(np.append(middles, middles[0]), np.append(share, share[0]), color=color, label=str(label), marker=".")
+    _draw_failures(figure, axes, records, records["yaw"] % (2 * np.pi), np.linspace(0, 2 * np.pi, 25))
     axes.set_title("share of failed grasps by the mug's yaw", fontsize=10, color=INK)
-    axes.set_ylim(bottom=0)
     axes.tick_params(labelsize=8)
-    axes.legend(loc="upper right", bbox_to_anchor=(1.1, 1.1), fontsize=8, frameon=False)
     return figure
 
 
@@ -200,14 +183,22 @@ def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
     tidy(axes)
     centimetres = 100 * records["camera"]
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
-    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
-        share = group["cost"].groupby(np.digitize(centimetres[group.index], edges) - 1).mean().reindex(range(n_bins))
-        axes.plot((edges[:-1] + edges[1:]) / 2, share, color=color, label=str(label), marker=".")
+    _draw_failures(figure, axes, records, centimetres, edges)
     axes.set_xlabel("height of the camera above its usual place, in cm", fontsize=9)
     axes.set_ylabel("share of failed grasps", fontsize=9)
-    axes.set_ylim(bottom=0)
-    axes.legend(fontsize=8, frameon=False)
     return figure
+
+
+def _draw_failures(figure: Figure, axes: Axes, records: pd.DataFrame, at: pd.Series, edges: np.ndarray) -> None:
+    """Draw the share of failures in each bin; curves in polar coordinates are closed."""
+    middles = (edges[:-1] + edges[1:]) / 2
+    order = np.arange(len(middles) + (axes.name == "polar")) % len(middles)
+    for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
+        bins = np.digitize(at[group.index], edges) - 1
+        share = group["cost"].groupby(bins).mean().reindex(range(len(middles))).to_numpy()
+        axes.plot(middles[order], share[order], color=color, label=str(label), marker=".")
+    axes.set_ylim(bottom=0)
+    legend_above(figure, axes)
 
 
 def _panels(figure: Figure, n_rows: int, n_columns: int) -> np.ndarray:
@@ -241,9 +232,6 @@ def _title(scenario: Scenario) -> str:
 
 def _noise(variance: float) -> str:
     """sigma^2 = 10^-3 in Matplotlib's mathematics."""
-    if variance == 0:
-        return r"$\sigma^2 = 0$"
-    exponent = np.log10(variance)
-    if np.isclose(exponent, round(exponent)) and round(exponent) != 0:
-        return rf"$\sigma^2 = 10^{{{round(exponent)}}}$"
-    return rf"$\sigma^2 = {variance:.3g}$"
+    exponent = round(np.log10(variance or 1.0))
+    is_power = exponent != 0 and np.isclose(variance / 10.0**exponent, 1.0)
+    return rf"$\sigma^2 = 10^{{{exponent}}}$" if is_power else rf"$\sigma^2 = {variance:.3g}$"

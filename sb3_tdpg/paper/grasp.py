@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -14,14 +15,7 @@ from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
-from sb3_tdpg.paper.grasp_analysis import (
-    ESTIMATES,
-    KNOWLEDGE,
-    PENALTY,
-    estimates_table,
-    knowledge_table,
-    penalty_table,
-)
+from sb3_tdpg.paper.knowledge import ESTIMATES, KNOWLEDGE, PENALTY, estimates_table, knowledge_table, penalty_table
 from sb3_tdpg.tdpg import TDPG
 
 # Seeds below 100 were used to make the blocks.
@@ -66,34 +60,27 @@ def reproduce_grasp(
     *,
     camera: str = "fixed",
     n_seeds: int = 5,
-    n_eval_episodes: int = 1000,
-    n_timesteps: int | None = None,
-    jobs: int | None = None,
-    publish: Path | None = None,
+    **options: Any,
 ) -> str:
     """
     Train every method with several seeds, evaluate it on every row; write tables, figures and records.
 
-    Finished runs are kept: the same call continues an interrupted one.
-
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
     :param camera: ``"fixed"``, Table III; or ``"varying"`` in height, a scenario of our own.
     :param n_seeds: Training seeds of each method.
-    :param n_eval_episodes: Episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as in the blocks.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     :raises ValueError: if ``camera`` is unknown; nothing has been run by then.
     """
     if camera not in METHODS:
         raise ValueError(f"camera={camera!r} must be one of {list(METHODS)}")
+    given = common.Options(**options)
     is_fixed, methods = camera == "fixed", METHODS[camera]
     rows = PANDA_GRASP if is_fixed else PANDA_GRASP_CAMERA
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     everything = [(method, seed) for method in methods for seed in seeds]
-    tasks = common.make_tasks("PandaGrasp-v0", out / "runs", everything, lambda _: rows, n_timesteps)
-    complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    tasks = common.make_tasks("PandaGrasp-v0", out / "runs", everything, lambda _: rows, given.overrides)
+    complete_runs(tasks, **given.of_runs)
     folders = common.folders_of(tasks)
 
     # The poses of the mug and of the grasp.
@@ -141,4 +128,5 @@ def reproduce_grasp(
             first = {label: models[label, FIRST_SEED] for label in ("PG", "TDPG")}
             estimates = markdown_table(estimates_table(first), digits=2)
             sections += ["## How much information is it?", ESTIMATES, estimates]
-    return common.write_results(out, sections, tasks, f"make reproduce-grasp{'' if is_fixed else '-camera'}", publish)
+    command = f"make reproduce-grasp{'' if is_fixed else '-camera'}"
+    return common.write_results(out, sections, tasks, command, given.publish)

@@ -24,7 +24,7 @@ from sb3_tdpg.evaluation import (
     training_curves,
 )
 from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
-from sb3_tdpg.paper.common import RECORD_COLUMNS, folders_of, met, read_records, write_results
+from sb3_tdpg.paper.common import RECORD_COLUMNS, Options, folders_of, met, read_records, write_results
 from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
@@ -35,9 +35,10 @@ READINGS = ("table", "text")
 METHODS = {"PG": "Lava-v0-pg", "TDPG": "Lava-v0", "TDPG (log-det)": "Lava-v0-logdet"}
 
 # Goals by cost definition: the largest mean, standard deviation and ratio (sigma^2 = 1 over training).
-GOALS: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = {
-    "table": {"PG": (14.0, None, None), "TDPG": (28.0, 10.0, 1.05), "TDPG (log-det)": (28.0, 10.0, 1.05)},
-    "text": {"PG": (12.0, None, None), "TDPG": (20.0, 10.0, 1.10), "TDPG (log-det)": (20.0, 10.0, 1.10)},
+_TABLE_GOALS, _TEXT_GOALS = dict(mean=28.0, std=10.0, ratio=1.05), dict(mean=20.0, std=10.0, ratio=1.10)
+GOALS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
+    "table": {"PG": dict(mean=14.0), "TDPG": _TABLE_GOALS, "TDPG (log-det)": _TABLE_GOALS},
+    "text": {"PG": dict(mean=12.0), "TDPG": _TEXT_GOALS, "TDPG (log-det)": _TEXT_GOALS},
 }
 
 # Seeds below 300 were used to tune the blocks.
@@ -61,14 +62,7 @@ SEEDS = (
 
 
 def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
-    """
-    Return a run of the lava problem.
-
-    :param method: A key of :data:`METHODS`.
-    :param reading: The cost definition, ``"table"`` or ``"text"``.
-    :param seed: Training seed.
-    :param overrides: Settings that replace those of the block.
-    """
+    """Return a run of a method of :data:`METHODS`; ``overrides`` replace settings of its block."""
     block = METHODS[method] + ("-table" if reading == "table" else "")
     return Run(method, "Lava-v0", block, seed, overrides, max_attempts=1 if method == "PG" else MAX_ATTEMPTS)
 
@@ -97,7 +91,7 @@ def demo(
     :param n_timesteps: Environment steps of each training; default: as in the block.
     :return: the table
     """
-    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    overrides = Options(n_timesteps=n_timesteps).overrides
     runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
     tasks: list[Task] = [(run, out / "runs" / run.folder_name, LAVA) for run in runs]
     folders = {run.method: folder for run, folder, _ in tasks}
@@ -119,11 +113,7 @@ def demo(
 
 
 def paper_runs(n_seeds: int) -> list[Run]:
-    """
-    List the runs with the paper's own settings and the table's cost definition: PG, and TDPG with each beta.
-
-    See the block ``Lava-v0-paper`` for the settings.
-    """
+    """List the runs with the paper's own settings (block ``Lava-v0-paper``): PG, and TDPG with each beta."""
     runs = []
     for seed in range(FIRST_SEED, FIRST_SEED + n_seeds):
         base = Run("paper's PG", "Lava-v0", "Lava-v0-paper-pg", seed)
@@ -139,31 +129,22 @@ def reproduce_lava(
     *,
     n_seeds: int = 10,
     n_paper_seeds: int = 3,
-    n_eval_episodes: int = 1000,
-    n_timesteps: int | None = None,
-    jobs: int | None = None,
-    publish: Path | None = None,
+    **options: Any,
 ) -> str:
     """
     Train every method with both cost definitions and many seeds, and the paper's own settings; write tables, figures
     and records.
 
-    Finished runs are kept: the same call continues an interrupted one.
-
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes_*.csv.gz``, figures, ``config.json`` and ``runs/``.
     :param n_seeds: Training seeds of each method.
     :param n_paper_seeds: Training seeds of the paper's own settings.
-    :param n_eval_episodes: Episodes of each row of Table I.
-    :param n_timesteps: Environment steps of each training; default: as in the blocks.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
-    overrides = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
-    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
+    given = Options(**options)
+    overrides, seeds = given.overrides, range(FIRST_SEED, FIRST_SEED + n_seeds)
     runs = {
-        reading: [lava_run(m, reading, seed, **overrides) for m in reversed(METHODS) for seed in seeds]
-        for reading in READINGS
+        reading: [lava_run(m, reading, seed, **overrides) for m in METHODS for seed in seeds] for reading in READINGS
     }
     runs["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
     tasks: dict[str, list[Task]] = {
@@ -172,13 +153,12 @@ def reproduce_lava(
     }
     everything = [task for of_group in tasks.values() for task in of_group]
     # The longest runs first, so that the cores finish together.
-    longest_first = sorted(everything, key=lambda task: task[0].method != "TDPG")
-    complete_runs(longest_first, n_eval_episodes=n_eval_episodes, jobs=jobs)
+    longest_first = sorted(everything, key=lambda task: (task[0].method != "TDPG", task[0].method == "PG"))
+    complete_runs(longest_first, **given.of_runs)
 
     sections, seed_tables = ["# The lava problem (Table I)"], []
     for group, of_group in tasks.items():
         records = read_records(of_group)
-        records = records.sort_values(["model", "train_seed"], key=_method_order, kind="stable", ignore_index=True)
         write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
@@ -191,7 +171,7 @@ def reproduce_lava(
             one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]
             _write_figures(out, f"_{group}", one_seed, folders, models, group)
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True), out / "seeds.csv")
-    return write_results(out, sections, everything, "make reproduce-lava", publish)
+    return write_results(out, sections, everything, "make reproduce-lava", given.publish)
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
@@ -203,7 +183,7 @@ def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
     return training.join(noisiest).join(records.groupby(keys)[["attempts", "selected"]].first()).reset_index()
 
 
-def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, tuple[float, float | None, float | None]]) -> str:
+def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
     """Summarise the seeds of each method, and compare them with its goals."""
     rows = []
     for method, of_method in seeds.groupby("model", sort=False):
@@ -211,20 +191,14 @@ def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, tuple[float, float | N
             f"{name}: mean (worst seed)": f"{of_method[c].mean():.3g} ({of_method[c].max():.3g})"
             for c, name in COLUMNS.items()
         }
-        verdict = _verdict(of_method, *goals[str(method)]) if method in goals else "none set"
+        verdict = _verdict(of_method, goals[str(method)]) if method in goals else "none set"
         rows.append(dict(method=method, seeds=len(of_method), **spread, goals=verdict))
     return markdown_table(rows)
 
 
-def _verdict(seeds: pd.DataFrame, mean: float, std: float | None, ratio: float | None) -> str:
-    checks = [f"mean <= {mean:g}: {met(seeds['mean'].mean() <= mean)}"]
-    if std is not None:
-        checks.append(f"standard deviation <= {std:g}: {met(seeds['std'].mean() <= std)}")
-    if ratio is not None:
-        checks.append(f"ratio <= {ratio:g}: {(seeds['ratio'] <= ratio).sum()} of {len(seeds)} seeds")
-    return "; ".join(checks)
-
-
-def _method_order(column: pd.Series) -> pd.Series:
-    order = {method: i for i, method in enumerate(METHODS)}
-    return column.map(lambda x: order.get(x, len(order))) if column.name == "model" else column
+def _verdict(seeds: pd.DataFrame, goals: Mapping[str, float]) -> str:
+    names = dict(mean="mean", std="standard deviation", ratio="ratio")
+    verdicts = {column: met(seeds[column].mean() <= goal) for column, goal in goals.items()}
+    if "ratio" in goals:
+        verdicts["ratio"] = f"{(seeds['ratio'] <= goals['ratio']).sum()} of {len(seeds)} seeds"
+    return "; ".join(f"{names[column]} <= {goal:g}: {verdicts[column]}" for column, goal in goals.items())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,6 @@ from sb3_tdpg.robustness.sensor import kind_of
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
-N_EPISODES = {"image": 100, "vector": 500}
 N_INFORMATION = 500  # episodes
 DPI = 110
 
@@ -96,13 +96,12 @@ def robustness_report(
     )
     loaded = load_all(sources, env_id, kwargs)
     _check_fit(loaded, rows)
-    n_episodes = n_episodes or N_EPISODES["image" if kind_of(space) == "image" else "vector"]
+    n_episodes = n_episodes or (100 if kind_of(space) == "image" else 500)
     plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
     _check_different(fingerprints, names)
-    config = {**vars(plan), "models": fingerprints}
-    del config["sources"]
+    config = {name: value for name, value in vars(plan).items() if name != "sources"} | {"models": fingerprints}
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
@@ -113,9 +112,9 @@ def robustness_report(
     knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
     how = provenance()
     page = Page(plan, rows, names, figures, knowledge, how_made(how["command"], how))
-    frames = dict(levels=numbers.levels, perturbations=numbers.groups, comparisons=numbers.comparisons)
-    for name, frame in frames.items():
-        write_frame_atomically(frame, out / f"{name}.csv")
+    write_frame_atomically(numbers.levels, out / "levels.csv")
+    write_frame_atomically(numbers.groups, out / "perturbations.csv")
+    write_frame_atomically(numbers.comparisons, out / "comparisons.csv")
     write_frame_atomically(records, out / "episodes.csv.xz")
     text = write_page(numbers, page)
     write_atomically(out / "report.md", text)
@@ -126,10 +125,8 @@ def robustness_report(
 def _import_extra() -> None:
     """Check the optional dependencies before the work begins."""
     try:
-        import jinja2  # noqa: F401
-        import markdown_it  # noqa: F401
-        import matplotlib  # noqa: F401
-        import rliable  # noqa: F401
+        for name in ("jinja2", "markdown_it", "matplotlib", "rliable"):
+            import_module(name)
     except ImportError as e:
         raise ImportError(f"a report needs {e.name}: pip install sb3_tdpg[plots]") from e
 
@@ -196,7 +193,7 @@ def _draw(
         figures["degradation"] = degradation_curves(numbers)
     if (numbers.groups["kind"] == "own").any():
         figures["own_rows"] = own_rows_figure(numbers)
-    if not numbers.comparisons.empty and numbers.comparisons["p_cost"].notna().any():
+    if numbers.has_probabilities:
         figures["comparison"] = comparison_figure(numbers)
     of_sensor = [row for row in rows if row.kind == "sensor"]
     if kind_of(space) == "image" and numbers.perturbations:
@@ -221,11 +218,9 @@ def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: 
     with threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
         for number, (label, model) in enumerate(firsts.items()):
             progress.set_postfix_str(f"information, {label}")
-            if not isinstance(model, TDPG):
-                reason = f"{type(model).__name__} has no task-relevant variables"
-                known.append(Knowledge(label, f"not measured: {reason}."))
-                continue
             try:
+                if not isinstance(model, TDPG):
+                    raise ValueError(f"{type(model).__name__} has no task-relevant variables")
                 with closing(scenario_env(row.scenario, model, n_episodes=N_INFORMATION)) as env:
                     report = information_report(model, env, N_INFORMATION, plan.seed, at_end=progress.update)
                 known.append(_knowledge(label, report, out, f"information-{number}"))

@@ -154,8 +154,7 @@ def fingerprint(model: Any) -> str:
     for name, values in sorted(model.policy.state_dict().items()):
         digest.update(name.encode())
         digest.update(values.detach().cpu().numpy().tobytes())
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None and normalize.norm_obs:
+    if (normalize := model.get_vec_normalize_env()) is not None and normalize.norm_obs:
         digest.update(normalize.obs_rms.mean.tobytes() + normalize.obs_rms.var.tobytes())
     return digest.hexdigest()[:12]
 

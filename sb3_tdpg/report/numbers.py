@@ -46,10 +46,14 @@ class Numbers:
         return list(self.levels["model"].unique())
 
     @property
+    def has_probabilities(self) -> bool:
+        """Whether there are probabilities, which need several models of two methods."""
+        return not self.comparisons.empty and bool(self.comparisons["p_cost"].notna().any())
+
+    @property
     def perturbations(self) -> list[str]:
         """The perturbations with severities."""
-        rows = self.groups[self.groups["kind"].isin(("sensor", "scene"))]
-        return list(rows["perturbation"].unique())
+        return list(self.groups.loc[self.groups["kind"].isin(("sensor", "scene")), "perturbation"].unique())
 
 
 def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
@@ -119,20 +123,18 @@ def _interval_columns(
 ) -> dict[str, np.ndarray]:
     """Aggregate ``(S, G, E)`` over models: a column with the number, and two with the ends of its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
-    if len(cube) > 1:
-        columns: tuple[np.ndarray, ...] = interquartile_means(cube.mean(axis=2), **how)
-    else:
-        columns = _mean_of_one_model(cube[0], how["level"], is_share)
+    one = len(cube) == 1
+    columns = _mean_of_one(cube[0], how["level"], is_share) if one else interquartile_means(cube.mean(axis=2), **how)
     return dict(zip(names, columns, strict=True))
 
 
-def _mean_of_one_model(costs: np.ndarray, level: float, is_share: bool) -> tuple[np.ndarray, ...]:
+def _mean_of_one(costs: np.ndarray, level: float, is_share: bool) -> tuple[np.ndarray, ...]:
     """Return the mean over episodes of ``(G, E)``, and the ends of its interval."""
     from scipy.stats import norm
 
     mean, variance, n = costs.mean(axis=1), costs.var(axis=1), costs.shape[1]
     if n == 1:
-        return mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)
+        return mean, mean * np.nan, mean * np.nan
     z = norm.ppf(0.5 + level / 2)
     if not is_share:
         half = z * np.sqrt(variance / (n - 1))

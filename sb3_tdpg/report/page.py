@@ -118,15 +118,11 @@ class Costs:
         cells = self.numbers.levels.set_index(["model", "perturbation", "severity"])
         severities = sorted(set(self.numbers.levels["severity"]) - {0})
         rows = [
-            {
-                "perturbation": escaped(name),
-                "method": escaped(model),
-                **{f"severity {level}": self.cell(cells.loc[(model, name, level)]) for level in severities},
-            }
+            [escaped(name), escaped(model), *(self.cell(cells.loc[(model, name, level)]) for level in severities)]
             for name in self.numbers.perturbations
             for model in self.numbers.models
         ]
-        return markdown_table(rows)
+        return markdown_table(rows, ["perturbation", "method", *(f"severity {level}" for level in severities)])
 
 
 def _verdict(numbers: Numbers, label: str) -> dict[str, Any]:
@@ -160,19 +156,15 @@ def _probability(row: Mapping[str, Any] | pd.Series, name: str) -> str:
 
 def _comparisons_table(numbers: Numbers) -> str:
     """Make a table of the probabilities that a method is better than the first one; empty if there are none."""
-    if numbers.comparisons.empty or numbers.comparisons["p_cost"].isna().all():
+    if not numbers.has_probabilities:
         return ""
-    rows = [
-        {
-            "perturbation": escaped(row["perturbation"]),
-            "method": escaped(row["model"]),
-            "probability of a lower cost": _probability(row, "p_cost"),
-            "probability of a lower added cost": _probability(row, "p_added"),
-            "clearly lower cost": escaped({"less": row["model"], "more": row["reference"]}.get(row["cost"], "")),
-        }
-        for row in numbers.comparisons.to_dict("records")
-    ]
-    return markdown_table(rows)
+    columns = ["perturbation", "method", "probability of a lower cost", "probability of a lower added cost"]
+    rows = []
+    for row in numbers.comparisons.to_dict("records"):
+        lower = {"less": row["model"], "more": row["reference"]}.get(row["cost"], "")
+        names = [escaped(name) for name in (row["perturbation"], row["model"], lower)]
+        rows.append([*names[:2], _probability(row, "p_cost"), _probability(row, "p_added"), names[2]])
+    return markdown_table(rows, [*columns, "clearly lower cost"])
 
 
 def _severities_table(page: Page) -> str:
@@ -196,9 +188,6 @@ def _severities_table(page: Page) -> str:
 
 def _models_table(page: Page) -> str:
     """Make a table of the models, with their numbers in the records."""
-    rows = [
-        (escaped(label), str(number), f"`{name}`")
-        for label, names in page.sources.items()
-        for number, name in enumerate(names)
-    ]
+    sources = page.sources.items()
+    rows = [(escaped(label), str(i), f"`{name}`") for label, names in sources for i, name in enumerate(names)]
     return markdown_table(rows, ["method", "`train_seed` in the records", "model"])

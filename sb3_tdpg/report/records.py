@@ -54,11 +54,10 @@ class Plan:
 
 def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
     """
-    Run every model in one row, and return a frame with a row for each episode.
+    Run every model in one row, with the same initial states and perturbations as far as the environment allows.
 
-    All models start from the same initial states and meet the same perturbations, as far as the environment and the
-    lengths of the episodes allow. The columns are ``model`` (the method), ``train_seed`` (the number of the model,
-    from 0), ``perturbation``, ``severity`` and ``kind``, followed by :data:`COLUMNS`.
+    The columns are ``model`` (the method), ``train_seed`` (the number of the model, from 0), ``perturbation``,
+    ``severity`` and ``kind``, followed by :data:`COLUMNS`.
     """
 
     def sensor(env: VecEnv) -> VecEnv:
@@ -66,13 +65,13 @@ def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
 
     how: dict[str, Any] = dict(seed=plan.seed, deterministic=plan.deterministic)
     how["sensor"] = sensor if row.kind == "sensor" else None
+    labels = dict(perturbation=row.perturbation, severity=row.severity, kind=row.kind)
     frames = []
     for label, of_method in models.items():
         for number, model in enumerate(of_method):
             frame = run_episodes(model, row.scenario, plan.n_episodes, **how)
-            frames.append(frame.assign(model=label, train_seed=number))
+            frames.append(frame.assign(model=label, train_seed=number, **labels))
     records = pd.concat(frames, ignore_index=True)
-    records = records.assign(perturbation=row.perturbation, severity=row.severity, kind=row.kind)
     keys = ("model", "train_seed", "perturbation", "severity", "kind")
     return records[[name for name in (*keys, *COLUMNS) if name in records]]
 

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 from gymnasium import spaces
@@ -19,7 +18,7 @@ from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS
 UNPERTURBED = "unperturbed"
 ALL = "all perturbations"
 
-FAST: Mapping[str, Mapping[str, Any]] = MappingProxyType({"BallCatch-v0": dict(renderer="fast")})
+FAST: Mapping[str, Mapping[str, Any]] = {"BallCatch-v0": dict(renderer="fast")}
 """Keywords that save time and hardly change the results, by environment; the user's keywords take precedence."""
 
 
@@ -88,9 +87,8 @@ def make_rows(
         if name not in PERTURBATIONS and name not in scenes:
             raise ValueError(f"perturbation={name!r} is unknown; this environment has {known}")
         if name not in known:
-            raise ValueError(
-                f"the perturbation {name!r} does not apply: {PERTURBATIONS[name].objection(space, horizon)}"
-            )
+            objection = PERTURBATIONS[name].objection(space, horizon)
+            raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
         for severity in severities:
             if name in scenes:
                 scenario = Scenario(name, env_id, {**env_kwargs, **scenes[name][severity - 1]})

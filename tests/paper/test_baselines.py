@@ -18,9 +18,16 @@ from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.experiments.training import make_training, read_schedule, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.paper import ball, baseline_runs, baselines, grasp
-from sb3_tdpg.paper.baseline_runs import SB3Run, TimedRun, training_time
-from sb3_tdpg.paper.baselines import BALL_BASELINES, GRASP_BASELINES, LAVA_BASELINES, Baseline
+from sb3_tdpg.paper import ball, baselines, grasp
+from sb3_tdpg.paper.baselines import (
+    BALL_BASELINES,
+    GRASP_BASELINES,
+    LAVA_BASELINES,
+    Baseline,
+    SB3Run,
+    TimedRun,
+    training_time,
+)
 
 COMPARISONS = (LAVA_BASELINES, BALL_BASELINES, GRASP_BASELINES)
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -75,7 +82,7 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
     assert "| PPO | 1 | " in plain
     assert "[" not in plain.split("## Grasping")[1].split("| PPO | 1 | ")[1].split("\n")[0]
     n_runs = [
-        sum(min(n, baseline.max_seeds or n) for baseline in each.baselines)
+        sum(min(n, baseline.max_seeds) for baseline in each.baselines)
         for each, n in zip(COMPARISONS, (2, 1, 1), strict=True)
     ]
     records = pd.read_csv(out / "episodes.csv.xz")
@@ -141,8 +148,8 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
             return self.now
 
     wall, cpu = Clock(), Clock()
-    monkeypatch.setattr(baseline_runs.time, "perf_counter", wall)
-    monkeypatch.setattr(baseline_runs.time, "process_time", cpu)
+    monkeypatch.setattr(baselines.time, "perf_counter", wall)
+    monkeypatch.setattr(baselines.time, "process_time", cpu)
 
     def train(run, attempt, folder, progress_bar):
         folder.mkdir(parents=True, exist_ok=True)
@@ -179,12 +186,12 @@ def path_of_time(folder):
 
 
 def test_weight_decay_reaches_the_optimiser_and_changes_nothing_else():
-    override = baselines.with_weight_decay("Lava-v0-pg", 0.01)
+    model = baselines.with_weight_decay("Lava-v0-pg", 100).run("Lava-v0", 0)
     kwargs = load_hyperparams("Lava-v0-pg")["policy_kwargs"]
-    assert override == dict(policy_kwargs={**kwargs, "optimizer_kwargs": {"weight_decay": 0.01}})
-    model = TimedRun("PG", "Lava-v0", "Lava-v0-pg", 0, override)
+    changes = dict(n_timesteps=100, policy_kwargs={**kwargs, "optimizer_kwargs": {"weight_decay": 0.001}})
+    assert model.overrides == changes
     optimizer = make_training("Lava-v0", model.settings).model.policy.optimizer
-    assert [group["weight_decay"] for group in optimizer.param_groups] == [0.01] * len(optimizer.param_groups)
+    assert [group["weight_decay"] for group in optimizer.param_groups] == [0.001] * len(optimizer.param_groups)
 
 
 def test_each_augmentation_changes_images_and_only_as_it_says():

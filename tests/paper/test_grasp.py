@@ -17,7 +17,7 @@ from sb3_tdpg.envs.scenarios import PANDA_CAMERA, PANDA_GRASP
 from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import InformationBatch, Mine
-from sb3_tdpg.paper import common, grasp, grasp_analysis, knowledge
+from sb3_tdpg.paper import common, grasp, knowledge
 from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
 from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
 
@@ -33,10 +33,10 @@ def tiny(monkeypatch):
         (common, "paired_difference"),
     ):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
-    monkeypatch.setattr(grasp_analysis, "N_MUGS", 100)
-    monkeypatch.setattr(grasp_analysis, "FITTED_MUGS", 60)
-    short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in grasp_analysis.CRITICS.items()}
-    monkeypatch.setattr(grasp_analysis, "CRITICS", short)
+    monkeypatch.setattr(knowledge, "N_MUGS", 100)
+    monkeypatch.setattr(knowledge, "FITTED_MUGS", 60)
+    short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in knowledge.CRITICS.items()}
+    monkeypatch.setattr(knowledge, "CRITICS", short)
     monkeypatch.setattr(grasp, "complete_runs", complete_runs_here)
 
 
@@ -74,9 +74,9 @@ def test_a_varying_camera_from_nothing_to_tables_figures_and_records(tmp_path, t
     heights = records.groupby("scenario")["camera"]
     assert heights.max()["Training"] <= 0.03 and heights.min()["Training"] >= -0.03
     assert heights.nunique()["Usual height"] == 1
-    knowledge = pd.read_csv(tmp_path / "knowledge.csv")
-    assert set(knowledge["mugs"]) == {"training", "twice the range"}
-    assert knowledge["camera"].between(0, 1).all()
+    known = pd.read_csv(tmp_path / "knowledge.csv")
+    assert set(known["mugs"]) == {"training", "twice the range"}
+    assert known["camera"].between(0, 1).all()
 
 
 def test_a_camera_that_is_none_is_refused_before_anything_is_run(tmp_path):
@@ -144,7 +144,7 @@ def test_the_bounds_enclose_an_information_that_is_known():
     rng = th.Generator().manual_seed(0)
     batch = gaussian_batch(2000, [[2.0, 1.0]], generator=rng)
     (truth,) = gaussian_information([[2.0, 1.0]])
-    found = grasp_analysis.bounds(batch)
+    found = knowledge.bounds(batch)
     # The standard deviation of a sample's bound is about 0.02.
     assert truth - 0.1 < found["lower bound"] <= found["upper bound"] < truth + 0.1
 
@@ -163,9 +163,9 @@ def test_the_critics_are_fitted_to_one_policy_after_the_other_and_read_on_fresh_
         for seed, label in enumerate(("PG", "TDPG"))
     }
     before = th.get_rng_state()
-    table = grasp_analysis.estimates_table(models).set_index("estimate")
+    table = knowledge.estimates_table(models).set_index("estimate")
     assert th.equal(th.get_rng_state(), before)
-    n_critics = len(grasp_analysis.CRITICS)
+    n_critics = len(knowledge.CRITICS)
     assert [fit[1:] for fit in fits] == [(False, 60)] * n_critics + [(True, 60)] * n_critics
     assert [fit[0] for fit in fits[:n_critics]] == [fit[0] for fit in fits[n_critics:]]
     assert (table.loc["lower bound"] <= table.loc["upper bound"] + 0.1).all()
@@ -178,7 +178,7 @@ def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
         "mi/total": [5.0, 5.0, 5.0, 4.5, 4.0, 3.5],
         "rollout/ep_cost_mean": [0.9, 0.05, 0.01, 0.01, 0.02, 0.01],
     })  # fmt: skip
-    with_penalty, without = grasp_analysis.penalty_table({1: log, 2: log.assign(**{"train/mi_coef": 0.0})})
+    with_penalty, without = knowledge.penalty_table({1: log, 2: log.assign(**{"train/mi_coef": 0.0})})
     assert with_penalty == {
         "seed": 1,
         "first epoch with the penalty": "2",
@@ -188,7 +188,7 @@ def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
         "failed grasps": "0.020",
     }
     assert (without["first epoch with the penalty"], without["last weight"]) == ("none", "0")
-    (of_one_epoch,) = grasp_analysis.penalty_table({1: log.drop(columns="train/mi_coef")[:1]})
+    (of_one_epoch,) = knowledge.penalty_table({1: log.drop(columns="train/mi_coef")[:1]})
     assert of_one_epoch["first epoch with the penalty"] == "none"
     assert of_one_epoch["information in the last epoch"] == "5.00"
 
