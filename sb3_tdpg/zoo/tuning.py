@@ -26,7 +26,7 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.experiments.studies import open_storage, open_study, quiet_optuna, work
+from sb3_tdpg.experiments.studies import open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
@@ -139,7 +139,6 @@ class TuningManager(TDPGExperimentManager):
         record = Path(self.save_path, RECORD)
         if Path(self.storage) != record.with_name("study.log"):  # that one names the study in its message
             check_same_config(record, dict(study=self.study_name, **description), "study")
-        quiet_optuna()
         study = open_study(
             open_storage(self.storage),
             self.study_name,
