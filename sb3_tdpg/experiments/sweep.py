@@ -94,8 +94,7 @@ class _Plan:
 
     def run(self, inverse_beta: float, seed: int) -> Run:
         """Return the run of one beta and one seed."""
-        beta = math.inf if inverse_beta == 0 else 1 / inverse_beta
-        overrides = {**self.settings, "beta": beta}
+        overrides = {**self.settings, "beta": 1 / inverse_beta if inverse_beta else math.inf}
         if "cost_limit" in load_hyperparams(self.block):
             overrides["cost_limit"] = None  # it belongs to beta="auto"
         return Run(f"beta {beta_label(inverse_beta)}", self.env_id, self.block, seed, overrides)
@@ -142,8 +141,8 @@ class _Plan:
         """Everything that makes one run comparable with another."""
         settings = {name: value for name, value in self.run(1.0, 0).settings.items() if name != "beta"}
         rows = {row.name: dict(env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in self.scenarios}
-        config = dict(env_id=self.env_id, block=self.block, settings=settings)
-        return {**config, "scenarios": rows, "n_eval_episodes": self.n_eval_episodes}
+        shared = {name: getattr(self, name) for name in ("env_id", "block", "n_eval_episodes")}
+        return {**shared, "settings": settings, "scenarios": rows}
 
 
 def sweep(
@@ -242,10 +241,9 @@ def _cost_limit(env_id: str, given: float | None) -> float:
         raise ValueError(f"env={env_id!r} is not registered: {e}") from e
     if given is None and threshold is None:
         raise ValueError(f"{env_id} is registered without a reward_threshold: give a cost limit, --cost-limit 40, say")
-    limit = -float(threshold or 0.0) if given is None else given
-    if math.isnan(limit):
+    if given is not None and math.isnan(given):
         raise ValueError("cost_limit is NaN")
-    return limit
+    return -float(threshold or 0.0) if given is None else given
 
 
 def _build_once(plan: _Plan) -> None:
@@ -301,10 +299,8 @@ def _results(study: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
 def select(runs: pd.DataFrame, cost_limit: float) -> pd.Series | None:
     """Select a run by the paper's rule (see :func:`sweep`), if one is below the limit."""
     below = runs[runs["cost"] < cost_limit]
-    if below.empty:
-        return None
     least = below[below["information"] <= below["information"].min() + TIE]
-    return least.loc[least["cost"].idxmin()]
+    return None if below.empty else least.loc[least["cost"].idxmin()]
 
 
 def _write(plan: _Plan, runs: pd.DataFrame, failures: Mapping[str, str]) -> str:
@@ -323,8 +319,7 @@ def _write(plan: _Plan, runs: pd.DataFrame, failures: Mapping[str, str]) -> str:
             with replaced_atomically(model) as partial:
                 shutil.copyfile(source, partial)
     save_figure(tradeoff_figure(runs, plan.columns, best, plan.cost_limit), out / "sweep.png")
-    config = {**plan.config, "cost_limit": plan.cost_limit, "runs": runs["folder"].tolist()}
-    write_run_config(out / "config.json", config)
+    write_run_config(out / "config.json", {**plan.config, "cost_limit": plan.cost_limit, "runs": [*runs["folder"]]})
     summary = _summary(plan, runs, best, failures)
     write_atomically(out / "summary.md", summary + "\n")
     return summary
