@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import optuna
 
-from sb3_tdpg.experiments.studies import enqueue_once, open_storage, open_study, quiet_optuna, work
+from sb3_tdpg.experiments.studies import enqueue_once, open_storage, open_study, work
 
 GRACE_PERIOD = 3
 JOBS = [{"x": x} for x in (-2, -1, 0, 1, 2, 3)]
@@ -37,7 +37,6 @@ def run_worker(url, n_trials, log, seconds):
         with open(log, "a") as file:
             file.write(text + "\n")
 
-    quiet_optuna()
     # The same seed in all workers: they must not try the same points for it.
     study = open_quick(url, sampler=optuna.samplers.TPESampler(seed=0))
     if n_trials is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -62,14 +63,15 @@ class Run:
     @property
     def folder_name(self) -> str:
         """A name made from the method and the seed."""
-        label = "".join(c if c.isalnum() else "-" for c in self.method.lower())
-        return f"{'-'.join(filter(None, label.split('-')))}-seed{self.seed}"
+        return "-".join([*re.findall(r"[^\W_]+", self.method.lower()), f"seed{self.seed}"])
 
     @property
     def config(self) -> dict[str, Any]:
         """Everything that determines the result of the run."""
         config = {name: getattr(self, name) for name in ("method", "env_id", "block", "seed", "max_attempts")}
-        start, policy = (None, None) if self.start is None else (self.start.name, _digest(self.start / "model.zip"))
+        start, policy = (None, None) if self.start is None else (self.start.name, "not trained yet")
+        if self.start is not None and (path := self.start / "model.zip").exists():
+            policy = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         return {**config, "start": start, "start_policy": policy, "settings": self.settings}
 
     def train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
@@ -86,7 +88,7 @@ class Run:
             return TDPG.load(result, device="cpu"), (folder / "selected.json").exists()
         seed = self.seed + SEEDS_BETWEEN_ATTEMPTS * attempt
         training = make_training(self.env_id, self.settings, seed=seed, device="cpu")
-        model, n_timesteps = training.model, training.n_timesteps
+        model, n_timesteps, selection = training.model, training.n_timesteps, training.selection
         n_epochs = n_timesteps // (model.n_episodes * model.horizon)
         save_freq = max(1, min(MAX_CHECKPOINT_EPOCHS, n_epochs // 4))
         resumes = checkpoint.exists()
@@ -97,9 +99,8 @@ class Run:
             # Not the whole model: the optimiser's state belongs to another objective.
             start = TDPG.load(self.start / "model.zip", device="cpu")
             model.policy.load_state_dict(start.policy.state_dict())
-        log = make_output_format("csv", str(folder), log_suffix=f"_{model.num_timesteps:08d}")
-        model.set_logger(Logger(str(folder), [log]))
-        selection = training.selection
+        suffix = f"_{model.num_timesteps:08d}"
+        model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), suffix)]))
         if selection is not None:
             selection.save_path = folder / "selected.zip"
         callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, save_freq)]
@@ -118,12 +119,7 @@ Task = tuple[Run, Path, Sequence[Scenario]]
 
 
 def complete_run(
-    run: Run,
-    folder: Path,
-    scenarios: Sequence[Scenario],
-    *,
-    n_eval_episodes: int = 1000,
-    progress_bar: bool = False,
+    run: Run, folder: Path, scenarios: Sequence[Scenario], *, n_eval_episodes: int = 1000, progress_bar: bool = False
 ) -> Path:
     """
     Train and evaluate, or resume an interrupted run, or do nothing if the run is finished.
@@ -171,9 +167,8 @@ def complete_run(
 
 def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episodes: int) -> dict[str, Any]:
     """
-    Check that a folder is free for a run or holds it already; the parameters are those of :func:`complete_run`.
+    Return the content of ``config.json``; the parameters are those of :func:`complete_run`.
 
-    :return: the content of ``config.json``
     :raises ValueError: if the folder holds a run with other settings.
     """
     rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
@@ -182,18 +177,12 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
     return config
 
 
-def _digest(path: Path) -> str:
-    """Name the content of a file, if it exists."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.exists() else "not trained yet"
-
-
 def read_progress(folder: Path) -> pd.DataFrame:
     """Return the training log of a run, one row for each epoch, also if the run was resumed."""
     frames = [pd.read_csv(path) for path in sorted(folder.glob("progress_*.csv"))]
-    log = pd.concat([frame for frame in frames if len(frame)], ignore_index=True)
+    log, step = pd.concat([frame for frame in frames if len(frame)]), "time/total_timesteps"
     # Epochs after the last checkpoint were run again, with the same numbers.
-    log = log.drop_duplicates("time/total_timesteps", keep="last")
-    return log.sort_values("time/total_timesteps", ignore_index=True)
+    return log.drop_duplicates(step, keep="last").sort_values(step, ignore_index=True)
 
 
 def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: int | None = None) -> None:

@@ -55,7 +55,6 @@ class _Journal(JournalStorage, BaseHeartbeat):
         # Absolute: through a link to this path workers see how old the lock of a dead one is.
         super().__init__(JournalFileBackend(str(path.absolute())))
         self.grace_period = grace_period
-        self.retry = RetryHeartbeatStaleTrialCallback(MAX_RETRIES)
 
     def record_heartbeat(self, trial_id: int) -> None:
         with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
@@ -65,11 +64,10 @@ class _Journal(JournalStorage, BaseHeartbeat):
         return _interval(self.grace_period)
 
     def get_heartbeat_stale_trial_callback(self) -> Callable[[optuna.Study, FrozenTrial], None]:
-        return self.retry
+        return RetryHeartbeatStaleTrialCallback(MAX_RETRIES)
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        trials = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
-        return [trial._trial_id for trial in trials if _silence(trial) > self.grace_period]
+        return [trial._trial_id for trial in _silent_trials(self, study_id)]
 
 
 class _Database(RDBStorage):
@@ -80,9 +78,8 @@ class _Database(RDBStorage):
             super().record_heartbeat(trial_id)
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        trials = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
         # Optuna would wait forever for a worker that has died before its first heartbeat.
-        early = [t._trial_id for t in trials if STARTED not in t.user_attrs and _silence(t) > (self.grace_period or 0)]
+        early = [t._trial_id for t in _silent_trials(self, study_id) if STARTED not in t.user_attrs]
         return [*super()._get_stale_trial_ids(study_id), *early]
 
 
@@ -90,16 +87,17 @@ def _interval(grace_period: float) -> int:
     return max(1, int(grace_period / 6))
 
 
-def _silence(trial: FrozenTrial) -> float:
-    """Return the seconds since the start or the last heartbeat of a running trial, by this machine's clock."""
-    assert trial.datetime_start is not None
+def _silent_trials(storage: Any, study_id: int) -> list[FrozenTrial]:
+    """Return the running trials without a sign of life in the grace period, by this machine's clock."""
+    trials = storage.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
+    since = time.time() - storage.grace_period
     # A trial that is run again has inherited an old heartbeat.
-    return time.time() - max(trial.datetime_start.timestamp(), trial.user_attrs.get(HEARTBEAT, 0.0))
+    return [t for t in trials if max(t.datetime_start.timestamp(), t.user_attrs.get(HEARTBEAT, 0.0)) < since]
 
 
 def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PERIOD) -> BaseStorage:
     """
-    Open the storage that workers share, and make its tables or file if necessary.
+    Open the storage that workers share, make its tables or file if necessary, and turn off Optuna's messages.
 
     :param storage: A path that ends in ``.log``: a journal file, for the processes of one machine. For many machines
         ``postgresql://user:password@host:port/database`` (psycopg 3, unless the URL names another driver), or another
@@ -117,29 +115,32 @@ def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PE
         raise ValueError(f"storage={shown!r} must be {FORMS}; SQLite is not meant for several workers")
     if text.count("@") > 1:
         raise ValueError(f"storage={shown!r}: write an @ in the password as %40")
-    for attempt in range(OPEN_ATTEMPTS):
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ExperimentalWarning)
-                if "://" not in text:
-                    return _Journal(Path(text), grace_period)
-                return _Database(
-                    url.replace("{", "{{").replace("}", "}}"),  # Optuna formats it
-                    dict(pool_pre_ping=True, connect_args=POSTGRES if url.startswith("postgresql") else {}),
-                    heartbeat_interval=_interval(grace_period),
-                    grace_period=int(grace_period),
-                    heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(MAX_RETRIES),
-                )
-        except ImportError as e:
-            raise ImportError(f"storage {shown} needs a driver: pip install 'sb3_tdpg[postgres]'") from e
-        except (OSError, ValueError, KeyError, AssertionError, RuntimeError, sa.exc.SQLAlchemyError) as e:
-            # Workers that start at once disturb each other while they make the tables.
-            if attempt == OPEN_ATTEMPTS - 1 or not isinstance(e, (sa.exc.DBAPIError, AssertionError)):
-                if isinstance(e, sa.exc.ArgumentError) or ("://" in text and isinstance(e, ValueError)):
-                    raise ValueError(f"storage={shown!r} is malformed or of an unknown kind, expected {FORMS}") from e
-                raise ValueError(f"storage {shown} cannot be opened: {_one_line(e)}") from e
-            time.sleep(0.5)
-    raise AssertionError("not reached")
+    optuna.logging.set_verbosity(optuna.logging.CRITICAL)  # work() reports the trials
+    warnings.filterwarnings("ignore", category=ExperimentalWarning)
+
+    def open_once() -> BaseStorage:
+        if "://" not in text:
+            return _Journal(Path(text), grace_period)
+        return _Database(
+            url.replace("{", "{{").replace("}", "}}"),  # Optuna formats it
+            dict(pool_pre_ping=True, connect_args=POSTGRES if url.startswith("postgresql") else {}),
+            heartbeat_interval=_interval(grace_period),
+            grace_period=int(grace_period),
+            heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(MAX_RETRIES),
+        )
+
+    try:
+        for _ in range(OPEN_ATTEMPTS - 1):
+            with contextlib.suppress(sa.exc.DBAPIError, AssertionError):
+                return open_once()
+            time.sleep(0.5)  # workers that start at once disturb each other while they make the tables
+        return open_once()
+    except ImportError as e:
+        raise ImportError(f"storage {shown} needs a driver: pip install 'sb3_tdpg[postgres]'") from e
+    except (OSError, ValueError, KeyError, AssertionError, RuntimeError, sa.exc.SQLAlchemyError) as e:
+        if isinstance(e, sa.exc.ArgumentError) or ("://" in text and isinstance(e, ValueError)):
+            raise ValueError(f"storage={shown!r} is malformed or of an unknown kind, expected {FORMS}") from e
+        raise ValueError(f"storage {shown} cannot be opened: {_one_line(e)}") from e
 
 
 def _one_line(error: BaseException) -> str:
@@ -147,44 +148,28 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def quiet_optuna() -> None:
-    """Turn off Optuna's messages, as :func:`work` reports the trials."""
-    optuna.logging.set_verbosity(optuna.logging.CRITICAL)
-    warnings.filterwarnings("ignore", category=ExperimentalWarning)
-
-
-def open_study(
-    storage: BaseStorage,
-    name: str,
-    *,
-    space: Mapping[str, Any],
-    directions: Sequence[str] = ("minimize",),
-    sampler: optuna.samplers.BaseSampler | None = None,
-    pruner: optuna.pruners.BasePruner | None = None,
-) -> optuna.Study:
+def open_study(storage: BaseStorage, name: str, *, space: Mapping[str, Any], **options: Any) -> optuna.Study:
     """
-    Create a study, or load it if it exists; directions, sampler and pruner are those of ``optuna.create_study``.
+    Create a study, or load it if it exists.
 
     :param storage: From :func:`open_storage`.
     :param name: Name of the study.
     :param space: Everything that makes one trial comparable with another: search space, environment, settings.
+    :param options: ``directions``, ``sampler`` and ``pruner`` of ``optuna.create_study``.
     :raises ValueError: if the study was made with another space; the message names the differences.
     """
-    kinds: list[Any] = list(directions)
     try:
-        study = optuna.create_study(storage=storage, study_name=name, directions=kinds, sampler=sampler, pruner=pruner)
+        study = optuna.create_study(storage=storage, study_name=name, **options)
     except DuplicatedStudyError:
-        study = optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=pruner)
+        study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True, **options)
         study.sampler.reseed_rng()  # two workers with the same seed would try the same points
     if SPACE not in study.user_attrs:
         if study.get_trials(deepcopy=False):
             raise ValueError(f"study {name!r} was made by another program: choose another name")
         study.set_user_attr(SPACE, jsonable(space))
     elif changed := differences(study.user_attrs[SPACE], jsonable(space)):
-        raise ValueError(
-            f"study {name!r} exists with other settings, {changed}: choose another name for the study, or the settings "
-            "that it was made with"
-        )
+        mend = "choose another name for the study, or the settings that it was made with"
+        raise ValueError(f"study {name!r} exists with other settings, {changed}: {mend}")
     return study
 
 
@@ -233,8 +218,10 @@ def work(
 
     def attempt(trial: optuna.Trial) -> float | Sequence[float]:
         nonlocal number
-        if n_trials is None and not _is_to_be_run(study, trial):
-            return [float("nan")] * len(study.directions)  # for Optuna, the trial has failed
+        if n_trials is None:
+            job, earlier = trial.user_attrs.get(JOB), study.get_trials(deepcopy=False)[: trial.number]
+            if job is None or any(t.user_attrs.get(JOB) == job and t.state != TrialState.FAIL for t in earlier):
+                return [float("nan")] * len(study.directions)  # for Optuna, the trial has failed
         number = trial.number
         trial.set_user_attr(STARTED, os.getpid())
         try:
@@ -272,26 +259,11 @@ def work(
         except StorageInternalError as e:
             raise ValueError(f"the storage does not answer: {_one_line(e)}") from e
         except (Exception, KeyboardInterrupt) as e:
-            is_taken_over = number is not None and not _put_back(study, number, e)
-            if not is_taken_over or isinstance(e, KeyboardInterrupt):
+            trials = study.get_trials()
+            if not any(number in trial.system_attrs.get("retry_history", ()) for trial in trials):
+                if number is not None and trials[number].state == TrialState.FAIL:
+                    # A trial may be interrupted any number of times.
+                    max_retries = None if isinstance(e, KeyboardInterrupt) else MAX_RETRIES
+                    RetryHeartbeatStaleTrialCallback(max_retries)(study, trials[number])
                 raise
             report(f"trial {number} was taken over by another worker: its result is dropped")
-
-
-def _is_to_be_run(study: optuna.Study, trial: optuna.Trial) -> bool:
-    """Return whether a trial has a job, and one that no earlier trial has except failed ones."""
-    job = trial.user_attrs.get(JOB)
-    earlier = study.get_trials(deepcopy=False)[: trial.number]
-    return job is not None and all(t.user_attrs.get(JOB) != job or t.state == TrialState.FAIL for t in earlier)
-
-
-def _put_back(study: optuna.Study, number: int, error: BaseException) -> bool:
-    """Put a failed trial back into the queue; return False if another worker has done so before."""
-    trials = study.get_trials()
-    if any(number in trial.system_attrs.get("retry_history", ()) for trial in trials):
-        return False
-    if trials[number].state == TrialState.FAIL:
-        # A trial may be interrupted any number of times.
-        retry = RetryHeartbeatStaleTrialCallback(None if isinstance(error, KeyboardInterrupt) else MAX_RETRIES)
-        retry(study, trials[number])
-    return True

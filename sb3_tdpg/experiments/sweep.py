@@ -13,6 +13,8 @@ import math
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +22,127 @@ import gymnasium as gym
 import pandas as pd
 
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
+from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.processes import process_pool
-from sb3_tdpg.common.provenance import write_frame_atomically, write_run_config
+from sb3_tdpg.common.provenance import provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.summary import how_made
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA, PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import save_figure
-from sb3_tdpg.experiments.runs import check_folder, complete_run, complete_runs
-from sb3_tdpg.experiments.sweep_runs import Sweep, make_sweep, parse_inverse_beta
-from sb3_tdpg.experiments.sweep_summary import select, sweep_summary
+from sb3_tdpg.evaluation.information import information_bounds, rollout_information
+from sb3_tdpg.experiments.runs import Run, Task, check_folder, complete_run, complete_runs
 from sb3_tdpg.experiments.tradeoff import tradeoff_figure
+from sb3_tdpg.experiments.training import make_training
+from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.tdpg import TDPG
 
 Job = tuple[float, int]  # 1 / beta, seed
+N_INFORMATION = 1000  # episodes
+
+# Among policies with almost no information, which of them has the least is chance: the cheapest of them is taken.
+TIE = 0.01  # nats
+
+NOT_SELECTED = "**No run costs less than {limit:g}, so none is selected**: train longer or loosen the limit."
+SELECTED = (
+    "**Selected: beta = {best.label}, seed {best.seed}** (cost {best.cost:.4g}, information {best.information:.3g} "
+    "nat; {where}). {n_below} of {n} runs are below a cost of {limit:g}; of those within {tie:g} nat of the one with "
+    "the least information, it is the cheapest."
+)
+EVERY_RUN = (
+    "Cost and its standard deviation over episodes; information in nats, summed over time, on fresh rollouts: the "
+    "log-det upper bound, which the selection goes by, and a lower bound. Both are estimated from the same rollouts, "
+    "and the lower bound is never above the upper one; on other rollouts both would differ a little. "
+    "`met_block_limits`: whether an epoch met the limits of the block's own selection, if it has one; otherwise the "
+    "model is that of the last epoch."
+)
+
+
+def parse_inverse_beta(beta: str | float) -> float:
+    """
+    Read a beta and return 1 / beta, the weight of the information; ``"inf"`` gives 0.
+
+    :raises ValueError: if it is not a positive number.
+    """
+    try:
+        inverse = 0.0 if str(beta) == "inf" else float(1 / Fraction(str(beta)))
+    except (ValueError, ArithmeticError):
+        inverse = -1.0
+    if inverse < 0:
+        raise ValueError(f"beta={beta!r} must be a positive number (0.04), a fraction (1/25) or inf (policy gradient)")
+    return round(inverse, 9)
+
+
+def beta_label(inverse_beta: float) -> str:
+    """Name a beta: ``"1/75"``, ``"0.3"``, ``"2"``, ``"inf"``."""
+    if inverse_beta == 0:
+        return "inf"
+    return f"1/{inverse_beta:.0f}" if inverse_beta == round(inverse_beta) > 1 else f"{1 / inverse_beta:.6g}"
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The settings that all runs share; the first scenario is that of the training."""
+
+    env_id: str
+    block: str
+    settings: Mapping[str, Any]
+    scenarios: Sequence[Scenario]
+    n_eval_episodes: int
+    cost_limit: float
+    out: Path
+    study: tuple[str, str, float] | None  # storage, name, grace period
+
+    def run(self, inverse_beta: float, seed: int) -> Run:
+        """Return the run of one beta and one seed."""
+        overrides = {**self.settings, "beta": 1 / inverse_beta if inverse_beta else math.inf}
+        if "cost_limit" in load_hyperparams(self.block):
+            overrides["cost_limit"] = None  # it belongs to beta="auto"
+        return Run(f"beta {beta_label(inverse_beta)}", self.env_id, self.block, seed, overrides)
+
+    def task(self, inverse_beta: float, seed: int) -> Task:
+        """Return a run with its folder and scenarios."""
+        run = self.run(inverse_beta, seed)
+        return run, self.out / "runs" / run.folder_name, self.scenarios
+
+    def row(self, inverse_beta: float, seed: int) -> dict[str, Any]:
+        """Return a finished run's row of ``runs.csv``: its cost in each scenario and its information in the first."""
+        run, folder, _ = self.task(inverse_beta, seed)
+        path = folder / "sweep_row.json"
+        if path.exists():
+            return json.loads(path.read_text())
+        records = pd.read_csv(folder / "episodes.csv")
+        costs = records.groupby("scenario", sort=False)["cost"].agg(["mean", "std"])
+        model = TDPG.load(folder / "model.zip", device="cpu")
+        training = self.scenarios[0].with_kwargs(**run.settings.get("env_kwargs", {}))
+        n_episodes = min(N_INFORMATION, max(self.n_eval_episodes, model.policy.trv_dim + 2))
+        upper, lower = information_bounds(rollout_information(model, training, n_episodes))
+        row: dict[str, Any] = dict(
+            label=beta_label(inverse_beta),
+            inverse_beta=inverse_beta,
+            seed=seed,
+            cost=float(costs["mean"].iloc[0]),
+            std=float(costs["std"].iloc[0]),
+            information=upper,
+            information_lower=lower,
+            met_block_limits=bool(records["selected"].iloc[0]),
+            folder=folder.name,
+            **{column: float(costs["mean"][name]) for name, column in self.columns.items()},
+        )
+        write_atomically(path, json.dumps(row))
+        return row
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """Name of the column of ``runs.csv`` with the mean cost, by scenario."""
+        return {scenario.name: f"cost: {scenario.name}" for scenario in self.scenarios}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Everything that makes one run comparable with another."""
+        settings = {name: value for name, value in self.run(1.0, 0).settings.items() if name != "beta"}
+        rows = {row.name: dict(env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in self.scenarios}
+        shared = {name: getattr(self, name) for name in ("env_id", "block", "n_eval_episodes")}
+        return {**shared, "settings": settings, "scenarios": rows}
 
 
 def sweep(
@@ -80,33 +193,45 @@ def sweep(
         raise ValueError("a sweep needs at least one beta and one seed: --betas 1/25 1/50 1/75 1/100 --seeds 5")
     if storage is None and study_name is not None:
         raise ValueError(f"study_name={study_name!r} needs a storage that keeps the study")
-    cost_limit = _cost_limit(env_id, cost_limit)
-    plan = make_sweep(env_id, block or env_id, settings or {}, n_timesteps, n_eval_episodes)
-    out = out or Path("results", f"sweep-{plan.block}")
-    study = () if storage is None else (storage, study_name or f"sweep-{plan.block}", grace_period)
-    if study:
-        _open_study(plan, *study)
-    tasks = [(plan.run(*job), plan.folder(out, *job), plan.scenarios) for job in wanted]
+    for name in {"beta", "seed"} & set(settings or ()):
+        raise ValueError(f"{name} is varied by the sweep: leave it out of the settings")
+    block = block or env_id
+    length = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    rows = PAPER_ROWS.get(env_id, (Scenario("Training", env_id),))
+    plan = _Plan(
+        env_id,
+        block,
+        settings={**(settings or {}), **length},
+        scenarios=PANDA_GRASP_CAMERA if block.startswith("PandaGrasp-v0-camera") else rows,
+        n_eval_episodes=n_eval_episodes,
+        cost_limit=_cost_limit(env_id, cost_limit),
+        out=out or Path("results", f"sweep-{block}"),
+        study=None if storage is None else (storage, study_name or f"sweep-{block}", grace_period),
+    )
+    _build_once(plan)
+    if plan.study is not None:
+        _open_study(plan)
+    tasks = [plan.task(*job) for job in wanted]
     for task in tasks:
         check_folder(*task, n_eval_episodes)
 
     failures: Mapping[str, str] = {}
     with threads(1):
-        if not study:
+        if plan.study is None:
             complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-            rows = [plan.row(plan.folder(out, *job), *job) for job in wanted]
+            results = [plan.row(*job) for job in wanted]
         else:
             if jobs is None or jobs == 1:
-                _work(plan, out, wanted, *study)
+                _work(plan, wanted)
             else:
                 with process_pool(jobs) as pool:
-                    for worker in as_completed([pool.submit(_work, plan, out, wanted, *study) for _ in range(jobs)]):
+                    for worker in as_completed([pool.submit(_work, plan, wanted) for _ in range(jobs)]):
                         worker.result()
-            rows, failures = _results(_open_study(plan, *study))
-    if not rows:
+            results, failures = _results(_open_study(plan))
+    if not results:
         raise ValueError(f"no run was finished: {failures}")
-    runs = pd.DataFrame(rows).sort_values(["inverse_beta", "seed"], ignore_index=True)
-    return _write(plan, out, runs, failures, cost_limit)
+    runs = pd.DataFrame(results).sort_values(["inverse_beta", "seed"], ignore_index=True)
+    return _write(plan, runs, failures)
 
 
 def _cost_limit(env_id: str, given: float | None) -> float:
@@ -116,37 +241,49 @@ def _cost_limit(env_id: str, given: float | None) -> float:
         raise ValueError(f"env={env_id!r} is not registered: {e}") from e
     if given is None and threshold is None:
         raise ValueError(f"{env_id} is registered without a reward_threshold: give a cost limit, --cost-limit 40, say")
-    limit = -float(threshold or 0.0) if given is None else given
-    if math.isnan(limit):
+    if given is not None and math.isnan(given):
         raise ValueError("cost_limit is NaN")
-    return limit
+    return -float(threshold or 0.0) if given is None else given
 
 
-def _open_study(plan: Sweep, storage: str, name: str, grace_period: float) -> Any:
-    from sb3_tdpg.experiments.studies import open_storage, open_study, quiet_optuna
+def _build_once(plan: _Plan) -> None:
+    """Build a model, so that errors in the settings are found before any training."""
+    try:
+        env = make_training(plan.env_id, plan.run(1.0, 0).settings, seed=0, device="cpu").model.env
+    except KeyError as e:
+        raise ValueError(f"{e.args[0]}: choose one with --block") from e
+    except TypeError as e:
+        raise ValueError(f"the settings of block {plan.block!r} do not fit: {e}") from e
+    assert env is not None
+    env.close()
 
-    quiet_optuna()
-    storage_ = open_storage(storage, grace_period)
-    return open_study(storage_, name, directions=("minimize", "minimize"), space=plan.config)
+
+def _open_study(plan: _Plan) -> Any:
+    from sb3_tdpg.experiments.studies import open_storage, open_study
+
+    assert plan.study is not None
+    storage, name, grace_period = plan.study
+    directions = ("minimize", "minimize")
+    return open_study(open_storage(storage, grace_period), name, directions=directions, space=plan.config)
 
 
-def _work(plan: Sweep, out: Path, wanted: Sequence[Job], *study_arguments: Any) -> None:
+def _work(plan: _Plan, wanted: Sequence[Job]) -> None:
     """Be one worker: run jobs of the study until none is left."""
     from sb3_tdpg.experiments.studies import enqueue_once, work
 
     def objective(trial: Any) -> tuple[float, float]:
         job = trial.suggest_float("inverse_beta", 0.0, 1e9), trial.suggest_int("seed", 0, 2**31)
-        run, folder = plan.run(*job), plan.folder(out, *job)
+        task = plan.task(*job)
         try:
-            check_folder(run, folder, plan.scenarios, plan.n_eval_episodes)
+            check_folder(*task, plan.n_eval_episodes)
         except ValueError as e:  # a job of another worker that does not fit into this one's folder: not to be pruned
             raise FileExistsError(str(e)) from e
-        complete_run(run, folder, plan.scenarios, n_eval_episodes=plan.n_eval_episodes)
-        row = plan.row(folder, *job)
+        complete_run(*task, n_eval_episodes=plan.n_eval_episodes)
+        row = plan.row(*job)
         trial.set_user_attr("row", row)
         return row["cost"], row["information"]
 
-    study = _open_study(plan, *study_arguments)
+    study = _open_study(plan)
     enqueue_once(study, [dict(inverse_beta=inverse, seed=seed) for inverse, seed in wanted])
     work(study, objective)
 
@@ -159,25 +296,65 @@ def _results(study: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
     return list(rows.values()), {job: reason for job, reason in reasons.items() if job not in rows}
 
 
-def _write(plan: Sweep, out: Path, runs: pd.DataFrame, failures: Mapping[str, str], cost_limit: float) -> str:
-    """Write everything except the runs; any worker may do so, and more than once."""
-    best = select(runs, cost_limit)
+def select(runs: pd.DataFrame, cost_limit: float) -> pd.Series | None:
+    """Select a run by the paper's rule (see :func:`sweep`), if one is below the limit."""
+    below = runs[runs["cost"] < cost_limit]
+    least = below[below["information"] <= below["information"].min() + TIE]
+    return None if below.empty else least.loc[least["cost"].idxmin()]
+
+
+def _write(plan: _Plan, runs: pd.DataFrame, failures: Mapping[str, str]) -> str:
+    """Write everything except the runs, and return the summary; any worker may do so, and more than once."""
+    out, best = plan.out, select(runs, plan.cost_limit)
     write_frame_atomically(runs, out / "runs.csv")
-    model, record, chosen = out / "selected.zip", out / "selected.json", None
+    model, record = out / "selected.zip", out / "selected.json"
     model.unlink(missing_ok=True)
     record.unlink(missing_ok=True)
     if best is not None:
-        chosen = (str(best["label"]), int(best["seed"]))
         content = {"beta": best["label"], **best[["seed", "cost", "std", "information", "folder"]]}
-        text = json.dumps({**content, "cost_limit": cost_limit}, indent=2, default=lambda x: x.item())
+        text = json.dumps({**content, "cost_limit": plan.cost_limit}, indent=2, default=lambda x: x.item())
         write_atomically(record, text + "\n")
         source = out / "runs" / best["folder"] / "model.zip"
         if source.exists():
             with replaced_atomically(model) as partial:
                 shutil.copyfile(source, partial)
-    save_figure(tradeoff_figure(runs, plan.columns, cost_limit=cost_limit, selected=chosen), out / "sweep.png")
-    write_run_config(out / "config.json", {**plan.config, "cost_limit": cost_limit, "runs": runs["folder"].tolist()})
-    limits: dict[str, Any] = dict(cost_limit=cost_limit, title=plan.block, has_model=model.exists())
-    text = sweep_summary(runs, best, plan.columns, failures, **limits)
-    write_atomically(out / "summary.md", text + "\n")
-    return text
+    save_figure(tradeoff_figure(runs, plan.columns, best, plan.cost_limit), out / "sweep.png")
+    write_run_config(out / "config.json", {**plan.config, "cost_limit": plan.cost_limit, "runs": [*runs["folder"]]})
+    summary = _summary(plan, runs, best, failures)
+    write_atomically(out / "summary.md", summary + "\n")
+    return summary
+
+
+def _summary(plan: _Plan, runs: pd.DataFrame, best: pd.Series | None, failures: Mapping[str, str]) -> str:
+    limit = plan.cost_limit
+    is_below = runs["cost"] < limit
+    selection = NOT_SELECTED.format(limit=limit)
+    if best is not None:
+        is_here = (plan.out / "selected.zip").exists()
+        where = "`selected.zip`" if is_here else f"not in this folder: `runs/{best.folder}/model.zip` of its worker"
+        counts = dict(n_below=is_below.sum(), n=len(runs), limit=limit, tie=TIE)
+        selection = SELECTED.format(best=best, where=where, **counts)
+    by_beta = runs.groupby("label", sort=False)
+    overview = {
+        "beta": list(by_beta.groups),
+        "seeds": by_beta.size(),
+        "cost: mean (worst)": _mean_and_worst(by_beta["cost"]),
+        "information in nats: mean (most)": _mean_and_worst(by_beta["information"], "{:.2g}"),
+        f"runs below {limit:g}": is_below.groupby(runs["label"], sort=False).sum(),
+    }
+    parts = [f"# Sweep over beta: {plan.block}", selection, "![cost against information](sweep.png)"]
+    parts += ["## By beta", markdown_table(pd.DataFrame(overview))]
+    if len(plan.columns) > 1:
+        costs = {f"beta {beta}": _mean_and_worst(group[list(plan.columns.values())]) for beta, group in by_beta}
+        table = markdown_table(pd.DataFrame({"scenario": list(plan.columns), **costs}))
+        parts += ["## Robustness", "Mean episode cost: mean over seeds (worst seed).", table]
+    shown = runs[["label", "seed", "cost", "std", "information", "information_lower", "met_block_limits"]]
+    parts += ["## Every run", EVERY_RUN, markdown_table(shown.rename(columns={"label": "beta"}), digits=4)]
+    if failures:
+        parts += ["## Failed", "\n".join(f"- `{job}`: {reason}" for job, reason in failures.items())]
+    return "\n\n".join([*parts, how_made("sb3-tdpg sweep", provenance())])
+
+
+def _mean_and_worst(values: pd.DataFrame, form: str = "{:.4g}") -> list[str]:
+    means, worst = values.mean(), values.max()
+    return [f"{form.format(a)} ({form.format(b)})" for a, b in zip(means, worst, strict=True)]

@@ -20,23 +20,15 @@ ORDERED = "Sensor noise"  # prefix of the scenarios that follow the reference in
 LIMIT_COLOR = "#D55E00"
 
 
-def tradeoff_figure(
-    runs: pd.DataFrame,
-    rows: Mapping[str, str],
-    *,
-    cost_limit: float | None = None,
-    selected: tuple[str, int] | None = None,
-    quantity: str = "mean episode cost",
-) -> Figure:
+def tradeoff_figure(runs: pd.DataFrame, rows: Mapping[str, str], best: pd.Series | None, cost_limit: float) -> Figure:
     """
     Draw cost against information, one point for each run, and beside it the cost of each run in each scenario.
 
     :param runs: ``label``, ``seed``, ``cost``, ``information`` (nats) and the columns of ``rows`` for each run, in the
         order of drawing.
     :param rows: Column of the mean cost by name of the scenario, the reference first.
+    :param best: The selected run, which is marked.
     :param cost_limit: Drawn as a line.
-    :param selected: Label and seed of the run to mark.
-    :param quantity: Label of the cost axis.
     """
     matplotlib = import_matplotlib()
     has_rows = len(rows) > 1
@@ -51,9 +43,9 @@ def tradeoff_figure(
         points = group["information"], group["cost"]
         scatter.scatter(*points, s=28, color=colors[label], label=name, alpha=0.85, zorder=3)
     information = runs["information"].clip(lower=FLOOR)
-    chosen = [(row.label, row.seed) == selected for row in runs.itertuples()]
-    ring: dict[str, Any] = dict(s=150, facecolors="none", edgecolors=LIMIT_COLOR, linewidths=2, zorder=4)
-    scatter.scatter(information[chosen], runs["cost"][chosen], label="selected" if any(chosen) else None, **ring)
+    if best is not None:
+        point = max(best["information"], FLOOR), best["cost"]
+        scatter.scatter(*point, s=150, facecolors="none", edgecolors=LIMIT_COLOR, lw=2, zorder=4, label="selected")
     low, high = 0.6 * information.min(), 1.7 * information.max()
     log_axis(scatter, "x", subs=(1,))
     scatter.set_xlim(low, max(high, 12 * low))  # at least one tick
@@ -61,25 +53,22 @@ def tradeoff_figure(
         span = low, min(ABOUT_NOTHING, high)
         scatter.axvspan(*span, color="#EEEEEE", zorder=0, label="information of about 0", linewidth=0)
     scatter.set_xlabel("information in the TRVs (nat, logarithmic axis)", fontsize=9)
-    scatter.set_ylabel(quantity, fontsize=9)
+    scatter.set_ylabel("mean episode cost", fontsize=9)
     costs = runs[list(rows.values())].to_numpy()
     if costs.min() > 0 and costs.max() > 4 * costs.min():
         log_axis(scatter, "y", subs=(1, 2, 5))
     if has_rows:
         _draw_rows(panels[1], runs, rows, colors)
     for axes in panels:
-        if cost_limit is not None:
-            axes.axhline(cost_limit, color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
+        axes.axhline(cost_limit, color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
         axes.grid(alpha=0.25)
         axes.margins(y=0.08)
         tidy(axes)
-    if cost_limit is not None:
-        where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(0, 3))
-        style: dict[str, Any] = dict(ha="right", fontsize=8, color=LIMIT_COLOR)
-        scatter.annotate(f"cost limit {cost_limit:g}", (0.99, cost_limit), **where, **style)
+    where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(0, 3))
+    style: dict[str, Any] = dict(ha="right", fontsize=8, color=LIMIT_COLOR)
+    scatter.annotate(f"cost limit {cost_limit:g}", (0.99, cost_limit), **where, **style)
     handles, names = scatter.get_legend_handles_labels()
-    columns = min(len(names), 8)
-    figure.legend(handles, names, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
+    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 8), frameon=False, fontsize=9)
     return figure
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
@@ -74,9 +74,8 @@ def read_schedule(settings: dict[str, Any]) -> None:
     rate = settings.get("learning_rate")
     if isinstance(rate, str):
         if not rate.startswith("lin_"):
-            raise ValueError(
-                f"learning_rate={rate!r} must be a number or 'lin_' and a number (YAML: write 1.0e-3, not 1e-3)"
-            )
+            mend = "must be a number or 'lin_' and a number (YAML: write 1.0e-3, not 1e-3)"
+            raise ValueError(f"learning_rate={rate!r} {mend}")
         settings["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
 
 
@@ -85,5 +84,4 @@ def _make(entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:
     (path, keywords), *more = [(entry, {})] if isinstance(entry, str) else entry.items()
     if more:
         raise ValueError(f"a callback or a wrapper is one class with its keywords, not {entry}")
-    module, _, name = path.rpartition(".")
-    return getattr(import_module(module), name)(*arguments, **keywords)
+    return resolve_name(path)(*arguments, **keywords)

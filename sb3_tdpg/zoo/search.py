@@ -36,24 +36,23 @@ def read_space(path: Path | None = None) -> Space:
         raise ValueError(f"the search space {file} cannot be read: {' '.join(str(e).split())}") from e
     if not isinstance(space, dict) or not space:
         raise ValueError(f"the search space {file} must map names of arguments to ranges")
+    policy = {f"policy_kwargs.{argument}" for argument in inspect.signature(TRVPolicy).parameters}
+    allowed = {WEIGHT, *inspect.signature(TDPG).parameters, *policy}
     for name, entry in space.items():
-        _check_entry(f"{name} of {file}", name, entry)
+        where = f"{name} of {file}"
+        if name not in allowed:
+            raise ValueError(f"{where} is no argument of TDPG, nor of its policy after 'policy_kwargs.', nor {WEIGHT}")
+        _check_range(where, entry)
     return space
 
 
-def _check_entry(where: str, name: str, entry: Any) -> None:
-    prefix, _, argument = name.rpartition(".")
-    owners: dict[str, Any] = {"": TDPG, "policy_kwargs": TRVPolicy}
-    if prefix not in owners or (name != WEIGHT and argument not in inspect.signature(owners[prefix]).parameters):
-        raise ValueError(f"{where} is no argument of TDPG, nor of its policy after 'policy_kwargs.', nor {WEIGHT}")
+def _check_range(where: str, entry: Any) -> None:
     keys = set(entry) if isinstance(entry, dict) else set()
     if keys != {"choices"} and not {"low", "high"} <= keys <= {"low", "high", "log"}:
         raise ValueError(f"{where} must have low and high, and may have log: true; or choices. It is {entry!r}")
-    if "choices" in entry:
-        if not isinstance(entry["choices"], list) or not entry["choices"]:
-            raise ValueError(f"{where} must have a list of choices, not {entry['choices']!r}")
-        return
-    low, high = entry["low"], entry["high"]
+    choices, low, high = entry.get("choices", [0]), entry.get("low", 1), entry.get("high", 2)
+    if not isinstance(choices, list) or not choices:
+        raise ValueError(f"{where} must have a list of choices, not {choices!r}")
     if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in (low, high)) or low >= high:
         raise ValueError(f"{where} must have finite numbers low < high (write 1.0e-3, not 1e-3), not {low!r}, {high!r}")
     if entry.get("log", False) and low <= 0:
@@ -68,15 +67,14 @@ def relevant(space: Space, block: Mapping[str, Any]) -> Space:
 
 def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
     """Sample a value for each name."""
-    values: dict[str, Any] = {}
-    for name, entry in space.items():
+
+    def suggest(name: str, entry: Mapping[str, Any]) -> Any:
         if "choices" in entry:
-            values[name] = trial.suggest_categorical(name, entry["choices"])
-        else:
-            is_integer = isinstance(entry["low"], int) and isinstance(entry["high"], int)
-            suggest: Any = trial.suggest_int if is_integer else trial.suggest_float
-            values[name] = suggest(name, **entry)
-    return values
+            return trial.suggest_categorical(name, **entry)
+        is_integer = isinstance(entry["low"], int) and isinstance(entry["high"], int)
+        return (trial.suggest_int if is_integer else trial.suggest_float)(name, **entry)
+
+    return {name: suggest(name, entry) for name, entry in space.items()}
 
 
 def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: float) -> dict[str, Any]:
@@ -90,12 +88,8 @@ def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: floa
     block = {**block, "policy_kwargs": copy.deepcopy(dict(block.get("policy_kwargs") or {}))}
     for name, value in values.items():
         prefix, _, argument = name.rpartition(".")
-        if prefix:
-            block[prefix][argument] = value
-        elif name == WEIGHT:
+        if name == WEIGHT:
             block["beta"] = 1.0 / (value * cost_scale)
-        elif name == "learning_rate":
-            block[name] = f"lin_{value!r}"
         else:
-            block[name] = value
+            (block[prefix] if prefix else block)[argument] = f"lin_{value!r}" if name == "learning_rate" else value
     return block

@@ -26,7 +26,7 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.experiments.studies import open_storage, open_study, quiet_optuna, work
+from sb3_tdpg.experiments.studies import open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
@@ -54,10 +54,8 @@ class TuningManager(TDPGExperimentManager):
         if self.objective_kind == "shift" and self._eval_env_kwargs_args is None:
             raise ValueError("--objective shift needs --eval-env-kwargs: how the environment differs from training")
         if self.n_jobs != 1:
-            raise ValueError(
-                f"--n-jobs {self.n_jobs} would be threads of one process, which do not make TDPG faster: start the "
-                "same command several times instead"
-            )
+            threads = f"--n-jobs {self.n_jobs} would be threads of one process, which do not make TDPG faster"
+            raise ValueError(f"{threads}: start the same command several times instead")
         self.n_evaluations = self.n_evaluations or N_EVALUATIONS
         self.study_name = self.study_name or f"{self.block or env_id}-{self.objective_kind}"
         self.save_path = self.params_path = str(Path(self.log_path, f"study-{self.study_name}"))
@@ -85,10 +83,8 @@ class TuningManager(TDPGExperimentManager):
         for limit in (self.cost_limit, block.get("cost_limit"), *selections, -threshold):
             if limit and math.isfinite(limit):
                 return float(limit)
-        raise ValueError(
-            f"tuning needs a limit on the expected cost (minus the reward) of {self.env_name.gym_id}, a finite number "
-            "other than 0: give --cost-limit"
-        )
+        needed = f"a limit on the expected cost (minus the reward) of {self.env_name.gym_id}"
+        raise ValueError(f"tuning needs {needed}, a finite number other than 0: give --cost-limit")
 
     def objective(self, trial: optuna.Trial) -> float:
         """Train with the hyperparameters that a trial samples; return the value to be minimised."""
@@ -125,28 +121,15 @@ class TuningManager(TDPGExperimentManager):
             super().hyperparameters_optimization()
             return
         assert self.storage is not None and self.study_name is not None
-        description = dict(
-            env_id=self.env_name.gym_id,
-            objective=self.objective_kind,
-            cost_limit=self.cost_limit,
-            space=self.space,
-            block=self.settings,
-            n_timesteps=self.n_timesteps,
-            eval_env_kwargs=self.eval_env_kwargs,
-            n_evaluations=self.n_evaluations,
-            n_eval_episodes=self.n_eval_episodes,
-        )
+        names = ("cost_limit", "space", "n_timesteps", "eval_env_kwargs", "n_evaluations", "n_eval_episodes")
+        description: dict[str, Any] = {name: getattr(self, name) for name in names}
+        description.update(env_id=self.env_name.gym_id, objective=self.objective_kind, block=self.settings)
         record = Path(self.save_path, RECORD)
         if Path(self.storage) != record.with_name("study.log"):  # that one names the study in its message
             check_same_config(record, dict(study=self.study_name, **description), "study")
-        quiet_optuna()
-        study = open_study(
-            open_storage(self.storage),
-            self.study_name,
-            sampler=self._create_sampler(self.sampler),
-            pruner=self._create_pruner(self.pruner),
-            space=description,
-        )
+        sampler, pruner = self._create_sampler(self.sampler), self._create_pruner(self.pruner)
+        storage = open_storage(self.storage)
+        study = open_study(storage, self.study_name, sampler=sampler, pruner=pruner, space=description)
         self.create_envs(1, eval_env=True).close()  # errors that every trial would have come before the first one
         work(study, self.objective, self.max_total_trials or self.n_trials, describe=_result)
         self._write_results(study, description)
@@ -154,10 +137,9 @@ class TuningManager(TDPGExperimentManager):
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         if self.algo != "tdpg" or sampler_method != "tpe":
             return super()._create_sampler(sampler_method)
+        options: dict[str, Any] = dict(n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True)
         # As the zoo's, except that workers which choose at the same time avoid each other's running trials.
-        return optuna.samplers.TPESampler(
-            n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, constant_liar=True
-        )
+        return optuna.samplers.TPESampler(**options, constant_liar=True)
 
     def _write_results(self, study: optuna.Study, description: dict[str, Any]) -> None:
         folder = Path(self.save_path)
@@ -165,13 +147,11 @@ class TuningManager(TDPGExperimentManager):
         write_frame_atomically(study.trials_dataframe(), folder / "trials.csv")
         write_run_config(folder / RECORD, dict(study=self.study_name, **description))
         best = best_trial(study)
-        if best is None:
-            print(
-                f"no trial of {self.study_name} keeps the expected cost below {self.cost_limit:g}: raise --cost-limit, "
-                "train longer with -n, or run more trials with --n-trials"
-            )
-            return
         assert self.cost_limit is not None
+        if best is None:
+            mend = "raise --cost-limit, train longer with -n, or run more trials with --n-trials"
+            print(f"no trial of {self.study_name} keeps the expected cost below {self.cost_limit:g}: {mend}")
+            return
         settings = {**put_in(self.settings, best.params, abs(self.cost_limit)), "n_timesteps": self.n_timesteps}
         text = yaml.safe_dump({self.block or self.env_name.gym_id: settings}, sort_keys=False)
         write_atomically(folder / "best.yml", f"# Trial {best.number} of {self.study_name}: {_result(best)}\n{text}")
@@ -194,9 +174,7 @@ class _Measuring(BaseCallback):
     def __init__(self, trial: optuna.Trial, env: VecEnv, limit: float, interval: int) -> None:
         super().__init__()
         self.trial, self.env, self.limit, self.interval = trial, env, limit, interval
-        self.is_pruned = False
-        self.last = (math.inf, math.inf)
-        self._next = interval
+        self.is_pruned, self.last, self._next = False, (math.inf, math.inf), interval
 
     def measure(self) -> tuple[float, float]:
         """Return the expected cost and the information in nats of the current policy."""
@@ -208,11 +186,10 @@ class _Measuring(BaseCallback):
         return self.last
 
     def _on_rollout_start(self) -> None:
-        if self.num_timesteps < self._next:
-            return
-        self._next += self.interval
-        self.trial.report(_rank(*self.measure(), self.limit), self.num_timesteps)
-        self.is_pruned = self.trial.should_prune()
+        if self.num_timesteps >= self._next:
+            self._next += self.interval
+            self.trial.report(_rank(*self.measure(), self.limit), self.num_timesteps)
+            self.is_pruned = self.trial.should_prune()
 
     def _on_step(self) -> bool:
         return not self.is_pruned
@@ -236,11 +213,8 @@ def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
 
 def block_of_trial(storage: str, study_name: str, number: int | None = None) -> dict[str, Any]:
     """
-    Return the hyperparameters of a trial of :class:`TuningManager`.
+    Return the hyperparameters of a trial of :class:`TuningManager`; default: the best one.
 
-    :param storage: Storage of the study.
-    :param study_name: Name of the study.
-    :param number: Number of the trial; default: the best one.
     :raises ValueError: if there is no such study or trial.
     """
     try:

@@ -24,7 +24,7 @@ sys.path.insert(0, str(REPOSITORY))
 
 import optuna  # noqa: E402
 
-from sb3_tdpg.experiments.studies import open_storage, open_study, quiet_optuna, work  # noqa: E402
+from sb3_tdpg.experiments.studies import open_storage, open_study, work  # noqa: E402
 from sb3_tdpg.experiments.training import make_training  # noqa: E402
 from sb3_tdpg.hyperparams import load_hyperparams  # noqa: E402
 
@@ -42,7 +42,6 @@ def train(learning_rate: float, n_timesteps: int) -> float:
 def run_worker(storage: str, name: str, n_trials: int, n_timesteps: int, barrier: Any) -> None:
     """Be one worker; the clock runs between the barriers."""
     warnings.simplefilter("ignore")
-    quiet_optuna()
     train(1e-3, 2500)  # what is imported and compiled in a first training
     sampler = optuna.samplers.TPESampler(seed=0, constant_liar=True)
     study = open_study(open_storage(storage), name, sampler=sampler, space={"learning_rate": [1e-4, 1e-2]})

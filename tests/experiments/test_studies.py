@@ -11,15 +11,10 @@ from optuna.trial import TrialState  # noqa: E402
 from postgres import PASSWORD, postgres  # noqa: E402, F401
 from study_workers import GRACE_PERIOD, JOBS, Workers, open_quick  # noqa: E402
 
-from sb3_tdpg.experiments.studies import enqueue_once, open_storage, quiet_optuna, work  # noqa: E402
+from sb3_tdpg.experiments.studies import enqueue_once, open_storage, work  # noqa: E402
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 ALIVE = (TrialState.RUNNING, TrialState.WAITING)
-
-
-@pytest.fixture(autouse=True)
-def silent_optuna():
-    quiet_optuna()
 
 
 @pytest.fixture(params=["postgresql", "journal"])
