@@ -69,7 +69,7 @@ def test_the_page_and_its_files(report):
     assert {"figures/degradation.png", "figures/examples.png", "figures/comparison.png"} < set(pictures)
     assert all((out / picture).stat().st_size > 1000 for picture in pictures)
     assert not list(out.rglob("*.partial"))
-    assert "| vector_noise | noise on every component | standard deviation, scales | 0.1 | 0.8 |" in page
+    assert "| vector_noise | Add noise to every component | standard deviation, scales | 0.1 | 0.8 |" in page
     assert "A scale is the standard deviation of a component" in page
 
 
