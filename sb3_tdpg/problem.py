@@ -78,7 +78,7 @@ def read_problem(env: VecEnv) -> Problem:
     state_space = _attribute(env, "state_space")
     is_observation = state_space is None
     shape = env.observation_space.shape if is_observation else state_space.shape
-    if is_observation and (shape is None or len(shape) > 1):
+    if shape is None or (is_observation and len(shape) > 1):
         raise ValueError(
             f"the mutual information needs the true state, and an observation of shape {shape} cannot stand in for it: "
             f"{BRING_THE_STATE}"

@@ -60,7 +60,7 @@ def write_run_config(path: Path, config: Mapping[str, Any]) -> None:
     Write a run's configuration as JSON, atomically, with its :func:`provenance` unless it has one already.
 
     :param path: The file; folders are made.
-    :param config: Settings and seeds; see :func:`jsonable`.
+    :param config: Settings and seeds; see ``jsonable``.
     """
     content = jsonable({**config, "provenance": config.get("provenance") or provenance()})
     write_atomically(path, json.dumps(content, indent=2) + "\n")

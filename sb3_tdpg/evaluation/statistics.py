@@ -56,7 +56,7 @@ def probability_of_improvement(
 
     :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
     :param control: Label of the method to compare with.
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the probability, 0.5 for no difference, and the ends of its interval
     """
     means = _seed_means(records_by_seed)
@@ -71,7 +71,7 @@ def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, *
     Pairing removes the differences between seeds where both methods start from one policy and meet the same episodes.
 
     :param control: Label of the method to compare with; it must have the same seeds.
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
     """
     means = _seed_means(records_by_seed)
@@ -87,7 +87,7 @@ def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarra
     Compute the interquartile mean over seeds for many rows at once; see :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
 
     :param scores: ``(seeds, rows)``; each row is resampled on its own.
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the means and the ends of their intervals, each ``(rows,)``
     """
     return _bootstrap(_interquartile_mean, scores, **bootstrap)
@@ -107,7 +107,7 @@ def probabilities_of_improvement(
 
     :param costs: ``(seeds, rows)``; each row is resampled on its own.
     :param of_control: ``(seeds of the control, rows)``
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in :func:`aggregate_seeds`.
+    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the probabilities and the ends of their intervals, each ``(rows,)``
     """
 

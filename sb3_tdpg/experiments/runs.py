@@ -195,6 +195,8 @@ def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: i
     :param jobs: Number of runs at a time; default: the number of cores.
     """
     jobs = jobs or usable_cores()
+    for _, folder, _ in tasks:  # an error here comes before the progress bar
+        folder.parent.mkdir(parents=True, exist_ok=True)
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
     running: dict[Future[Path], Path] = {}
     n_epochs = 0  # of finished runs

@@ -238,7 +238,8 @@ class CriticEstimator(InformationEstimator):
         fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(batch.trvs)
         self._forget(broken)
         self.moments = {}  # the old moments may not be finite, either
-        rows = InformationBatch(*(None if x is None else x[broken] for x in batch))
+        alive = None if batch.alive is None else batch.alive[broken]
+        rows = InformationBatch(*(x[broken] for x in batch[:4]))._replace(alive=alive)
         self._ascend(fresh, self.make_optimizer(fresh), rows, broken, self.refit_gradient_steps)
         for parameter, fresh_parameter in zip(self.critic.parameters(), fresh.parameters(), strict=True):
             parameter[broken] = fresh_parameter

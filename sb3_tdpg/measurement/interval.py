@@ -197,7 +197,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
     :param confidence: Probability, at least, that the interval of a step contains the truth.
     :param seed: Seed of the divisions of the episodes and of the noise.
-    :raises ValueError: if ``confidence`` is not in (0, 1), and as :func:`check_batch`.
+    :raises ValueError: if ``confidence`` is not in (0, 1), and as ``check_batch``.
     """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
@@ -240,7 +240,7 @@ def component_estimates(
     :param seed: Seed of the division of the episodes and of the noise.
     :return: the estimates and their lower limits, ``(T, X)`` each, nats; NaN where a component is constant and where
         too few episodes are alive
-    :raises ValueError: as :func:`check_batch`.
+    :raises ValueError: as ``check_batch``.
     """
     values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
     for t, step, rng in _steps(batch, seed):

@@ -58,7 +58,7 @@ class Numbers:
 
 def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
     """
-    Aggregate the records of :func:`~sb3_tdpg.report.records.run_row`.
+    Aggregate the records of ``run_row``.
 
     The number of a model is its mean cost over episodes (for a perturbation, also over severities). The number of a
     method is the interquartile mean over its models, with a stratified bootstrap interval over the models. The interval

@@ -227,7 +227,7 @@ def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)  # a training takes longer
     assert process.returncode == 130
-    assert "the same command goes on" in error
+    assert "the same command continues" in error
     assert "Traceback" not in error
     assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
 
