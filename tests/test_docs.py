@@ -40,6 +40,15 @@ PAPER_NUMBERS = {
 
 MAX_EPOCHS = 2
 
+# The other pages take up to minutes and are marked slow.
+QUICK_PAGES = {
+    "docs/guide/quickstart.md",
+    "docs/guide/algorithm.md",
+    "docs/guide/your_environment.md",
+    "docs/guide/extend.md",
+    "docs/environments/lava.md",
+}
+
 
 def python_blocks(page):
     """Line number and code of each block of a page that is to be run."""
@@ -93,7 +102,12 @@ def run_in_order(blocks, source):
     return namespace
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if any(python_blocks(p))], ids=name_of)
+def parameters_of(pages):
+    """Mark the pages that take minutes as slow."""
+    return [pytest.param(p, marks=() if name_of(p) in QUICK_PAGES else pytest.mark.slow, id=name_of(p)) for p in pages]
+
+
+@pytest.mark.parametrize("page", parameters_of(p for p in PAGES if any(python_blocks(p))))
 def test_the_python_blocks_of_a_page_run_in_order(page, tmp_path, monkeypatch, brief_training, registry):
     monkeypatch.chdir(tmp_path)
     run_in_order(python_blocks(page), page)
