@@ -178,24 +178,12 @@ class TRVPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        data.update(
-            horizon=self.horizon,
-            trv_dim=self.trv_dim,
-            net_arch=self.net_arch,
-            activation_fn=self.activation_fn,
-            time_varying=self.time_varying,
-            squash_trv_mean=self.squash_trv_mean,
-            squash_trv_log_var=self.squash_trv_log_var,
-            encoder_log_var_init=self.encoder_log_var_init,
-            action_log_var_init=self.action_log_var_init,
-            encoder_var_floor=self.encoder_var_floor,
-            action_var_floor=self.action_var_floor,
-            lr_schedule=self._dummy_schedule,
-            features_extractor_class=self.features_extractor_class,
-            features_extractor_kwargs=self.features_extractor_kwargs,
-            optimizer_class=self.optimizer_class,
-            optimizer_kwargs=self.optimizer_kwargs,
-        )
+        names = (
+            "horizon", "trv_dim", "net_arch", "activation_fn", "time_varying", "squash_trv_mean", "squash_trv_log_var",
+            "encoder_log_var_init", "action_log_var_init", "encoder_var_floor", "action_var_floor",
+            "features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
+        )  # fmt: skip
+        data.update({name: getattr(self, name) for name in names}, lr_schedule=self._dummy_schedule)
         return data
 
     # -- the two conditional distributions --------------------------------------------------------------------
