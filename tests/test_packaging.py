@@ -14,6 +14,12 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCES = ("sb3_tdpg", "envs", "hyperparams", "setup.cfg", "pyproject.toml", "LICENSE")
 
 IMPORT_ALL = "import sb3_tdpg, sb3_tdpg.envs, sb3_tdpg.hyperparams; "
+# What lies beside the package in a checkout is not part of it.
+NOTHING_ELSE = (
+    "import importlib.util; "
+    "found = [n for n in ('tests', 'docs', 'sb3_tdpg') if importlib.util.find_spec(f'sb3_tdpg.{n}')]; "
+    "assert not found, found; "
+)
 MAKE_LAVA = "import gymnasium, sb3_tdpg; [gymnasium.make(id).reset() for id in ('Lava-v0', 'sb3_tdpg:Lava-v0')]"
 
 
@@ -107,7 +113,7 @@ def test_the_installed_wheel_has_the_version_that_it_reports(installed: Path, tm
 
 
 def test_the_installed_wheel_makes_the_lava_environment(installed: Path, tmp_path: Path) -> None:
-    run(installed, "-c", MAKE_LAVA, cwd=tmp_path)
+    run(installed, "-c", IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA, cwd=tmp_path)
 
 
 def test_the_installed_wheel_does_not_get_in_the_way_of_a_checkout(installed: Path) -> None:
@@ -117,7 +123,7 @@ def test_the_installed_wheel_does_not_get_in_the_way_of_a_checkout(installed: Pa
 
 def test_a_checkout_on_the_python_path_works_without_an_install(tmp_path: Path) -> None:
     python = make_environment(tmp_path / "venv")
-    run(python, "-c", IMPORT_ALL + MAKE_LAVA, cwd=tmp_path, pythonpath=REPOSITORY)
+    run(python, "-c", IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA, cwd=tmp_path, pythonpath=REPOSITORY)
 
 
 @pytest.mark.slow
@@ -128,4 +134,4 @@ def test_an_editable_install_works_from_inside_and_outside_the_checkout(mode: st
     arguments = ["--no-deps", "--no-build-isolation", "--config-settings", f"editable_mode={mode}"]
     pip("--python", python, "install", *arguments, "-e", checkout, cwd=tmp_path)
     for cwd in (tmp_path, checkout):
-        run(python, "-c", IMPORT_ALL + MAKE_LAVA, cwd=cwd)
+        run(python, "-c", IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA, cwd=cwd)
