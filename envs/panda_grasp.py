@@ -204,7 +204,7 @@ class PandaGraspEnv(POMDPEnv):
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """
         if self.render_mode != "rgb_array":
-            raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a film")
+            raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a video")
         if self._time == 0:
             raise ValueError("there is no grasp to show before step()")
         _, _, to_z, to_w = self._film[0].mug_orientation

@@ -251,7 +251,7 @@ def work(
                 study.optimize(attempt, n_trials=1, callbacks=[say])
             elif n_running and (n_trials is None or n_done < n_trials):
                 if not is_waiting:
-                    report(f"waiting for {n_running} trials of other workers; those of dead workers will be run again")
+                    report(f"waiting for {n_running} trials of other workers; trials of dead workers will be run again")
                 is_waiting = True
                 time.sleep(1.0)
             else:
