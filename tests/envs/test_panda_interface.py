@@ -253,7 +253,7 @@ def test_every_episode_of_a_batch_is_rendered_by_its_own_state():
 
 def test_what_cannot_be_shown_is_said(env):
     assert env.render() is None
-    with pytest.raises(ValueError, match="render_mode=None must be 'rgb_array' for a film"):
+    with pytest.raises(ValueError, match="render_mode=None must be 'rgb_array' for a video"):
         next(env.film())
     drawing = PandaGraspEnv(render_mode="rgb_array")
     with pytest.raises(ValueError, match="before the first reset"):
