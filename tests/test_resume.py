@@ -154,7 +154,7 @@ def test_a_checkpoint_of_other_environments_is_refused_with_the_mend(tmp_path):
     path = tmp_path / "c.zip"
     train(make_model("lava_in_dummy_vec_env", "mine"), 100, path)
     model = TDPG.load(path, env=make_vec_env("Lava-v0", n_envs=2), device="cpu")
-    with pytest.raises(ValueError, match=r"made with 4 environments, .* has 2: resume with as many"):
+    with pytest.raises(ValueError, match=r"made with 4 environments, .* has 2: resume with the same number"):
         model.learn(100, reset_num_timesteps=False)
 
 

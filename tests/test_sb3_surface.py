@@ -47,7 +47,7 @@ def test_the_learning_rate_follows_its_schedule_and_leaves_the_critics_alone():
     assert rates[0] == pytest.approx(1e-2)
     assert np.diff(rates[1:]).max() < 0
     assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(1e-4)
-    assert model.estimator.optimizer.learning_rate == 1e-3
+    assert model.estimator.learning_rate == 1e-3
 
 
 def test_policy_kwargs_reach_the_policy():
@@ -302,7 +302,7 @@ def test_an_estimator_of_ones_own_is_given_as_a_class_and_saved(tmp_path):
 def test_mi_kwargs_reach_the_estimator():
     model = tiny_tdpg(mi_estimator="mine", mi_kwargs={**TINY_CRITIC, "ema_decay": 0.5, "learning_rate": 0.02})
     assert model.estimator.ema_decay == 0.5
-    assert model.estimator.optimizer.learning_rate == 0.02
+    assert model.estimator.learning_rate == 0.02
 
 
 def test_a_foreign_environment_may_be_given_bare():

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import pandas as pd
-from pandas.api.types import is_bool_dtype, is_numeric_dtype
-
 _MARKS = dict(l="---", r="---:", c=":---:")
 
 
@@ -23,6 +20,10 @@ def markdown_table(
     :param align: ``"l"``, ``"r"`` or ``"c"`` for each column; the last letter holds for the remaining columns.
         Default: numbers are right-aligned, everything else is left-aligned.
     """
+    # Here, since the import takes most of a second and a training writes no table.
+    import pandas as pd
+    from pandas.api.types import is_bool_dtype, is_numeric_dtype
+
     frame = pd.DataFrame(rows, columns=None if columns is None else list(columns))
     if align is None:
         align = "".join("r" if is_numeric_dtype(t) and not is_bool_dtype(t) else "l" for t in frame.dtypes)

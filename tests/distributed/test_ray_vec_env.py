@@ -272,6 +272,7 @@ def test_a_training_gives_the_log_that_it_gives_with_subproc_vec_env(env_id, alg
     assert_same_parameters(*policies)
 
 
+@pytest.mark.slow
 def test_the_block_of_the_guide_trains():
     guide = (REPOSITORY / "docs" / "guide" / "zoo.md").read_text()
     (code,) = re.findall(r"<!-- no-run -->\n```python\n(from stable.*?)^```", guide, re.MULTILINE | re.DOTALL)
@@ -354,6 +355,7 @@ def killing_at(*steps):
     return AtEveryStep(strike)
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_after_an_actor_was_restarted(make):
     model = lava_model(make([Lava] * 2, max_restarts=1))
     with pytest.warns(UserWarning, match="Ray has restarted actor 1 of 2"):
@@ -361,6 +363,7 @@ def test_a_training_goes_on_after_an_actor_was_restarted(make):
     assert model.epoch == 4
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_from_its_checkpoint_after_a_dead_actor_was_reported(make, tmp_path):
     path = tmp_path / "checkpoint.zip"
     undisturbed = lava_model(make([Lava] * 2))

@@ -273,6 +273,7 @@ def leaked(n):
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
 
 
+@pytest.mark.slow
 def test_hundreds_of_trials_leak_neither_memory_nor_bodies():
     assert leaked(300) < 3_000
 

@@ -209,7 +209,7 @@ def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the
 
 def test_a_callback_is_refused_where_an_epoch_has_too_few_episodes_for_an_interval():
     model = tiny_tdpg(PROBLEM, n_episodes=min_episodes(2) - 1)
-    with pytest.raises(ValueError, match=r"n_episodes=19 are too few.* at least 20"):
+    with pytest.raises(ValueError, match=r"n_episodes=19 is too small.* at least 20"):
         train_epochs(model, 1, callback=InformationCallback())
 
 

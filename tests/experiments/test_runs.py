@@ -176,6 +176,7 @@ def test_a_run_killed_between_training_and_evaluation_does_not_train_again(tmp_p
     assert not (tmp_path / "attempt0").exists()
 
 
+@pytest.mark.slow
 def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     # In this process: the workers would not see the small epochs of this module.

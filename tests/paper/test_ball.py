@@ -33,6 +33,7 @@ def tiny(monkeypatch):
         (common, "paired_difference"),
     ):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
+    monkeypatch.setattr(ball, "trv_knowledge", partial(ball.trv_knowledge, n_walls=4))
     asked = []
 
     def complete_runs(tasks, *, n_eval_episodes, jobs):
@@ -72,6 +73,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     assert (records["cost"] <= 100 * records["distance"] + 25 * 0.2 + 0.1).all()
 
 
+@pytest.mark.slow
 def test_the_ablations_may_be_added_later(tmp_path, tiny):
     arguments = dict(n_seeds=1, n_eval_episodes=2, n_timesteps=100)
     summary = ball.reproduce_ball(tmp_path, controls=False, **arguments)
@@ -94,6 +96,7 @@ def test_a_second_stage_starts_from_the_policy_of_the_first(tmp_path, tiny):
     np.testing.assert_allclose(*costs)
 
 
+@pytest.mark.slow
 def test_the_varying_launch_has_a_reproduction_of_its_own(tmp_path, tiny, capsys):
     arguments = ["--n-seeds", "1", "--n-eval-episodes", "2", "--n-timesteps", "100"]
     assert main(["reproduce", "ball-varying", "--out", str(tmp_path), *arguments]) == 0

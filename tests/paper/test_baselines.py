@@ -61,6 +61,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(baselines, "complete_runs", complete_runs_here)
 
 
+@pytest.mark.slow
 def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
     out, published = tmp_path / "out", tmp_path / "docs"
     arguments = dict(n_seeds=2, n_ball_seeds=1, n_eval_episodes=2, n_timesteps=100, records=results)

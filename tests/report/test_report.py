@@ -145,6 +145,7 @@ def test_it_goes_on_where_it_stopped_and_gives_the_same(report, monkeypatch):
     assert {name: (out / name).read_bytes() for name in before} == before
 
 
+@pytest.mark.slow
 def test_the_estimates_of_the_information_show_their_progress(tmp_path, capsys):
     def report_of(folder, *models, progress_bar):
         robustness_report(
@@ -161,6 +162,7 @@ def test_the_estimates_of_the_information_show_their_progress(tmp_path, capsys):
     assert "estimate" not in report_of("none", free, progress_bar=True)
 
 
+@pytest.mark.slow
 def test_other_perturbations_may_be_asked_for_later(report):
     arguments, out = report
     n_rows = len(list((out / "rows").iterdir()))
@@ -171,6 +173,7 @@ def test_other_perturbations_may_be_asked_for_later(report):
     assert main(arguments) == 0  # for the other tests
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_episodes(report, tmp_path):
     arguments, out = report
     arguments = [*arguments[: arguments.index("--jobs")], "--jobs", "2", "--out", str(tmp_path / "two")]

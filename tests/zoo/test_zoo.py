@@ -99,6 +99,7 @@ def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     assert_same_training(here)
 
 
+@pytest.mark.slow
 def test_a_killed_training_with_normalised_observations_is_resumed_exactly(here):
     settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
     arguments = ["train", *LAVA, "-params", *settings, "-n", "20000", "--seed", "1"]
