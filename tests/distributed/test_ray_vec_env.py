@@ -403,7 +403,7 @@ def test_an_actor_that_does_not_answer_counts_as_dead(max_restarts, make, tmp_pa
             _, _, dones, infos = env.step(action)
         assert dones[0]
         assert infos[0]["episode_lost"]
-        assert not env.step(action)[2][0]
+        assert "episode_lost" not in env.step(action)[3][0]  # the episode may end of itself, at random
 
 
 def test_files_of_monitor_are_not_overwritten_by_a_restarted_actor(make, tmp_path):
@@ -416,7 +416,7 @@ def test_files_of_monitor_are_not_overwritten_by_a_restarted_actor(make, tmp_pat
 
 
 def test_more_cpus_than_the_cluster_has_are_refused_after_a_while(make):
-    with pytest.raises(TimeoutError, match=r"1 of 1 actors did not start .*'num_cpus': 3.*'CPU': 2\.0, .*n_actors"):
+    with pytest.raises(TimeoutError, match=r"1 of 1 actors did not start .*'num_cpus': 3.*'CPU': 2\.0.*n_actors"):
         make(wanderers(), 1, actor_options=dict(num_cpus=3), start_timeout=1.0)
     assert make(wanderers(), 1).num_envs == N  # what was asked for is not still waited for
 

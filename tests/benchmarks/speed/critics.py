@@ -72,5 +72,5 @@ def bench_critics(sizes: Sizes) -> Iterable[Row]:
             fit_batched,
             fit_loop,
             sizes.repetitions,
-            goal=10,
+            goal=5,
         )

@@ -38,7 +38,7 @@ def bench_epoch(sizes: Sizes) -> Iterable[Row]:
         lambda: seconds(learn, sizes.epochs),
         lambda: seconds(lambda: loop.epoch(draw_randomness(model, rng))),
         sizes.loop_repetitions,
-        goal=100,
+        goal=150,
     )
 
 
