@@ -16,6 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.envs.lava import LavaEnv
 
+SLOW = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[1]
 SAVE_FREQ = 2
 # Seven epochs of 20 episodes on Lava, about as many on CartPole, of 8 episodes of varying length.
@@ -98,8 +99,14 @@ def stop_in_epoch(epoch):
     return AtEveryStep(stop)
 
 
-@pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("env", ENVIRONMENTS)
+@pytest.mark.parametrize(
+    ("env", "settings"),
+    [
+        pytest.param(env, settings, marks=SLOW if (env, settings) == ("cartpole", "passes under a cost limit") else ())
+        for env in ENVIRONMENTS
+        for settings in SETTINGS
+    ],
+)
 def test_a_training_that_stopped_anywhere_goes_on_bit_for_bit(env, settings, tmp_path):
     total, stop = TOTAL[env], stop_in_epoch(3)
     if SETTINGS[settings].get("seed", 0) is None:  # two models differ then: both go on from the same file
@@ -199,7 +206,10 @@ SCRIPT = """
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
-@pytest.mark.parametrize(("env", "where"), [("lava", "mid_rollout"), ("lava", "mid_save"), ("cartpole", "mid_rollout")])
+@pytest.mark.parametrize(
+    ("env", "where"),
+    [("lava", "mid_rollout"), ("lava", "mid_save"), pytest.param("cartpole", "mid_rollout", marks=SLOW)],
+)
 def test_a_process_killed_with_sigkill_leaves_a_whole_checkpoint_to_go_on_from(env, where, tmp_path):
     path = tmp_path / "killed.zip"
     script = textwrap.dedent(SCRIPT).format(

@@ -27,14 +27,17 @@ def process_pool(
     """
     Open a pool of worker processes, which start tasks in the order in which they are submitted.
 
-    Every worker is a fresh interpreter that computes with one thread. Workers ignore Ctrl-C; an exception in the
-    ``with`` block, such as ``KeyboardInterrupt``, stops all of them at once. They also end when this process is killed.
+    Every worker computes with one thread, in a process that has computed nothing before. Workers ignore Ctrl-C; an
+    exception in the ``with`` block, such as ``KeyboardInterrupt``, stops all of them at once. They also end when this
+    process is killed.
 
     :param n_processes: Number of workers.
     :param initializer: Called once in each worker before its first task.
     :param initargs: Arguments of the initializer.
     """
-    context = mp.get_context("spawn")
+    # All workers are forked from one process that has imported the package once and computed nothing.
+    context: Any = mp.get_context("forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn")
+    context.set_forkserver_preload(["sb3_tdpg"])
     # Only this process holds the writing end, so the workers see when it is closed, or when this process has died.
     reading, writing = context.Pipe(duplex=False)
     with ProcessPoolExecutor(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:

@@ -7,13 +7,12 @@ Dimension key: T time steps, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
 import torch as th
-from scipy.optimize import brentq
 from scipy.special import owens_t
 
 from sb3_tdpg.common.threads import threads
@@ -80,6 +79,13 @@ def normal_quantile(miss: float) -> float:
     return NormalDist().inv_cdf(1 - miss)
 
 
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    """Find where a function crosses zero."""
+    from scipy.optimize import brentq  # its import takes half a second
+
+    return brentq(function, low, high)
+
+
 def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
     Divide the probability to miss between two limits, given the gap between their bounds.
@@ -98,7 +104,7 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
         return normal.cdf(-c) + normal.cdf(-c - gap) - miss
 
     # With a wide gap, rounding can put the root just below its lower limit.
-    c = brentq(excess, least, normal_quantile(miss / 2) + 1e-9) if excess(least) > 0 else least
+    c = _root(excess, least, normal_quantile(miss / 2) + 1e-9) if excess(least) > 0 else least
     return normal.cdf(-c)
 
 
@@ -116,7 +122,7 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     def excess(c: float) -> float:
         return NormalDist().cdf(-c) + 2 * owens_t(c, slopes).sum() - miss
 
-    return brentq(excess, normal_quantile(miss) - 1e-9, normal_quantile(miss / (1 + len(slopes))) + 1e-9)
+    return _root(excess, normal_quantile(miss) - 1e-9, normal_quantile(miss / (1 + len(slopes))) + 1e-9)
 
 
 def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, float]:

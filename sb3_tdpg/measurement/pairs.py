@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from scipy.stats import rankdata
 from torch import nn
 
 from sb3_tdpg.common.threads import threads
@@ -141,6 +140,8 @@ def _check(x: npt.ArrayLike, z: npt.ArrayLike, n_folds: int) -> tuple[th.Tensor,
 
 def _ranks(x: th.Tensor) -> th.Tensor:
     """Return the relative rank of every value in its component, in (0, 1), with ties averaged: ``(..., N, D)``."""
+    from scipy.stats import rankdata  # its import takes a second
+
     return th.as_tensor((rankdata(x.numpy(), axis=-2) - 0.5) / x.shape[-2])
 
 

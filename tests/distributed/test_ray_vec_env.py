@@ -319,8 +319,9 @@ def test_a_restarted_actor_ends_its_lost_episodes_like_a_time_limit_and_starts_n
     for i in (1, 2):
         assert infos[i]["TimeLimit.truncated"]
         assert infos[i]["episode_lost"]
-        one = {key: value[i] for key, value in last_observations.items()} if kind == "dict" else last_observations[i]
-        assert_same(infos[i]["terminal_observation"], one)
+        terminal = infos[i]["terminal_observation"]
+        one = {key: last_observations[key][i] for key in terminal} if kind == "dict" else last_observations[i]
+        assert_same(terminal, one)
         begins_at = env.reset_infos[i]["begins_at"]
         np.testing.assert_array_equal((observations["walk"] if kind == "dict" else observations)[i], begins_at)
     # Nothing happens to the other actor, and the new episodes go on.

@@ -60,6 +60,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     assert set(records["cost"]) <= {0.0, 1.0}
 
 
+@pytest.mark.slow
 def test_a_varying_camera_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     arguments = ["--n-seeds", "2", "--n-eval-episodes", "3", "--n-timesteps", "8"]
     assert main(["reproduce", "grasp-camera", "--out", str(tmp_path), *arguments]) == 0

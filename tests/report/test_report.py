@@ -20,6 +20,7 @@ from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
+from sb3_tdpg.report import main as report_main
 from sb3_tdpg.report.models import label_of
 from sb3_tdpg.report.numbers import make_numbers
 from sb3_tdpg.report.rendering import to_html
@@ -30,6 +31,14 @@ pytest.importorskip("rliable")
 pytest.importorskip("markdown_it")
 
 N_EPISODES = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_information_episodes():
+    """Measuring the information takes long."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(report_main, "N_INFORMATION", 150)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -184,8 +193,8 @@ def test_processes_give_the_same_episodes(report, tmp_path):
 def test_all_methods_meet_the_same_episodes(tmp_path):
     model = tiny_tdpg()
     robustness_report(
-        {"A": model, "B": [model]}, "Lava-v0", out=tmp_path, perturbations=["vector_bias"], n_episodes=30,
-        progress_bar=False,
+        {"A": model, "B": [model]}, "Lava-v0", out=tmp_path, perturbations=["vector_bias"], severities=[1],
+        n_episodes=30, progress_bar=False,
     )  # fmt: skip
     records = pd.read_csv(tmp_path / "episodes.csv.xz").set_index(["model", "perturbation", "severity", "episode"])
     pd.testing.assert_series_equal(records.loc["A"]["cost"], records.loc["B"]["cost"])
@@ -194,7 +203,7 @@ def test_all_methods_meet_the_same_episodes(tmp_path):
 def test_one_model_is_not_taken_for_a_method(tmp_path):
     text = robustness_report(
         {"A": tiny_tdpg(), "B": tiny_tdpg(seed=1)}, "Lava-v0", out=tmp_path, perturbations=["vector_noise"],
-        n_episodes=30, scenarios=(), progress_bar=False,
+        severities=[3], n_episodes=30, scenarios=(), progress_bar=False,
     )  # fmt: skip
     assert "about this model" in text
     assert "give several" in text

@@ -194,6 +194,7 @@ def test_trials_that_fall_behind_are_pruned(here):  # noqa: F811
     assert len(states) == 8
 
 
+@pytest.mark.slow
 def test_two_workers_share_a_study(here):  # noqa: F811
     command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "6", "--storage", "study.log"]
     workers = [start(command, here) for _ in range(2)]
@@ -205,8 +206,17 @@ def test_two_workers_share_a_study(here):  # noqa: F811
     assert all("best of" in output for output in outputs)
 
 
-@pytest.mark.parametrize("sampler", ["random", "tpe"])
-@pytest.mark.parametrize("pruner", ["none", "halving", "median"])
+@pytest.mark.parametrize(
+    ("sampler", "pruner"),
+    [
+        ("random", "median"),
+        ("tpe", "halving"),
+        *(
+            pytest.param(sampler, pruner, marks=pytest.mark.slow)
+            for sampler, pruner in (("random", "none"), ("random", "halving"), ("tpe", "none"), ("tpe", "median"))
+        ),
+    ],
+)
 def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):  # noqa: F811
     """As the zoo's own tests try them."""
     arguments = ["--env", "CartPole-v1", "-n", "100", "-params", 'policy_kwargs:"dict(trv_dim=3)"', "n_envs:1"]

@@ -81,7 +81,7 @@ def test_our_environments_run_as_a_batch_for_any_algorithm(here, monkeypatch):
 
 
 def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
-    arguments = ["train", *LAVA, "-params", "n_episodes:20", "-n", "20000", "--seed", "1"]
+    arguments = ["train", *LAVA, "-params", "n_episodes:20", "-n", "8000", "--seed", "1"]
     process = start(arguments, here)
     wait_for(folder_of(here) / "checkpoint.zip", process)
     process.send_signal(signal.SIGINT)
