@@ -32,10 +32,10 @@ demo: $(STAMP) ## train TDPG and its baseline on the lava problem, compare them,
 
 # One thread per worker: the networks are small, and the workers already fill the cores.
 test: $(STAMP) ## run the tests but for the slow ones
-	OMP_NUM_THREADS=1 $(PY) -m pytest -m "not slow" -n $(JOBS)
+	OMP_NUM_THREADS=1 $(PY) -m pytest -m "not slow" -n $(JOBS) --dist loadfile
 
 test-slow: $(STAMP) ## run the slow tests
-	OMP_NUM_THREADS=1 $(PY) -m pytest -m slow -n $(JOBS)
+	OMP_NUM_THREADS=1 $(PY) -m pytest -m slow -n $(JOBS) --dist worksteal
 
 lint: $(STAMP) ## check style and format
 	$(PY) -m ruff check .

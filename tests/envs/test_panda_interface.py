@@ -77,10 +77,10 @@ def test_the_motion_decides_on_the_solver_s_iterations_unless_they_are_given(key
 
 def test_every_kind_of_vectorised_environment_gives_the_same_outcomes_and_details():
     kinds = {
-        "dummy": make_vec_env("PandaGrasp-v0", 4, seed=3, vec_env_cls=DummyVecEnv),
-        "subprocesses": make_vec_env("sb3_tdpg:PandaGrasp-v0", 4, seed=3, vec_env_cls=SubprocVecEnv),
-        "batch": BatchedVecEnv(PandaGraspEnv(), 4),
-        "pool": BatchedVecEnv(PandaGraspEnv(n_processes=2), 4),
+        "dummy": make_vec_env("PandaGrasp-v0", 2, seed=3, vec_env_cls=DummyVecEnv),
+        "subprocesses": make_vec_env("sb3_tdpg:PandaGrasp-v0", 2, seed=3, vec_env_cls=SubprocVecEnv),
+        "batch": BatchedVecEnv(PandaGraspEnv(), 2),
+        "pool": BatchedVecEnv(PandaGraspEnv(n_processes=2), 2),
     }
     first_images = {name: each.reset() for name, each in kinds.items()}
     states = np.array([info["state"] for info in kinds["dummy"].reset_infos])
@@ -147,7 +147,7 @@ def has_ended(process):
 
 def test_the_processes_do_not_end_by_ctrl_c_but_with_their_environment():
     for is_closed in (True, False):
-        made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 4)
+        made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 2)
         made.reset()
         processes = processes_of(made)
         assert processes
@@ -162,7 +162,7 @@ def test_the_processes_do_not_end_by_ctrl_c_but_with_their_environment():
 
 
 def test_a_process_that_dies_is_reported():
-    made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 4)
+    made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 2)
     made.reset()
     for process in processes_of(made):
         os.kill(process.pid, signal.SIGKILL)

@@ -44,9 +44,10 @@ def tiny(monkeypatch):
     return asked
 
 
-def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
+@pytest.mark.parametrize("n_seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_from_nothing_to_tables_figures_and_records(n_seeds, tmp_path, tiny):
     out, published = tmp_path / "out", tmp_path / "docs"
-    summary = ball.reproduce_ball(out, n_seeds=2, n_eval_episodes=2, n_timesteps=100, publish=published)
+    summary = ball.reproduce_ball(out, n_seeds=n_seeds, n_eval_episodes=2, n_timesteps=100, publish=published)
 
     assert (out / "summary.md").read_text() == summary
     assert {path.name for path in published.iterdir()} == {path.name for path in out.iterdir()} - {"runs"}
@@ -66,7 +67,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny):
     ):
         assert title in summary
     records = pd.read_csv(out / "episodes.csv.xz")
-    n_policies = 2 * len(ball.METHODS) + len(ball.PAPER_METHODS)
+    n_policies = n_seeds * len(ball.METHODS) + len(ball.PAPER_METHODS)
     assert len(records) == n_policies * (len(BALL_CATCH) + len(BALL_CATCH_DIAGNOSIS)) * 2
     # A terminal cost of 100 for each metre, and a little for driving.
     assert (records["cost"] >= 100 * records["distance"] - 0.1).all()
