@@ -127,10 +127,7 @@ def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENT
     return th.cat([x, x.square(), th.exp(-squared_distance / 2)], dim=-1)
 
 
-BASELINES: dict[str, AdvantageFunction] = {
-    "mean": episode_mean_advantages,
-    "value": value_advantages,
-}
+BASELINES: dict[str, AdvantageFunction] = {"mean": episode_mean_advantages, "value": value_advantages}
 
 
 def get_baseline(name: str) -> AdvantageFunction:

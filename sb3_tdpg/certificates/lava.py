@@ -15,8 +15,7 @@ from tqdm import tqdm
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
-from sb3_tdpg.common.provenance import provenance, write_frame_atomically, write_run_config
-from sb3_tdpg.common.summary import how_made
+from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario

@@ -1,12 +1,7 @@
 """Evaluation: scenario -> per-episode records -> table -> figure."""
 
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map, save_figure, training_curves
-from sb3_tdpg.evaluation.information import (
-    InformationReport,
-    information_report,
-    interval_frame,
-    state_knowledge,
-)
+from sb3_tdpg.evaluation.information import InformationReport, information_report, interval_frame, state_knowledge
 from sb3_tdpg.evaluation.records import Trajectories, evaluate_scenarios, rollout_states
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table

@@ -126,10 +126,10 @@ def short_name(row: str) -> str:
     return last if last[0].isdigit() else "0" if row == "Training" else row
 
 
-def legend_above(figure: Figure, axes: Axes) -> None:
-    """Draw the legend of the axes above the figure."""
+def legend_above(figure: Figure, axes: Axes, most: int = 3) -> None:
+    """Draw the legend of the axes above the figure, in at most as many columns."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = -(-len(labels) // -(-len(labels) // 3))  # as few rows as possible with up to three columns, evenly filled
+    columns = -(-len(labels) // -(-len(labels) // most))  # as few rows as possible, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 

@@ -24,8 +24,7 @@ import pandas as pd
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.processes import process_pool
-from sb3_tdpg.common.provenance import provenance, write_frame_atomically, write_run_config
-from sb3_tdpg.common.summary import how_made
+from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA, PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import save_figure

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.figures import INK, WIDTH, import_matplotlib, log_axis, new_figure, short_name, tidy
+from sb3_tdpg.evaluation.figures import (
+    INK,
+    WIDTH,
+    import_matplotlib,
+    legend_above,
+    log_axis,
+    new_figure,
+    short_name,
+    tidy,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,8 +76,7 @@ def tradeoff_figure(runs: pd.DataFrame, rows: Mapping[str, str], best: pd.Series
     where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(0, 3))
     style: dict[str, Any] = dict(ha="right", fontsize=8, color=LIMIT_COLOR)
     scatter.annotate(f"cost limit {cost_limit:g}", (0.99, cost_limit), **where, **style)
-    handles, names = scatter.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 8), frameon=False, fontsize=9)
+    legend_above(figure, scatter, 8)
     return figure
 
 

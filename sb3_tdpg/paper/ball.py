@@ -89,13 +89,7 @@ KNOWLEDGE = (
 
 
 def reproduce_ball(
-    out: Path,
-    *,
-    launch: str = "fixed",
-    controls: bool = True,
-    n_seeds: int = 5,
-    n_paper_seeds: int = 1,
-    **options: Any,
+    out: Path, *, launch: str = "fixed", controls: bool = True, n_seeds: int = 5, n_paper_seeds: int = 1, **options: Any
 ) -> str:
     """
     Train every method with several seeds, evaluate it on the rows of Table II; write tables, figures and records.

@@ -13,8 +13,7 @@ import pandas as pd
 
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
-from sb3_tdpg.common.provenance import provenance, write_frame_atomically, write_run_config
-from sb3_tdpg.common.summary import how_made
+from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
 from sb3_tdpg.experiments.runs import Run, Task

@@ -55,13 +55,7 @@ COMPARISON = (
 )
 
 
-def reproduce_grasp(
-    out: Path,
-    *,
-    camera: str = "fixed",
-    n_seeds: int = 5,
-    **options: Any,
-) -> str:
+def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **options: Any) -> str:
     """
     Train every method with several seeds, evaluate it on every row; write tables, figures and records.
 

@@ -124,13 +124,7 @@ def paper_runs(n_seeds: int) -> list[Run]:
     return runs
 
 
-def reproduce_lava(
-    out: Path,
-    *,
-    n_seeds: int = 10,
-    n_paper_seeds: int = 3,
-    **options: Any,
-) -> str:
+def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **options: Any) -> str:
     """
     Train every method with both cost definitions and many seeds, and the paper's own settings; write tables, figures
     and records.

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from gymnasium import spaces
 
-from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, log_axis, new_figure, tidy
+from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, legend_above, log_axis, new_figure, tidy
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.numbers import CLEAR, Numbers
@@ -46,7 +46,7 @@ def degradation_curves(numbers: Numbers) -> Figure:
     _log_if_wide(panels[0, 0], levels, "y")
     figure.supxlabel("severity (0: unperturbed)", fontsize=9)
     figure.supylabel("episode cost", fontsize=9)
-    _legend(figure, panels[0, 0])
+    legend_above(figure, panels[0, 0], 4)
     return figure
 
 
@@ -57,7 +57,7 @@ def own_rows_figure(numbers: Numbers) -> Figure:
     axes.grid(alpha=0.25, axis="x")
     _log_if_wide(axes, shown, "x")
     axes.set_xlabel("episode cost", fontsize=9)
-    _legend(figure, axes)
+    legend_above(figure, axes, 4)
     return figure
 
 
@@ -71,7 +71,7 @@ def comparison_figure(numbers: Numbers) -> Figure:
     axes.set_xlim(-0.02, 1.02)
     text = f"probability of a lower cost than {numbers.models[0]} (dashed: {1 - CLEAR:.2g} and {CLEAR:.2g})"
     axes.set_xlabel(text, fontsize=9)
-    _legend(figure, axes)
+    legend_above(figure, axes, 4)
     return figure
 
 
@@ -119,7 +119,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
         tidy(axes)
     figure.supxlabel("time step $t$", fontsize=9)
     figure.supylabel(f"component {component} of the observation", fontsize=9)
-    _legend(figure, panels[0, 0], n_columns=6)
+    legend_above(figure, panels[0, 0], 6)
     return figure
 
 
@@ -159,8 +159,3 @@ def _log_if_wide(axes: Axes, frame: pd.DataFrame, which: str) -> None:
     low, high = frame[["low", "iqm"]].min().min(), frame["iqm"].max()
     if low > 0 and high > 10 * low:
         log_axis(axes, which, subs=(1, 3) if high < 300 * low else (1,))
-
-
-def _legend(figure: Figure, axes: Axes, n_columns: int = 4) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=n_columns, frameon=False, fontsize=9)

@@ -13,15 +13,14 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_tdpg.common.files import write_atomically
-from sb3_tdpg.common.provenance import check_same_config, provenance, write_frame_atomically, write_run_config
-from sb3_tdpg.common.summary import how_made
+from sb3_tdpg.common.provenance import check_same_config, how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import InformationReport, information_report, save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
 from sb3_tdpg.report.figures import comparison_figure, degradation_curves, own_rows_figure, vector_examples
-from sb3_tdpg.report.models import Source, check_registered, fingerprint, load_all
+from sb3_tdpg.report.models import Source, fingerprint, load_all
 from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, write_page
 from sb3_tdpg.report.records import Models, Plan, complete_rows
@@ -83,7 +82,6 @@ def robustness_report(
     out = Path(out)
     perturbations = [perturbations] if isinstance(perturbations, str) else perturbations
     sources = _sources(models)
-    check_registered(env_id)
     kwargs = default_env_kwargs(env_id, env_kwargs)
     for name, value, least in (("n_episodes", n_episodes, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
         if value is not None and (not isinstance(value, (int, np.integer)) or value < least):

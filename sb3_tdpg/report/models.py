@@ -14,7 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.vec_env import make_episodes_env
@@ -157,16 +156,3 @@ def fingerprint(model: Any) -> str:
     if (normalize := model.get_vec_normalize_env()) is not None and normalize.norm_obs:
         digest.update(normalize.obs_rms.mean.tobytes() + normalize.obs_rms.var.tobytes())
     return digest.hexdigest()[:12]
-
-
-def check_registered(env_id: str) -> None:
-    """Raise a ``ValueError`` if an id is not registered; it may have the ``module:id`` form."""
-    if not isinstance(env_id, str):
-        raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
-    module, _, bare_id = env_id.rpartition(":")
-    try:
-        if module:
-            import_module(module)
-        gym.spec(bare_id)
-    except (gym.error.Error, ImportError) as e:
-        raise ValueError(f"env={env_id!r} is not registered: {e}") from e

@@ -25,11 +25,7 @@ N_STEPS = 8  # before the image is taken
 
 
 def perturbation_gallery(
-    env: VecEnv | str,
-    names: Sequence[str] | None = None,
-    *,
-    env_kwargs: Mapping[str, Any] | None = None,
-    seed: int = 0,
+    env: VecEnv | str, names: Sequence[str] | None = None, *, env_kwargs: Mapping[str, Any] | None = None, seed: int = 0
 ) -> Figure:
     """
     Draw one image under each perturbation (rows) in each severity (columns), beside the unperturbed image.

@@ -302,7 +302,7 @@ BAD = {
     "folder": (["."], {}, "holds no model.zip"),
     "no model": (["notes.zip"], {}, "notes.zip cannot be read"),
     "label": (["A="], {}, "LABEL=FILE"),
-    "environment": (["{pg}"], {"--env": "Larva-v0"}, "'Larva-v0' is not registered"),
+    "environment": (["{pg}"], {"--env": "Larva-v0"}, "Larva-v0 cannot be made .*Larva"),
     "spaces": (["{pg}"], {"--env": "Pendulum-v1"}, "does not fit.*the model's observation_space"),
     "keyword": (["{pg}"], {"--env-kwargs": "lava=3"}, "cannot be made"),
     "horizon": (["{pg}"], {"--env-kwargs": "horizon=7"}, "horizon of 5 steps, the environment has 7"),
