@@ -82,6 +82,8 @@ def robustness_report(
     out = Path(out)
     perturbations = [perturbations] if isinstance(perturbations, str) else perturbations
     sources = _sources(models)
+    if not isinstance(env_id, str):
+        raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
     kwargs = default_env_kwargs(env_id, env_kwargs)
     for name, value, least in (("n_episodes", n_episodes, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
         if value is not None and (not isinstance(value, (int, np.integer)) or value < least):

@@ -147,7 +147,7 @@ def has_ended(process):
 
 def test_the_processes_do_not_end_by_ctrl_c_but_with_their_environment():
     for is_closed in (True, False):
-        made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 2)
+        made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 4)
         made.reset()
         processes = processes_of(made)
         assert processes
@@ -162,7 +162,7 @@ def test_the_processes_do_not_end_by_ctrl_c_but_with_their_environment():
 
 
 def test_a_process_that_dies_is_reported():
-    made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 2)
+    made = BatchedVecEnv(PandaGraspEnv(n_processes=2), 4)
     made.reset()
     for process in processes_of(made):
         os.kill(process.pid, signal.SIGKILL)
