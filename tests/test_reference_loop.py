@@ -22,7 +22,7 @@ from gymnasium.utils import seeding
 from sb3_tdpg import TDPG
 from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
-from sb3_tdpg.networks import BatchedMLP, ELUGradient
+from sb3_tdpg.networks import BatchedMLP
 from tests.reference_loop import Episode, LoopTDPG, Minibatch, Randomness, mean_baseline, unbatch
 
 SEED = 7
@@ -94,17 +94,7 @@ def run_both(case: Case) -> Recorded:
     loop = LoopTDPG.copy_of(model)
     critic_inputs: list[th.Tensor] = []
     critic = model.estimator.critic
-    critic.register_forward_pre_hook(lambda _, args: critic_inputs.append(args[0].detach()))  # the estimates
-    make_by_hand = critic.gradient_by_hand
-
-    def recording() -> ELUGradient:
-        by_hand = make_by_hand()
-        forward = by_hand.forward
-        by_hand.forward = lambda x: (critic_inputs.append(x.detach()), forward(x))[1]  # the gradient steps
-        return by_hand
-
-    critic.gradient_by_hand = recording
-
+    critic.register_forward_pre_hook(lambda _, args: critic_inputs.append(args[0].detach()))
     _, callback = model._setup_learn(total_timesteps=10**6)
     th.manual_seed(SEED)
     assert model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)

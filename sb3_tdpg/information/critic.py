@@ -191,15 +191,11 @@ class CriticEstimator(InformationEstimator):
         n = min(self.batch_size, n_episodes // 2)
         # In a refit the rows are those of `steps`; otherwise `steps` selects rows.
         rows = slice(None) if len(steps) == n_rows else steps
-        by_hand = critic.gradient_by_hand() if self.activation_fn is nn.ELU else None
         for inputs in self._minibatches(batch, n, n_steps):
-            if by_hand is not None:
-                by_hand.backward(self._objective_gradient(by_hand.forward(inputs), n, rows, steps))
-            else:
-                optimizer.zero_grad(set_to_none=False)
-                with th.enable_grad():
-                    values = critic(inputs)
-                values.backward(self._objective_gradient(values.detach(), n, rows, steps))
+            optimizer.zero_grad(set_to_none=False)
+            with th.enable_grad():
+                values = critic(inputs)
+            values.backward(self._objective_gradient(values.detach(), n, rows, steps))
             optimizer.step()
 
     def _minibatches(self, batch: InformationBatch, n: int, n_steps: int) -> Iterator[th.Tensor]:

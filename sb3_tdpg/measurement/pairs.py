@@ -20,7 +20,7 @@ from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information import InfoNCE, InformationBatch, InformationEstimator, Nwj, get_estimator_class
 from sb3_tdpg.information.critic import CriticEstimator, Scores
 from sb3_tdpg.measurement.copula_start import NORMAL, Start, add_up, choose_start, degrees_of_freedom, t_scores
-from sb3_tdpg.networks import BatchedMLP, ELUGradient, flatten_parameters
+from sb3_tdpg.networks import BatchedMLP, flatten_parameters
 
 STEPS_PER_CHECK = 50
 MIN_VARIANCE = 1e-2  # of a direction, before it is scaled to variance 1
@@ -195,20 +195,6 @@ class StartedMLP(BatchedMLP):
         sums = add_up(self.table, pairs)
         n_inputs = sums.shape[-1] - self.start.table.shape[-1]
         return sums[..., :n_inputs], self.start.of_sums(sums[..., n_inputs:])
-
-    def gradient_by_hand(self) -> ELUGradient:
-        """Return a faster way than autograd to evaluate and differentiate this critic; see :class:`ELUGradient`."""
-        return _StartedGradient(self)
-
-
-class _StartedGradient(ELUGradient):
-    def __init__(self, critic: StartedMLP) -> None:
-        super().__init__(critic)
-        self._prepare = critic.prepare
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        inputs, start = self._prepare(x)
-        return start + super().forward(inputs)
 
 
 def _cross_fit(

@@ -18,7 +18,7 @@ from information_problems import (
     half_dead,
     random_batch,
 )
-from small_problems import TINY_CRITIC, parameters
+from small_problems import TINY_CRITIC
 
 from sb3_tdpg.information import (
     ESTIMATORS,
@@ -186,24 +186,6 @@ def test_smile_clips_the_scores_of_the_marginal_samples_and_no_others():
     scores = Scores(th.tensor([[7.0, -7.0, 9.0]]), th.tensor([[[5.0], [-5.0], [1.0]]]))
     expected = 3.0 - math.log((math.exp(2) + math.exp(-2) + math.exp(1)) / 3)
     assert estimator._bound(scores).item() == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize("alive", [False, True], ids=["all_alive", "some_dead"])
-@pytest.mark.parametrize("name", CRITICS)
-def test_the_critics_gradient_by_hand_is_that_of_autograd(name, alive):
-    class SameELU(th.nn.ELU):
-        """Not nn.ELU itself, so that the short cut for it is not taken."""
-
-    batch = random_batch(alive=half_dead() if alive else None)
-    fitted = []
-    for activation_fn in (th.nn.ELU, SameELU):
-        th.manual_seed(0)
-        estimator = build(name, 4, 2, 2, **{**TINY_CRITIC, "hidden_sizes": (8, 6)}, activation_fn=activation_fn)
-        estimator.fit(batch)
-        fitted.append(parameters(estimator.critic))
-    for key, value in fitted[0].items():
-        if (name, key) != ("infonce", "layers.2.bias"):  # a constant that cancels: Adam makes steps of rounding errors
-            th.testing.assert_close(value, fitted[1][key], rtol=1e-4, atol=1e-5)
 
 
 # -- gradients ------------------------------------------------------------------------------------------------

@@ -173,26 +173,6 @@ def test_the_start_is_the_log_density_ratio_of_a_multivariate_t():
     np.testing.assert_allclose(start(shifted)[0, :, 0], 0.5 + expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_networks_gradient_by_hand_is_that_of_autograd():
-    n_rows, n = 2, 30
-    generator = th.Generator().manual_seed(0)
-    critic = StartedMLP(n_rows, (6, 8, 8, 1))
-    critic.table = th.randn(2 * n_rows * n, 6 + 4, generator=generator)
-    critic.start = Start(critic.table[:, 6:], th.ones(n_rows, 1, 1))
-    first = n * (th.arange(n_rows)[:, None, None] + th.tensor([0, n_rows]))  # place of each row's x, and of its z
-    pairs = first + th.randint(n, (n_rows, 50, 2), generator=generator)
-    weights = th.randn(n_rows, 50, 1, generator=generator)
-    values = critic(pairs)
-    expected = th.autograd.grad((weights * values).sum(), list(critic.parameters()))
-    for parameter in critic.parameters():
-        parameter.grad = th.full_like(parameter, th.nan)
-    with th.no_grad():
-        by_hand = critic.gradient_by_hand()
-        th.testing.assert_close(by_hand.forward(pairs), values)
-        by_hand.backward(weights)
-    th.testing.assert_close([parameter.grad for parameter in critic.parameters()], list(expected))
-
-
 def test_the_averaged_critic_follows_the_trained_one():
     critic = StartedMLP(1, (1, 1))
     weights = flatten_parameters(critic)

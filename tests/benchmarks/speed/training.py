@@ -8,15 +8,10 @@ from typing import Any
 import numpy as np
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from torch import nn
 
 from sb3_tdpg import TDPG, make_episodes_env
 from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
 from tests.reference_loop import LoopTDPG, draw_randomness
-
-
-class AutogradELU(nn.ELU):
-    """An ELU that the gradient by hand does not know."""
 
 
 def make_tdpg(n_episodes: int, *, beta: float = 1 / 75, **kwargs: Any) -> TDPG:
@@ -73,14 +68,3 @@ def bench_training(sizes: Sizes) -> Iterable[Row]:
             sizes.repetitions,
             goal=3,
         )
-    by_hand, autograd = (
-        learner(make_tdpg(n, mi_kwargs=dict(activation_fn=activation)), sizes.epochs, n * 5)
-        for activation in (nn.ELU, AutogradELU)
-    )
-    yield compare(
-        f"training on Lava, N={n}, MINE: gradient of the critics by hand against autograd",
-        lambda: seconds(by_hand, sizes.epochs),
-        lambda: seconds(autograd, sizes.epochs),
-        sizes.repetitions,
-        goal=1.25,
-    )
