@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
+from sb3_tdpg.features import flat_action_space
 from sb3_tdpg.information import InformationBatch
 
 
@@ -47,14 +49,22 @@ class EpisodeBuffer(RolloutBuffer):
 
     :param state_dim: X
     :param trv_dim: Z
-    :param args: See :class:`~stable_baselines3.common.buffers.RolloutBuffer`.
-    :param kwargs: Likewise.
+    :param kwargs: See :class:`~stable_baselines3.common.buffers.RolloutBuffer`.
     """
 
-    def __init__(self, *args: Any, state_dim: int, trv_dim: int, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        *,
+        state_dim: int,
+        trv_dim: int,
+        **kwargs: Any,
+    ) -> None:
         self.state_dim = state_dim
         self.trv_dim = trv_dim
-        super().__init__(*args, **kwargs)
+        super().__init__(buffer_size, observation_space, flat_action_space(action_space), **kwargs)
 
     def reset(self) -> None:
         """Clear the buffer."""

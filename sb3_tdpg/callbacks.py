@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple, cast
 
@@ -43,6 +44,15 @@ class MINECallback(TDPGCallback):
     ``model.information``; a MINECallback in the user's list replaces it. Without a penalty (``beta = inf``) it does
     nothing: plain policy gradient trains no critic.
     """
+
+    def _on_training_start(self) -> None:
+        estimator, n = self.tdpg.estimator, self.tdpg.n_episodes
+        if self.tdpg.needs_information and n < (needed := estimator.recommended_episodes):
+            warnings.warn(
+                f"n_episodes={n} are too few for {type(estimator).__name__}, which reports information where there is "
+                f"none: give n_episodes={needed} or more (mi_estimator='logdet' needs the fewest)",
+                stacklevel=2,
+            )
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg

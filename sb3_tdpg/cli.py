@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import pkgutil
 import sys
@@ -43,9 +44,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(out: Path, **options: Any) -> None:
+    from sb3_tdpg.common.files import kept_by_this_process
     from sb3_tdpg.paper.lava import demo
 
-    print(f"\n{demo(out, **options)}\n\nresults are in {out}")
+    with kept_by_this_process(out):
+        print(f"\n{demo(out, **options)}\n\nresults are in {out}")
 
 
 class Experiment(NamedTuple):
@@ -77,8 +80,11 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
             flag = "--no-controls" if name == "controls" else f"--{name.replace('_', '-')}"
             others = " and ".join(other for other in EXPERIMENTS if name in EXPERIMENTS[other].flags)
             raise ValueError(f"{flag} is for {others}, not for {experiment}")
+    from sb3_tdpg.common.files import kept_by_this_process
+
     out = out or Path("results", chosen.folder)
-    text = pkgutil.resolve_name(f"sb3_tdpg.paper.{chosen.function}")(out, **chosen.arguments, **given)
+    with kept_by_this_process(out):
+        text = pkgutil.resolve_name(f"sb3_tdpg.paper.{chosen.function}")(out, **chosen.arguments, **given)
     print(f"\n{text}\n\nresults are in {out}")
 
 
@@ -98,16 +104,20 @@ def _zoo(program: str, arguments: Sequence[str]) -> None:
 
 
 def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> None:
+    from sb3_tdpg.common.files import kept_by_this_process
     from sb3_tdpg.evaluation.enjoy import parse_keywords
     from sb3_tdpg.experiments.sweep import sweep
 
     out = options.pop("out") or Path("results", f"sweep-{options['block'] or env}")
-    text = sweep(env, n_seeds=seeds, settings=parse_keywords(settings), out=out, **options)
+    # With a storage, several workers share the folder.
+    with kept_by_this_process(out) if options["storage"] is None else contextlib.nullcontext():
+        text = sweep(env, n_seeds=seeds, settings=parse_keywords(settings), out=out, **options)
     print(f"\n{text}\n\nresults are in {out}")
 
 
 def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, **options: Any) -> None:
     from sb3_tdpg.certificates.lava import certify_lava
+    from sb3_tdpg.common.files import kept_by_this_process
     from sb3_tdpg.evaluation.enjoy import parse_keywords
 
     if env.rpartition(":")[2] != "Lava-v0":
@@ -115,17 +125,21 @@ def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: P
             f"certify has declared shifts for Lava-v0 only, not for {env}: declare your own in Python, see "
             "sb3_tdpg.certificates.shifts.TrainingEpisodes"
         )
-    print(f"\n{certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)}\n\nresults are in {out}")
+    with kept_by_this_process(out):
+        text = certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)
+    print(f"\n{text}\n\nresults are in {out}")
 
 
 def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:
+    from sb3_tdpg.common.files import kept_by_this_process
     from sb3_tdpg.common.processes import usable_cores
     from sb3_tdpg.evaluation.enjoy import parse_keywords
     from sb3_tdpg.report import parse_models, robustness_report
 
     out = out or Path("results", f"report-{env.rpartition(':')[2]}")
     options["jobs"] = options["jobs"] or usable_cores()
-    robustness_report(parse_models(models, env), env, env_kwargs=parse_keywords(env_kwargs), out=out, **options)
+    with kept_by_this_process(out):
+        robustness_report(parse_models(models, env), env, env_kwargs=parse_keywords(env_kwargs), out=out, **options)
     print(f"the report is {out / 'report.html'} (Markdown: {out / 'report.md'})")
 
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 import io
 import os
 import sys
+import warnings
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -30,7 +31,7 @@ from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.information import InformationEstimator
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import Problem, read_problem
+from sb3_tdpg.problem import Problem, check_numbers, named_shapes, read_problem
 from sb3_tdpg.settings import nearest_multiples
 
 # Checkpoints that were saved before the module moved name its old path.
@@ -62,6 +63,15 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     """I[x_t; x~_t] of the last rollouts in nats, ``(T,)``; None without a penalty."""
     _random_state: RandomState | None = None
     _problem: Problem | None = None
+
+    def __init__(self, *args: Any, device: th.device | str = "auto", **kwargs: Any) -> None:
+        try:
+            is_cuda = device != "auto" and th.device(device).type == "cuda"
+        except RuntimeError as e:
+            raise ValueError(f"device={device!r} is unknown: use 'cpu', 'cuda', 'cuda:1' or 'auto'") from e
+        if is_cuda and not th.cuda.is_available():
+            warnings.warn(f"device={str(device)!r}, but torch finds no GPU: the model is on the CPU", stacklevel=3)
+        super().__init__(*args, device=device, **kwargs)  # type: ignore[misc]
 
     @property
     @abstractmethod
@@ -138,7 +148,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         rollout_buffer.reset()
         callback.on_rollout_start()
         if self._last_obs is None:
-            self._last_obs = env.reset()  # type: ignore[assignment]
+            with named_shapes(env):
+                self._last_obs = env.reset()  # type: ignore[assignment]
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
         n_envs = env.num_envs
@@ -151,13 +162,16 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         self._last_obs = None
 
         while (running := np.flatnonzero(column < self.n_episodes)).size > 0:
+            check_numbers("observation", obs, self.observation_space.shape, t)
+            check_numbers("state", states, (self.state_dim,), t)
             with th.no_grad():
                 step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(t, self.horizon - 1))
             actions = step.actions.cpu().numpy()
             env_actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
             if isinstance(self.action_space, spaces.Box):
                 env_actions = np.clip(env_actions, self.action_space.low, self.action_space.high)
-            new_obs, rewards, dones, infos = env.step(env_actions)
+            with named_shapes(env):
+                new_obs, rewards, dones, infos = env.step(env_actions)
 
             self.num_timesteps += n_envs
             callback.update_locals(locals())
@@ -233,7 +247,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             self.epoch = 0
             self._current_progress_remaining = 1.0
         random_state, self._random_state = self._random_state, None
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        with named_shapes(self.env):
+            result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if random_state is not None and not reset_num_timesteps:
             # Last, since the set-up draws, too. The first rollout then resets the environments once more.
             random_state.restore(self.env)
@@ -287,3 +302,14 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         # The estimator's state dict holds its optimiser, too.
         return ["policy", "policy.optimizer", "estimator"], []
+
+
+def check_policy(policy: Any, aliases: Collection[str]) -> None:
+    """Raise a ``ValueError`` unless the policy is TDPG's."""
+    if isinstance(policy, str) and policy not in aliases:
+        raise ValueError(f"policy={policy!r} is unknown: use one of {list(aliases)}")
+    if not isinstance(policy, str) and not (isinstance(policy, type) and issubclass(policy, TRVPolicy)):
+        raise ValueError(
+            f"policy={policy!r} is neither 'TRVPolicy' nor a subclass of TRVPolicy; if it comes from a file, another "
+            "algorithm saved it: load it with the class that saved it"
+        )

@@ -1,4 +1,4 @@
-"""The CNN in front of the encoder, and the kinds of observations that need it."""
+"""The kinds of observations and actions, and the CNN in front of the encoder."""
 
 from __future__ import annotations
 
@@ -30,6 +30,15 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
     if space is not None and is_image_space(space, check_channels=False, normalized_image=not normalize_images):
         return "image"
     return "vector"
+
+
+def flat_action_space(space: spaces.Space) -> spaces.Space:
+    """Flatten a ``MultiDiscrete`` or ``MultiBinary`` space of several dimensions; SB3 takes only one."""
+    if isinstance(space, spaces.MultiDiscrete):
+        return spaces.MultiDiscrete(space.nvec.flatten())
+    if isinstance(space, spaces.MultiBinary):
+        return spaces.MultiBinary(int(np.prod(space.shape)))
+    return space
 
 
 class TRVCnn(BaseFeaturesExtractor):

@@ -7,6 +7,7 @@ Dimension key: T horizon, N episodes or environments, Z TRVs, U action, F featur
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_tdpg.buffers import EpisodeBatch
-from sb3_tdpg.features import observation_kind
+from sb3_tdpg.features import flat_action_space, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
 from sb3_tdpg.settings import POLICY_DEFAULTS
 
@@ -86,6 +87,8 @@ class TRVPolicy(BasePolicy):
     :param use_sde: Must be False.
     """
 
+    _has_warned = False  # of deterministic=True
+
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -145,7 +148,7 @@ class TRVPolicy(BasePolicy):
 
         self.features_extractor = self.make_features_extractor()
         self.features_dim = self.features_extractor.features_dim
-        self.action_dist = make_proba_distribution(action_space)
+        self.action_dist = make_proba_distribution(flat_action_space(action_space))
         self.encoder = TimeMLP(
             horizon,
             [self.trv_dim + self.features_dim, *self.net_arch["encoder"], 2 * self.trv_dim],
@@ -166,15 +169,10 @@ class TRVPolicy(BasePolicy):
 
     def _n_action_parameters(self) -> int:
         """Return the number of outputs of the action head."""
-        space = self.action_space
-        if isinstance(space, spaces.Box):
-            return 2 * int(np.prod(space.shape))  # mean and log-variance
-        if isinstance(space, spaces.Discrete):
-            return int(space.n)
-        if isinstance(space, spaces.MultiDiscrete):
-            return int(space.nvec.sum())
-        assert isinstance(space, spaces.MultiBinary)
-        return int(np.prod(space.shape))
+        distribution: Any = self.action_dist
+        if isinstance(distribution, DiagGaussianDistribution):
+            return 2 * distribution.action_dim  # mean and log-variance
+        return int(np.sum(getattr(distribution, "action_dims", None) or distribution.action_dim))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -387,12 +385,25 @@ class TRVPolicy(BasePolicy):
         :param state: the memory that the last call returned; ``None`` at the start
         :param episode_start: ``(n_envs,)`` bool; clears the memory where True
         :param deterministic: Use means instead of samples. This removes the channel noise that the bottleneck acts
-            through, so it is not the policy that was trained; the paper's tables use ``False``.
+            through, so it is not the policy that was trained (the first such call warns); the paper's tables use
+            ``False``.
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
         """
         if isinstance(observation, dict):
             raise ValueError("the observation is a dict, but TRVPolicy takes arrays: flatten it (FlattenObservation)")
+        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+            raise ValueError(
+                "the observation is a tuple. You are probably mixing Gym API with SB3 VecEnv API: an environment's "
+                "reset() returns (obs, info), that of a VecEnv obs alone; pass obs"
+            )
+        if deterministic and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                "deterministic=True acts with means instead of samples, without the noise of the bottleneck: this is "
+                "not the policy that was trained. Give deterministic=False, also to evaluate_policy and EvalCallback",
+                stacklevel=3,
+            )
         self.set_training_mode(False)
         observation_tensor, is_vectorized = self.obs_to_tensor(observation)
         assert isinstance(observation_tensor, th.Tensor)
@@ -420,7 +431,7 @@ class TRVPolicy(BasePolicy):
         actions = step.actions.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
-        return (actions if is_vectorized else actions[0]), (step.trvs.cpu().numpy(), t + 1)
+        return (actions if is_vectorized else actions.squeeze(axis=0)), (step.trvs.cpu().numpy(), t + 1)
 
 
 def _default(value: float | None, default: float) -> float:

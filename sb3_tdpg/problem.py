@@ -6,6 +6,9 @@ Dimension key: E environments, X state.
 
 from __future__ import annotations
 
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +16,15 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdpg.features import observation_kind
+
 BRING_THE_STATE = (
     "give the environment an attribute `state_space` (a Box) and put a copy of the true state into "
     'info["state"] in both reset() and step()'
 )
+
+# The square of a larger number is not finite in float32.
+LARGEST = 1e18
 
 
 @dataclass(frozen=True)
@@ -78,9 +86,9 @@ def read_problem(env: VecEnv) -> Problem:
     state_space = _attribute(env, "state_space")
     is_observation = state_space is None
     shape = env.observation_space.shape if is_observation else state_space.shape
-    if shape is None or (is_observation and len(shape) > 1):
+    if shape is None or (is_observation and observation_kind(env.observation_space) != "vector"):
         raise ValueError(
-            f"the mutual information needs the true state, and an observation of shape {shape} cannot stand in for it: "
+            f"the mutual information needs the true state, and an image of shape {shape} cannot stand in for it: "
             f"{BRING_THE_STATE}"
         )
     state_dim = int(np.prod(shape))
@@ -109,3 +117,46 @@ def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
 def _attribute(env: VecEnv, name: str) -> Any:
     """Return an attribute of the first environment, or None."""
     return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
+
+
+def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, t: np.ndarray) -> None:
+    """
+    Check what the environments returned, before it reaches a network.
+
+    :param what: "observation" or "state".
+    :param values: ``(E, *shape)``
+    :param shape: Expected shape of one.
+    :param t: time step of each environment, ``(E,)``
+    :raises ValueError: if the shape is another one, or a number is NaN, infinite or larger than 1e18.
+    """
+    if values.shape[1:] != shape:
+        raise ValueError(
+            f"the environments returned {what}s of shape {values.shape[1:]} at step {t.max()} of an episode, but their "
+            f"space has the shape {shape}: mend reset() and step(), or the space"
+        )
+    if np.issubdtype(values.dtype, np.floating) and not (good := np.abs(values) <= LARGEST).all():
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        env, component = index[0], list(index[1:])
+        raise ValueError(
+            f"environment {env} returned the {what} {values[index]:g} in component {component} at step "
+            f"{t[env]} of its episode: it must be a finite number of at most {LARGEST:g}"
+        )
+
+
+@contextmanager
+def named_shapes(env: VecEnv) -> Iterator[None]:
+    """Turn NumPy's error for an observation of a wrong shape, raised in an SB3 ``VecEnv``, into one that names it."""
+    try:
+        yield
+    except ValueError as e:
+        frames = {frame.f_code.co_name: frame for frame, _ in traceback.walk_tb(e.__traceback__)}
+        frame = frames.get("_save_obs") or frames.get("_stack_obs")
+        if frame is None:
+            raise
+        index = frame.f_locals.get("env_idx")  # known in the DummyVecEnv only
+        who = "an environment" if index is None else f"environment {index}"
+        found = "" if index is None else f" {np.shape(frame.f_locals['obs'])}"
+        raise ValueError(
+            f"{who} returned an observation of a wrong shape{found} in reset() or step(): its observation_space "
+            f"has the shape {env.observation_space.shape}"
+        ) from e

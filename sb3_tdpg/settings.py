@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ class Defaults(NamedTuple):
     """Arguments of :class:`~sb3_tdpg.tdpg.TDPG` that depend on the kind of observation, and the length of training."""
 
     beta: float | str
-    learning_rate: Schedule
+    learning_rate: str
     n_episodes: int
     n_epochs: int
     batch_size: int | None
@@ -40,7 +41,7 @@ class Defaults(NamedTuple):
 # One update per epoch, as in the paper; the falling learning rate improves the last epochs.
 VECTOR = Defaults(
     beta=1 / 75,
-    learning_rate=LinearSchedule(2e-3, 2e-5, 1.0),
+    learning_rate="lin_2e-3_2e-5",
     n_episodes=500,
     n_epochs=1,
     batch_size=None,
@@ -55,7 +56,7 @@ VECTOR = Defaults(
 # Images are expensive: PPO's passes over few episodes, and the gradient with the least variance.
 IMAGE = Defaults(
     beta="auto",
-    learning_rate=LinearSchedule(1e-3, 5e-5, 1.0),
+    learning_rate="lin_1e-3_5e-5",
     n_episodes=160,
     n_epochs=4,
     batch_size=80,
@@ -121,7 +122,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     :raises ValueError: for the first one that is out of range.
     """
     check_beta_argument(settings["beta"], settings["cost_limit"])
-    for rate in _values(settings["learning_rate"]):
+    for rate in _values(rate_schedule(settings["learning_rate"])):
         check_learning_rate(rate)
     get_estimator_class(settings["mi_estimator"])
     get_baseline(settings["baseline"])
@@ -140,9 +141,10 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
             f"batch_size={batch_size} must be between 2 and n_episodes={n_episodes}: it counts episodes, "
             "because the memory of an episode cannot be cut"
         )
-    for clip_range in _values(settings["clip_range"]):
-        # A schedule may fall to 0; rl-zoo3 loads models for evaluation with one that is always 0.
-        lowest_is_allowed = callable(settings["clip_range"])
+    clip_ranges = _values(settings["clip_range"])
+    # A schedule may fall to 0; rl-zoo3 loads models for evaluation with one that is always 0.
+    lowest_is_allowed = callable(settings["clip_range"])
+    for clip_range in clip_ranges:
         is_number = isinstance(clip_range, (int, float, np.number))
         if not (is_number and (clip_range > 0 or (clip_range == 0 and lowest_is_allowed))):
             raise ValueError(
@@ -150,7 +152,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
                 "returns one; float('inf') turns the clipping off"
             )
     n_updates = settings["n_epochs"] * (1 if batch_size is None else math.ceil(n_episodes / batch_size))
-    if n_updates > 1 and not callable(settings["clip_range"]) and math.isinf(settings["clip_range"]):
+    if n_updates > 1 and math.isinf(clip_ranges[0]):
         raise ValueError(
             f"n_epochs={settings['n_epochs']} and batch_size={batch_size} make {n_updates} updates on the same "
             "rollouts, which needs clipping: give clip_range=0.2, as in PPO, or make one update"
@@ -164,6 +166,23 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
         raise ValueError(f"gae_lambda={settings['gae_lambda']} must be in [0, 1]; 1 leaves the gradient unbiased")
     if not settings["max_grad_norm"] > 0:
         raise ValueError(f"max_grad_norm={settings['max_grad_norm']} must be positive, or None for no clipping")
+
+
+def rate_schedule(rate: Any) -> Schedule | Any:
+    """Return the schedule that a text such as ``"lin_1e-3"`` (to 0) or ``"lin_1e-3_1e-5"`` stands for, or the rate."""
+    if not isinstance(rate, str):
+        return rate
+    kind, *ends = rate.split("_")
+    try:
+        start, end = map(float, (*ends, "0")[:2])
+    except ValueError:
+        start = end = math.nan
+    if kind != "lin" or len(ends) > 2 or not math.isfinite(start + end):
+        raise ValueError(
+            f"learning_rate={rate!r} must be a number, a function, or a text such as 'lin_1e-3' (falls to 0) or "
+            "'lin_1e-3_1e-5' (in YAML write the number 1.0e-3: YAML reads 1e-3 as text)"
+        )
+    return LinearSchedule(start, end, 1.0)
 
 
 def _values(number_or_schedule: Any) -> list[Any]:
@@ -234,3 +253,11 @@ def nearest_multiples(n: int, divisor: int) -> str:
     """Name the multiples of ``divisor`` next to ``n``."""
     below = n // divisor * divisor
     return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"
+
+
+def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
+    """Call with keywords of the user, or raise a ``ValueError`` that names their argument."""
+    try:
+        return make(**kwargs)
+    except TypeError as e:
+        raise ValueError(f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}: {e}") from e

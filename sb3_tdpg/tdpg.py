@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -25,11 +26,20 @@ from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError
+from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import RebuiltTRVs, TRVPolicy
 from sb3_tdpg.problem import reward_threshold
-from sb3_tdpg.settings import check_action_space, check_arguments, check_beta, check_count, defaults_for, fill_in
+from sb3_tdpg.settings import (
+    check_action_space,
+    check_arguments,
+    check_beta,
+    check_count,
+    defaults_for,
+    fill_in,
+    rate_schedule,
+    with_keywords,
+)  # fmt: skip
 from sb3_tdpg.vec_env import make_episodes_env
 
 __all__ = ["TDPG", "TrainingDivergedError"]
@@ -63,8 +73,8 @@ class TDPG(EpisodicAlgorithm):
         (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
         (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: 1/75; ``"auto"`` for images or with a ``cost_limit``.
     :param cost_limit: Limit for ``beta="auto"``; default: minus the environment's registered ``reward_threshold``.
-    :param learning_rate: Learning rate of the policy, a number or a schedule; default: linear from 2e-3 to 2e-5; from
-        1e-3 to 5e-5. The critics have their own (``mi_kwargs``).
+    :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
+        linearly; default: ``"lin_2e-3_2e-5"``; ``"lin_1e-3_5e-5"``. The critics have their own (``mi_kwargs``).
     :param n_episodes: Episodes N of a policy epoch; default: 500; 160.
     :param n_envs: Number of environments to make from an id; default: see :func:`~sb3_tdpg.make_episodes_env`.
     :param mi_estimator: A name in :data:`sb3_tdpg.information.ESTIMATORS` or a subclass of
@@ -108,7 +118,7 @@ class TDPG(EpisodicAlgorithm):
         *,
         beta: float | Schedule | str | None = None,
         cost_limit: float | None = None,
-        learning_rate: float | Schedule | None = None,
+        learning_rate: float | Schedule | str | None = None,
         n_episodes: int | None = None,
         n_envs: int | None = None,
         mi_estimator: str | type[InformationEstimator] | None = None,
@@ -165,11 +175,11 @@ class TDPG(EpisodicAlgorithm):
             gae_lambda=gae_lambda,
             max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
         )
-        _check_policy(policy)
+        check_policy(policy, self.policy_aliases)
         check_arguments(settings)
         super().__init__(
-            policy=policy,  # type: ignore[arg-type]
-            env=env,  # type: ignore[arg-type]
+            policy=policy,
+            env=env,
             learning_rate=settings["learning_rate"],
             n_steps=0,  # set once the horizon is known
             gamma=gamma,
@@ -198,7 +208,7 @@ class TDPG(EpisodicAlgorithm):
         self.bptt_steps = bptt_steps
         self.n_epochs: int = settings["n_epochs"]
         self.batch_size: int | None = settings["batch_size"]
-        self.clip_range: float | Schedule = settings["clip_range"]
+        self.clip_range: Any = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.n_threads: int | None = settings["n_threads"]
         self.auto_weight: AutoWeight | None = None
@@ -211,17 +221,17 @@ class TDPG(EpisodicAlgorithm):
     def _setup_model(self) -> None:
         # load() sets attributes without the constructor: check them again.
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
-        _check_policy(self.policy_class)
+        check_policy(self.policy_class, self.policy_aliases)
         check_arguments(vars(self))
-        self._setup_lr_schedule()
+        self.lr_schedule = FloatSchedule(rate_schedule(self.learning_rate))
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._set_problem(self._check_problem(self.env), self.env)
         elif self.horizon == 0:
             raise ValueError("TDPG needs an environment to learn the horizon and the spaces from: pass env=...")
         self._setup_beta()
-        self.clip_range_schedule = FloatSchedule(self.clip_range)
-        policy = _with_keywords(
+        self.clip_range = FloatSchedule(self.clip_range)  # as in PPO
+        policy = with_keywords(
             "policy_kwargs",
             self.policy_kwargs,
             partial(
@@ -237,7 +247,7 @@ class TDPG(EpisodicAlgorithm):
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         estimator = partial(estimator_class, self.horizon, self.state_dim, self.policy.trv_dim)
-        self.estimator = _with_keywords("mi_kwargs", self.mi_kwargs, estimator).to(self.device)
+        self.estimator = with_keywords("mi_kwargs", self.mi_kwargs, estimator).to(self.device)
         self.rollout_buffer = EpisodeBuffer(
             self.horizon,
             self.observation_space,
@@ -298,7 +308,7 @@ class TDPG(EpisodicAlgorithm):
             self._check_finite("information", th.tensor(information))
             self.auto_weight.update(mean_cost, information)
         mi_coef = self.mi_coef
-        clip_range = self.clip_range_schedule(self._current_progress_remaining)
+        clip_range = self.clip_range(self._current_progress_remaining)
 
         advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
         cost_scale = th.ones(())  # what the advantages, and with them the penalty, are divided by
@@ -360,7 +370,6 @@ class TDPG(EpisodicAlgorithm):
         n_parts = 1 if self.batch_size is None else math.ceil(self.n_episodes / self.batch_size)
         if n_parts == 1:
             return [slice(None)]
-        # Nearly equal: a remainder of one episode would allow no estimate.
         return th.randperm(self.n_episodes, device=self.device).tensor_split(n_parts)
 
     # -- learn and load ---------------------------------------------------------------------------------------
@@ -423,28 +432,11 @@ class TDPG(EpisodicAlgorithm):
             kwargs.setdefault("cost_limit", None)
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except AssertionError as e:
-            if not str(e).startswith("No "):  # "No data found in the saved file", "No params found ..."
+        except (AssertionError, pickle.UnpicklingError) as e:
+            # "No data found in the saved file", "No params found ..."
+            if isinstance(e, AssertionError) and not str(e).startswith("No "):
                 raise
             raise ValueError(
-                f"{path} is not a model of TDPG: the file is damaged, or another program made it ({e})"
+                f"{path} is not a model of TDPG: the file is damaged, or another program made it "
+                f"({' '.join(str(e).split())[:200]})"
             ) from e
-
-
-def _with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
-    """Call with keywords of the user, or raise a ``ValueError`` that names their argument."""
-    try:
-        return make(**kwargs)
-    except TypeError as e:
-        raise ValueError(f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}: {e}") from e
-
-
-def _check_policy(policy: Any) -> None:
-    """Raise a ``ValueError`` unless the policy is TDPG's."""
-    if isinstance(policy, str) and policy not in TDPG.policy_aliases:
-        raise ValueError(f"policy={policy!r} is unknown: use one of {list(TDPG.policy_aliases)}")
-    if not isinstance(policy, str) and not (isinstance(policy, type) and issubclass(policy, TRVPolicy)):
-        raise ValueError(
-            f"policy={policy!r} is neither 'TRVPolicy' nor a subclass of TRVPolicy; if it comes from a file, another "
-            "algorithm saved it: load it with the class that saved it"
-        )

@@ -1,8 +1,10 @@
 """Bad input is refused before any training, with an error that says what to do."""
 
+import io
 import math
 import re
 import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -274,3 +276,35 @@ def test_a_policy_of_its_own_needs_a_horizon(horizon):
     space = spaces.Box(-1, 1, (2,), np.float32)
     with pytest.raises(ValueError, match=r"horizon.*at least 1"):
         TRVPolicy(space, space, lambda _: 1e-3, horizon=horizon)
+
+
+class Payload:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
+
+
+def test_a_payload_among_the_weights_is_refused_in_one_line(tmp_path):
+    model, marker = tmp_path / "model.zip", tmp_path / "marker"
+    tiny_tdpg().save(model)
+    changed = io.BytesIO()
+    th.save({"weight": Payload(marker)}, changed)
+    with zipfile.ZipFile(model) as old, zipfile.ZipFile(tmp_path / "bad.zip", "w") as new:
+        for name in old.namelist():
+            new.writestr(name, changed.getvalue() if name == "policy.pth" else old.read(name))
+    with pytest.raises(ValueError, match="is not a model of TDPG") as refused:
+        TDPG.load(tmp_path / "bad.zip")
+    assert len(str(refused.value).splitlines()) == 1
+    assert not marker.exists()
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_reported():
+    with pytest.warns(UserWarning, match="device='cuda', but torch finds no GPU: the model is on the CPU"):
+        assert tiny_tdpg(device="cuda").device.type == "cpu"
+    with pytest.raises(ValueError, match="device='foo' is unknown"):
+        tiny_tdpg(device="foo")

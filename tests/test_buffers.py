@@ -89,3 +89,11 @@ def test_the_information_batch_has_a_mask_only_if_an_episode_ended_early(buffer)
     assert mask.sum(0).tolist() == [3, 3, 3, 1]
     buffer.add_step(np.array([1, 2]), np.array([N - 1, N - 1]), **rows(2, 1.0))
     assert buffer.episode_batch().information_batch().alive is None
+
+
+def test_where_no_episode_runs_the_encoder_has_a_density(buffer):
+    buffer.add_step(0, slice(None), **rows(N, 7.0))
+    buffer.full = True
+    stds = buffer.episode_batch().stds
+    assert (stds[0] == 7).all()
+    assert (stds[1:] == 1).all()  # its logarithm is finite

@@ -1,9 +1,18 @@
 """The loss functions, by hand."""
 
+import math
+
 import pytest
 import torch as th
 
-from sb3_tdpg.losses import clipped_policy_loss, cost_to_go, information_loss, normalized, policy_gradient_loss
+from sb3_tdpg.losses import (
+    clipped_policy_loss,
+    cost_to_go,
+    information_loss,
+    normalized,
+    policy_distance,
+    policy_gradient_loss,
+)
 
 
 def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes():
@@ -99,3 +108,10 @@ def test_normalised_advantages_count_living_steps_only():
     assert living.mean().item() == pytest.approx(0, abs=1e-6)
     assert living.std(correction=0).item() == pytest.approx(1)
     assert std.item() == pytest.approx(th.tensor([1.0, 2.0, 6.0]).std(correction=0).item())
+
+
+def test_the_distance_of_two_policies_is_that_of_the_new_one_from_the_old():
+    log_ratio, alive = th.tensor([[1.0, -0.5, 0.0]]), th.tensor([[1.0, 1.0, 0.0]])
+    kl, clipped = policy_distance(log_ratio - 3.0, th.full((1, 3), -3.0), alive, 0.5)
+    assert kl.item() == pytest.approx(((math.e - 2) + (math.exp(-0.5) - 0.5)) / 2)
+    assert clipped.item() == 0.5  # e - 1 is beyond, 1 - e^-0.5 is not

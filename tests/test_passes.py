@@ -247,7 +247,7 @@ def with_threshold(env, threshold):
 def test_vectors_are_learnt_from_as_in_the_paper():
     model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
     assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, None)
-    assert (model.clip_range, model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "mine")
+    assert (model.clip_range(1.0), model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "mine")
     assert not model.normalize_advantage
     assert model.env.num_envs == 500
 
@@ -255,7 +255,7 @@ def test_vectors_are_learnt_from_as_in_the_paper():
 def test_images_are_learnt_from_with_ppos_passes_under_the_environments_threshold():
     model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
     assert (model.beta, model.cost_limit) == ("auto", 5.0)
-    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range) == (160, 4, 80, 0.2)
+    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 80, 0.2)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
     assert model.env.num_envs == 160
 
@@ -266,7 +266,7 @@ def test_every_default_may_be_overruled():
         "TRVPolicy", env, beta=0.5, n_episodes=8, n_epochs=1, clip_range=math.inf, normalize_advantage=False,
         encoder_gradient="score", mi_estimator="loo", device="cpu",
     )  # fmt: skip
-    assert (model.beta, model.n_epochs, model.batch_size, model.clip_range) == (0.5, 1, 8, math.inf)
+    assert (model.beta, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (0.5, 1, 8, math.inf)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("score", "loo", False)
     train_epochs(model, 1)
 
@@ -303,7 +303,17 @@ def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping
     model = TDPG("TRVPolicy", "PandaGrasp-v0", n_episodes=16, device="cpu").learn(2 * 16)
     assert model.epoch == 2
     assert (model.beta, model.cost_limit, model.mi_estimator) == ("auto", 0.03, "logdet")
-    assert (model.n_epochs, model.batch_size, model.clip_range, model.policy.trv_dim) == (4, 16, 0.2, 16)
+    assert (model.n_epochs, model.batch_size, model.clip_range(1.0), model.policy.trv_dim) == (4, 16, 0.2, 16)
     model.env.close()
     model = TDPG("TRVPolicy", "PandaGrasp-v0", device="cpu")
     assert (model.n_episodes, model.batch_size, model.env.num_envs) == (400, 200, 400)
+
+
+def test_the_weight_falls_at_most_by_twice_the_rate():
+    weight = AutoWeight(cost_limit=10.0)
+    weight.update(10.0, 1.0)
+    before = weight.value
+    weight.update(1e6, 1.0)
+    assert weight.value == pytest.approx(before * math.exp(-0.6))
+    weight.update(-1e6, 1.0)
+    assert weight.value == pytest.approx(before * math.exp(-0.6 + 0.3))

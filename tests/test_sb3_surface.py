@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from small_problems import (
     TINY_CRITIC,
     AtEveryEpoch,
     AtEveryStep,
     CountdownEnv,
+    ToyEnv,
     assert_same_parameters,
     lava_env,
     parameters,
@@ -20,7 +22,7 @@ from small_problems import (
 )
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import HParam, configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -354,3 +356,64 @@ def test_an_environment_that_leaves_out_its_state_is_refused_with_the_mend():
         e._info = dict
     with pytest.raises(ValueError, match=r'no info\["state"\]'):
         train_epochs(tiny_tdpg(env), 1)
+
+
+def test_the_recipe_for_hyperparameters_in_tensorboard_works_with_the_defaults(tmp_path):
+    """As in SB3's documentation."""
+    pytest.importorskip("tensorboard")
+    model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
+    logger = configure(str(tmp_path), ["tensorboard"])
+    values = {"learning rate": model.learning_rate, "gamma": model.gamma, "clip range": model.clip_range(1.0)}
+    logger.record("hparams", HParam(values, {"rollout/ep_rew_mean": 0.0}), exclude=("stdout", "log", "json", "csv"))
+    logger.dump(0)
+    assert [model.lr_schedule(progress) for progress in (1.0, 0.0)] == pytest.approx([2e-3, 2e-5])
+
+
+@pytest.mark.parametrize("mi_estimator", ["mine", "logdet", "vib"])
+def test_parameters_are_tensors(mi_estimator):
+    model = train_epochs(tiny_tdpg(mi_estimator=mi_estimator), 1)
+    found = model.get_parameters()
+    for name in ("policy", "estimator"):
+        assert all(isinstance(value, th.Tensor) for value in found[name].values())
+    other = tiny_tdpg(mi_estimator=mi_estimator, seed=1)
+    other.set_parameters(found)
+    assert_same_parameters(parameters(model.estimator), parameters(other.estimator))
+
+
+def test_the_first_deterministic_evaluation_warns_that_it_is_another_policy():
+    model = tiny_tdpg()
+    with pytest.warns(UserWarning, match=r"deterministic=True .* not the policy that was trained") as warned:
+        for _ in range(2):
+            evaluate_policy(model, make_episodes_env("Lava-v0", 2), n_eval_episodes=2)
+    assert len([w for w in warned if "deterministic=True" in str(w.message)]) == 1
+
+
+@pytest.mark.parametrize("action_space", [
+    spaces.Discrete(3), spaces.Box(-1, 1, (), np.float32), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2),
+], ids=str)  # fmt: skip
+def test_a_single_action_is_an_array_as_in_sb3(action_space):
+    model = tiny_tdpg(DummyVecEnv([lambda: ToyEnv(action_space=action_space)]))
+    action, _ = model.predict(model.observation_space.sample())
+    assert isinstance(action, np.ndarray)
+    assert action.shape == action_space.shape
+
+
+def test_the_tuple_that_a_gymnasium_reset_returns_is_refused():
+    with pytest.raises(ValueError, match="mixing Gym API with SB3 VecEnv API"):
+        tiny_tdpg().predict(LavaEnv().reset())
+
+
+@pytest.mark.parametrize("kwargs", [
+    dict(observation_space=spaces.Box(-1, 1, (4, 2), np.float32), gives_state=False),
+    dict(action_space=spaces.MultiBinary((2, 3))),
+    dict(action_space=spaces.MultiDiscrete(np.array([[2, 3], [4, 5]]))),
+], ids=["observations", "binary", "discrete"])  # fmt: skip
+def test_spaces_of_two_dimensions_train(kwargs, tmp_path):
+    model = tiny_tdpg(DummyVecEnv([lambda: ToyEnv(**kwargs)] * 2), n_episodes=4)
+    before = parameters(model.policy)
+    train_epochs(model, 2)
+    assert not same_parameters(before, parameters(model.policy))
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", device="cpu")
+    action, _ = loaded.predict(loaded.observation_space.sample())
+    assert loaded.action_space.contains(action)

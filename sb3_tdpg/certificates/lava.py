@@ -61,7 +61,8 @@ def certify_lava(
     :param n_episodes: Number of recorded training episodes.
     :param n_test_episodes: Episodes in each random shift; ten times as many in each of the paper's.
     :param confidence: Confidence of each certificate.
-    :param cost_bound: The certified cost is clipped here; default: ``wall_cost``.
+    :param cost_bound: Upper bound on the cost of an episode; default: ``wall_cost``, at which the certified cost is
+        clipped.
     :param seed: Seed of the episodes and of the shifts.
     :return: the summary, as Markdown
     :raises ValueError: if an argument is wrong; no episode has been run by then.
@@ -75,6 +76,8 @@ def certify_lava(
     for name, value, least in (("seed", seed, 0), ("n_test_episodes", n_test_episodes, 2)):
         if value < least:
             raise ValueError(f"{name}={value} must be at least {least}")
+    if cost_bound is not None and not (math.isfinite(cost_bound) and cost_bound > 0):
+        raise ValueError(f"cost_bound={cost_bound} must be finite and above 0: it bounds the cost of an episode")
     loaded = _load(models, training)
     out.mkdir(parents=True, exist_ok=True)  # now, so that an error does not come at the very end
     std = float(training.env_kwargs.get("sensor_noise_std", LAVA[0].env_kwargs["sensor_noise_std"]))
@@ -88,6 +91,11 @@ def certify_lava(
         for label, model in loaded.items():
             print(f"{label}: {n_episodes:,} training episodes")
             episodes = TrainingEpisodes(model, training, n_budget_episodes=n_budget, **settings)
+            if cost_bound is not None and (highest := float(episodes.costs.max())) > cost_bound:
+                raise ValueError(
+                    f"cost_bound={cost_bound:g} is below a cost of {highest:g} that {label} had in training: give an "
+                    "upper bound on the cost of an episode"
+                )
             paper += [dict(model=label, **_paper_row(episodes, row, 10 * n_test_episodes)) for row in rows]
             few = min(N_RANDOM_BUDGET_EPISODES, n_budget)
             for i, shift in enumerate(tqdm(shifts, desc=f"{label}: random shifts", disable=not shifts)):

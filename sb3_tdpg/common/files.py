@@ -1,8 +1,8 @@
-"""Write files atomically."""
+"""Write files atomically, and keep a folder for one process."""
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,6 +18,8 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
     """
     Give a path to write to; it replaces the target when the block ends without an error.
 
+    After a power cut there is the old or the new content, never a part of it.
+
     :param path: The target; folders are made. Several processes may replace it at once.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,4 +27,44 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
     with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder:
         partial = Path(folder, path.name)
         yield partial
+        for written in [partial, *partial.rglob("*")] if partial.is_dir() else [partial]:
+            _flush(written)
         os.replace(partial, path)
+        _flush(path.parent)
+
+
+def _flush(path: Path) -> None:
+    """Wait until a file, or the list of files of a folder, is on the disk."""
+    with suppress(OSError):  # not every system can flush a folder
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def kept_by_this_process(folder: Path) -> Iterator[None]:
+    """
+    Make a folder of results, and keep other processes out of it until the block ends or this process does.
+
+    :raises ValueError: if another process keeps it.
+    :raises OSError: if the folder cannot be written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".writable", dir=folder):
+        pass
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as e:
+            raise ValueError(f"another process is writing to {folder}: wait for it, or give another folder") from e
+        yield
+    finally:
+        os.close(descriptor)

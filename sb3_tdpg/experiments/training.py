@@ -7,7 +7,6 @@ from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_tdpg.callbacks import SelectionCallback
@@ -44,7 +43,6 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     n_timesteps = int(settings.pop("n_timesteps"))
     callbacks: list[BaseCallback] = [_make(entry) for entry in settings.pop("callback", [])]
     env = take_env(env_id, settings)
-    read_schedule(settings)
     return Training(TDPG(settings.pop("policy"), env, **settings), callbacks, n_timesteps)
 
 
@@ -67,16 +65,6 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
         env = _make(entry, env)
     normalize = settings.pop("normalize", None)
     return env if normalize is None else VecNormalize(env, **{**normalize, "gamma": settings.get("gamma", 0.99)})
-
-
-def read_schedule(settings: dict[str, Any]) -> None:
-    """Replace a learning rate that is a text such as ``lin_1e-3`` by its schedule."""
-    rate = settings.get("learning_rate")
-    if isinstance(rate, str):
-        if not rate.startswith("lin_"):
-            mend = "must be a number or 'lin_' and a number (YAML: write 1.0e-3, not 1e-3)"
-            raise ValueError(f"learning_rate={rate!r} {mend}")
-        settings["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
 
 
 def _make(entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:

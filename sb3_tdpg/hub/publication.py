@@ -97,6 +97,10 @@ def read_run(folder: Path) -> Publication:
         )
     config = json.loads((folder / "config.json").read_text())
     settings, records = with_numbers(config["settings"]), pd.read_csv(folder / "episodes.csv")
+    if missing := sorted({"attempts", "scenario", "cost"} - set(records)) or ["rows"] * (len(records) == 0):
+        raise ValueError(
+            f"{folder / 'episodes.csv'} has no {', '.join(missing)}: it is not whole; run the command again"
+        )
     files = {name: folder / name for name in ("config.json", "episodes.csv", "selected.json")}
     notes = [_selection_note(folder, settings)]
     if (attempts := int(records["attempts"].iloc[0])) > 1:
@@ -142,8 +146,7 @@ def read_zoo_folder(
     model_path = folder / f"{inner.name}.zip"
     if not (is_last := model_path.exists()) and not (model_path := folder / "best_model.zip").exists():
         raise ValueError(f"{folder} has neither {inner.name}.zip nor best_model.zip: let the training end first")
-    # The zoo reads its files like this. They are the user's own, and the model is unpickled, too.
-    args, settings = (dict(yaml.load((inner / n).read_text(), yaml.UnsafeLoader)) for n in ("args.yml", "config.yml"))
+    args, settings = (_read_plain(inner / name) for name in ("args.yml", "config.yml"))
     env_kwargs = settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
     env_id, env = str(args["env"]), None
     if (inner / "vecnormalize.pkl").exists():
@@ -180,6 +183,26 @@ def read_zoo_folder(
         files=files,
         metrics=sorted([*folder.glob("*.csv"), *folder.glob("evaluations.npz")]),
     )
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Reads the two Python types that rl-zoo3 writes, and runs nothing."""
+
+
+for _tag, _construct in (
+    ("object/apply:collections.OrderedDict", lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0])),
+    ("tuple", lambda loader, node: loader.construct_sequence(node, deep=True)),
+):
+    _PlainLoader.add_constructor(f"tag:yaml.org,2002:python/{_tag}", _construct)
+
+
+def _read_plain(path: Path) -> dict[str, Any]:
+    """Read a file of rl-zoo3 as plain data."""
+    try:
+        return dict(yaml.load(path.read_text(), _PlainLoader))
+    except (yaml.YAMLError, TypeError, ValueError) as e:
+        reason = " ".join(str(e).split())
+        raise ValueError(f"{path} is not plain data that rl-zoo3 wrote, and is not read: {reason}") from e
 
 
 def _typed_command(command: str) -> str | None:

@@ -79,6 +79,11 @@ class InformationEstimator(nn.Module):
         """Return the number of living episodes that an estimate needs in a batch of ``n_episodes``."""
         return min(self.trv_dim + 2, n_episodes)
 
+    @property
+    def recommended_episodes(self) -> int:
+        """Number of episodes of an epoch below which the estimate is misleading."""
+        return self.trv_dim + 2
+
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         """Estimate all steps (``t=None``, ``(T, N, ...) -> (T,)``) or one (``(1, n, ...) -> (1,)``) where all live."""

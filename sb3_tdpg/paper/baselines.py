@@ -23,13 +23,14 @@ from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.envs.scenarios import BALL_CATCH, LAVA, PANDA_GRASP, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.experiments.runs import Run, Task, complete_runs
-from sb3_tdpg.experiments.training import read_schedule, take_env
+from sb3_tdpg.experiments.training import take_env
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper.ball import GROUPS, NO_PENALTY_PLAIN, with_groups
 from sb3_tdpg.paper.ball import SECOND_STAGE as BALL_SECOND_STAGE
 from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, Options, make_tasks, read_records, write_results
 from sb3_tdpg.paper.grasp import TDPG_SECOND_STAGE as GRASP_SECOND_STAGE
 from sb3_tdpg.paper.lava import MAX_ATTEMPTS
+from sb3_tdpg.settings import rate_schedule
 
 # The number of environment steps of TDPG, in both of its stages if it has two.
 LAVA_STEPS, BALL_STEPS, GRASP_STEPS = 1.5e6, 1.6e5, 3.2e4
@@ -95,7 +96,7 @@ class SB3Run(TimedRun):
         settings = self.settings
         n_timesteps = int(settings.pop("n_timesteps"))
         env = take_env(self.env_id, settings)
-        read_schedule(settings)
+        settings["learning_rate"] = rate_schedule(settings["learning_rate"])
         model = algorithm(settings.pop("policy"), env, **settings, seed=self.seed, device="cpu")
         model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
         model.learn(n_timesteps, progress_bar=progress_bar)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Mapping
@@ -64,6 +65,13 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
         if number is not None:
             correct = yaml.safe_dump(number).split()[0]
             raise ValueError(f"{where} has {key}: {value}, which YAML reads as text, not as a number: write {correct}")
+    for key in {"n_timesteps", "n_envs"} & set(block):
+        if not (isinstance(block[key], (int, float)) and block[key] >= 1):
+            raise ValueError(f"{where} has {key}: {block[key]!r}, which must be a number of at least 1")
+    if not isinstance(block.get("callback", []), (str, list, dict)):
+        raise ValueError(f"{where} has callback: {block['callback']!r}, which must be a class or a list of classes")
+    if "seed" in block:
+        raise ValueError(f"{where} has seed: {block['seed']!r}: give --seed on the command line")
     if "n_timesteps" not in block:
         raise ValueError(f"{where} has no n_timesteps, the length of training in environment steps: add it")
 
@@ -90,7 +98,7 @@ class TDPGExperimentManager(ExperimentManager):
         kwargs["config"] = kwargs.get("config") or find_file(algo, self.block or env_id)
         super().__init__(args, algo, env_id, *rest, **kwargs)
         self.is_batch = batched_class(env_id) is not None and self.vec_env_class is DummyVecEnv
-        self.is_interrupted = False
+        self.is_interrupted = self.has_claimed = False
         self.deterministic_eval = self.deterministic_eval and algo != "tdpg"
         if self.resume is not None:
             self.save_path = str(self.resume)
@@ -104,9 +112,20 @@ class TDPGExperimentManager(ExperimentManager):
         try:
             return super().setup_experiment()
         except BaseException:
-            if not was_there:
+            if self.has_claimed or not was_there:
                 shutil.rmtree(self.save_path, ignore_errors=True)
             raise
+
+    def create_log_folder(self) -> None:
+        """Make the folder of the training; of several processes that start at once, each gets a number of its own."""
+        while not (self.has_claimed or self.resume is not None or self.optimize_hyperparameters):
+            try:
+                os.makedirs(self.save_path)
+                self.has_claimed = True
+            except FileExistsError:
+                self.save_path = re.sub(r"\d+$", lambda number: str(int(number[0]) + 1), self.save_path)
+                self.params_path = f"{self.save_path}/{self.env_name}"
+        super().create_log_folder()
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read and check the block of hyperparameters."""

@@ -76,16 +76,21 @@ def _split(program: str, arguments: Sequence[str]) -> tuple[argparse.Namespace, 
     given, flags = ours.parse_known_args(arguments)
     shared = argparse.ArgumentParser(ours.prog, add_help=False, allow_abbrev=False)
     shared.add_argument("--algo", default="tdpg")
+    shared.add_argument("-n", "--n-timesteps", type=int)
     for names in (["--env-kwargs"], ["--eval-env-kwargs"], ["-params", "--hyperparams"]):
         shared.add_argument(*names, nargs="+", action=StoreDict)
     try:
         shared.parse_known_args(flags, given)
+        if given.n_timesteps is not None and given.n_timesteps < 1:
+            raise ValueError(f"-n {given.n_timesteps} must be at least 1: the environment steps of a training")
     except (NameError, SyntaxError) as e:
         raise ValueError(f"{e}: write key:value with a value in Python, text in quotes as in key:\"'text'\"") from e
     return given, flags
 
 
 def _train(given: argparse.Namespace, flags: list[str]) -> None:
+    if given.algo == "tdpg" and {"-optimize", "--optimize-hyperparameters"} & set(flags):
+        raise ValueError("train does not tune TDPG: use `sb3-tdpg tune` with the same flags, but without -optimize")
     folder, seed = given.resume, []
     if folder is not None:
         record = _read_record(folder, bool(flags or given.block))
@@ -113,6 +118,8 @@ def _read_record(folder: Path, has_flags: bool) -> dict[str, Any]:
     if not (folder / RECORD).exists():
         raise ValueError(f"--resume {folder} is not the folder of a training: it has no {RECORD}")
     record: dict[str, Any] = json.loads((folder / RECORD).read_text())
+    if not {"arguments", "seed"} <= set(record):
+        raise ValueError(f"{folder / RECORD} does not say how its training was started: train anew")
     if has_flags:
         raise ValueError(
             f"{folder} was started with `{' '.join(record['arguments'])}`, and other flags cannot change it: give "

@@ -55,6 +55,8 @@ def _check_range(where: str, entry: Any) -> None:
         raise ValueError(f"{where} must have a list of choices, not {choices!r}")
     if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in (low, high)) or low >= high:
         raise ValueError(f"{where} must have finite numbers low < high (write 1.0e-3, not 1e-3), not {low!r}, {high!r}")
+    if not isinstance(entry.get("log", False), bool):
+        raise ValueError(f"{where} has log: {entry['log']!r}, which must be true or false")
     if entry.get("log", False) and low <= 0:
         raise ValueError(f"{where} has log: true, for which low={low} must be positive")
 

@@ -80,7 +80,10 @@ class TuningManager(TDPGExperimentManager):
     def _find_limit(self, block: dict[str, Any]) -> float:
         selections = [c.cost_limit for c in get_callback_list(block) if isinstance(c, SelectionCallback)]
         threshold = gym.spec(self.env_name.gym_id).reward_threshold or 0.0
-        for limit in (self.cost_limit, block.get("cost_limit"), *selections, -threshold):
+        given = self.cost_limit
+        if given is not None and not (math.isfinite(given) and given != 0):
+            raise ValueError(f"--cost-limit {given} must be a finite number other than 0")
+        for limit in (given, block.get("cost_limit"), *selections, -threshold):
             if limit and math.isfinite(limit):
                 return float(limit)
         needed = f"a limit on the expected cost (minus the reward) of {self.env_name.gym_id}"

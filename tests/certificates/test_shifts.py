@@ -14,7 +14,8 @@ from small_problems import ToyEnv, tiny_tdpg, train_epochs
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch.distributions import Normal, kl_divergence
 
-from sb3_tdpg.certificates.certificate import worst_mean
+from sb3_tdpg.certificates import shifts
+from sb3_tdpg.certificates.certificate import cost_distribution, worst_mean
 from sb3_tdpg.certificates.lava import _load
 from sb3_tdpg.certificates.shifts import (
     Shift,
@@ -322,3 +323,43 @@ def test_the_certificates_hold_in_a_thousand_random_shifts_and_the_bottleneck_ma
         assert (costs <= bounds).all()
         medians[block] = np.median(bounds)
     assert medians["Lava-v0-logdet"] < 0.3 * medians["Lava-v0-pg"]
+
+
+# -- what makes a certificate valid, number by number ------------------------------------------------------------
+
+
+def test_the_divergence_of_the_sensor_counts_at_every_step(episodes):
+    shift = lava_shift("", sensor_bias=(0.02, 0.0), start_beta=(2.0, 1.0))
+    assert shift.sensor_kl > 0 < shift.start_kl
+    assert episodes.certify(shift).sensor_kl == pytest.approx(shift.start_kl + 5 * shift.sensor_kl)
+
+
+def test_half_of_the_error_is_for_the_cost_and_half_for_all_divergences_together(episodes, monkeypatch):
+    asked = []
+
+    def record(values, cost_bound, confidence):
+        asked.append(confidence)
+        return cost_distribution(values, cost_bound, confidence)
+
+    monkeypatch.setattr(shifts, "cost_distribution", record)
+    allowed = episodes.allowing(0.9)
+    assert asked == [pytest.approx(0.95)]
+    asked.clear()
+    allowed.budgets(lava_shift("", sensor_noise_std=0.05))
+    assert asked == [pytest.approx(1 - 0.1 / 12)] * 6  # five steps and the last action
+    assert 1 - asked[0] == pytest.approx((1 - 0.95) / 6)
+
+
+def test_the_cost_bound_has_a_stage_cost_for_every_control():
+    one, two = LavaEnv(horizon=1, max_action=3.0, action_cost=2.0), LavaEnv(horizon=2, max_action=3.0, action_cost=2.0)
+    farthest = math.hypot(3.0, 5.0 + 3.0)
+    assert one.cost_bound == pytest.approx(farthest + 2.0 * 3.0 + 100 * farthest)
+    assert two.cost_bound - one.cost_bound == pytest.approx(farthest + 2.0 * 3.0)
+
+
+@pytest.mark.parametrize("bound, message", [("-1", "above 0"), ("1", "is below a cost of")])
+def test_a_bound_below_a_cost_in_training_is_refused(bound, message, model, tmp_path, capsys):
+    model.save(tmp_path / "model.zip")
+    arguments = ["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--n-episodes", "3000"]
+    assert main([*arguments, "--cost-bound", bound, "--out", str(tmp_path / "out")]) == 2
+    assert re.search(message, capsys.readouterr().err)

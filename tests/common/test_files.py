@@ -1,7 +1,13 @@
-"""Files that are never half-written."""
+"""Files that are never half-written, and folders that one process keeps."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+from sb3_tdpg.common.files import kept_by_this_process as keep
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
 
 
@@ -23,3 +29,33 @@ def test_what_could_not_be_written_leaves_the_old_file_and_nothing_else(tmp_path
         raise KeyboardInterrupt
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_content_and_folder_are_flushed_before_and_after_the_file_is_replaced(tmp_path, monkeypatch):
+    done = []
+    replace = os.replace
+    monkeypatch.setattr(os, "fsync", lambda descriptor: done.append(Path(f"/proc/self/fd/{descriptor}").resolve().name))
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
+    write_atomically(tmp_path / "summary.md", "text")
+    assert done == ["summary.md", "replace", tmp_path.name]
+
+
+def test_a_folder_is_kept_by_one_process_at_a_time(tmp_path):
+    script = (
+        "import sys; from pathlib import Path; from sb3_tdpg.common.files import kept_by_this_process\n"
+        f"with kept_by_this_process(Path({str(tmp_path / 'out')!r})):\n    print('kept', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdin=-1, stdout=-1, text=True) as process:
+        assert process.stdout.readline() == "kept\n"
+        with pytest.raises(ValueError, match=r"another process is writing to .*out: wait"), keep(tmp_path / "out"):
+            pass
+        process.kill()
+        process.wait()
+        with keep(tmp_path / "out"):
+            assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_noticed_at_once(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"), keep(tmp_path / "file" / "out"):
+        pytest.fail("it was kept")

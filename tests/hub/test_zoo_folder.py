@@ -109,3 +109,17 @@ def test_the_card_of_our_own_folder_says_which_policy_it_is(zoo_folder, tmp_path
     (copy / "checkpoint.zip").touch()  # interrupted
     assert "The policy is the last one" in notes()
     assert "epoch 3" not in notes()
+
+
+PAYLOAD = "!!python/object/apply:os.system ['touch {marker}']"
+
+
+@pytest.mark.parametrize("name", ["args.yml", "config.yml"])
+def test_a_file_of_a_zoo_folder_that_would_run_code_is_refused(name, zoo_folder, tmp_path):
+    folder, marker = tmp_path / "Lava-v0_1", tmp_path / "marker"
+    shutil.copytree(zoo_folder, folder)
+    (folder / "Lava-v0" / name).write_text(PAYLOAD.format(marker=marker))
+    with pytest.raises(ValueError, match=rf"{name} is not plain data that rl-zoo3 wrote") as refused:
+        read_publication(folder, n_eval_episodes=2)
+    assert len(str(refused.value).splitlines()) == 1
+    assert not marker.exists()

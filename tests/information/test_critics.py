@@ -365,3 +365,13 @@ def test_an_estimator_saved_and_loaded_goes_on_as_if_it_had_not_been(name, reset
         results.append((e(batch), parameters(e)))
     th.testing.assert_close(results[0][0], results[1][0], rtol=0, atol=0)
     assert_same_parameters(results[0][1], results[1][1])
+
+
+def test_a_refit_does_not_mix_with_the_moving_average_of_the_critic_before():
+    estimator = Mine(3, 2, 2, ema_decay=0.99, **TINY_CRITIC)
+    batch = random_batch(horizon=3)
+    estimator.fit(batch)
+    estimator.log_ema.fill_(50.0)
+    with th.no_grad():
+        estimator._refit(batch, th.tensor([1]))
+    assert estimator.log_ema[1] < 5 < 50 == estimator.log_ema[0] == estimator.log_ema[2]

@@ -12,6 +12,7 @@ from sb3_tdpg.measurement import information_interval
 from sb3_tdpg.measurement.interval import (
     LOWER_BOUNDS,
     UPPER_BOUNDS,
+    _gap,
     joint_quantile,
     limit,
     min_episodes,
@@ -196,3 +197,11 @@ def test_a_batch_that_is_not_fit_is_refused(change, message):
 def test_a_confidence_out_of_its_range_is_refused(confidence):
     with pytest.raises(ValueError, match="confidence="):
         information_interval(random_batch(), confidence=confidence)
+
+
+def test_the_gap_is_counted_in_the_larger_of_the_two_errors():
+    parts = np.array([-1.0, 0.0, 1.0, 0.0])
+    lower, upper = Estimate(1.0, parts), Estimate(2.0, 3 * parts)
+    assert _gap([lower], [upper]) == pytest.approx(1.0 / upper.error)
+    assert _gap([upper], [lower]) == pytest.approx(-1.0 / upper.error)
+    assert math.isnan(_gap([], [upper]))

@@ -242,3 +242,20 @@ def test_where_no_pair_fits_the_bound_is_not_infinite():
     bound = donsker_varadhan(np.full(100, log_clip := 6.0), np.zeros((100, 100)), 100 * 99, log_clip)
     assert math.log(100**2 / 10) - 0.1 < bound.value < math.log(100**2 / 10)
     assert bound.error > 0.3
+
+
+def test_an_episode_also_counts_as_a_component_of_the_others_mixture():
+    # A broad density far from all draws adds to no other episode's mixture, a central one adds to all of them.
+    batch = gaussian_batch(60, [[1.0, 1.0]], generator=generator())
+    step = encoded(batch, n_draws=4)
+    n, n_draws, dim = step.trvs.shape
+    density = bounds_module.log_gaussians(step.trvs.reshape(-1, dim), step.means, np.square(step.stds))
+    own = np.repeat(np.arange(n), n_draws)
+    gaps = density[np.arange(n * n_draws), own].copy()
+    density[np.arange(n * n_draws), own] = -np.inf
+    total = np.exp(density).sum(axis=1)
+    gaps = (gaps - np.log(total / (n - 1))).reshape(n, -1).mean(axis=1)
+    shares = (np.exp(density) / total[:, None]).sum(axis=0) / n_draws
+    whole = Estimate(float(gaps.mean()), gaps - shares).less_noise(bounds_module.noise_controls(step))
+    assert leave_one_out_bound(step).error == pytest.approx(whole.error)
+    assert abs(whole.error / Estimate(0.0, gaps).less_noise(bounds_module.noise_controls(step)).error - 1) > 0.01

@@ -16,7 +16,7 @@ from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.experiments.runs import Run, complete_run
-from sb3_tdpg.experiments.training import make_training, read_schedule, take_env
+from sb3_tdpg.experiments.training import make_training, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import ball, baselines, grasp
 from sb3_tdpg.paper.baselines import (
@@ -28,6 +28,7 @@ from sb3_tdpg.paper.baselines import (
     TimedRun,
     training_time,
 )
+from sb3_tdpg.settings import rate_schedule
 
 COMPARISONS = (LAVA_BASELINES, BALL_BASELINES, GRASP_BASELINES)
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -113,7 +114,7 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
     settings = run.settings
     n_timesteps, policy = settings.pop("n_timesteps"), settings.pop("policy")
     env = take_env("Lava-v0", settings)
-    read_schedule(settings)
+    settings["learning_rate"] = rate_schedule(settings["learning_rate"])
     model = cls(policy, env, **settings, seed=3, device="cpu").learn(n_timesteps)
     saved = cls.load(tmp_path / "run" / "model.zip", device="cpu")
     for name, value in model.policy.state_dict().items():

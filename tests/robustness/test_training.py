@@ -9,6 +9,7 @@ from small_problems import tiny_tdpg, toy_vec_env, train_epochs
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.robustness.training import VecImagePerturbation
 
+IMAGES = spaces.Box(0, 255, (3, 16, 16), np.uint8)
 OFF = dict(color=0.0, pattern=0.0, patch=0.0, contrast=0.0, noise=0.0)
 
 
@@ -113,3 +114,21 @@ def test_a_strength_out_of_its_range_is_refused(arguments, fragment):
 def test_vectors_are_refused():
     with pytest.raises(ValueError, match="images of bytes"):
         VecImagePerturbation(make_episodes_env("Lava-v0", 4))
+
+
+def test_three_images_of_ten_get_no_pattern():
+    env = VecImagePerturbation(toy_vec_env(observation_space=IMAGES), **{**OFF, "pattern": 1.0})
+    th.manual_seed(0)
+    images = np.full((3000, 3, 16, 16), 100, np.uint8)
+    unchanged = (env.perturb(images) == 100).all(axis=(1, 2, 3)).mean()
+    assert 0.26 < unchanged < 0.34
+
+
+def test_the_strength_of_the_noise_is_drawn_for_each_image():
+    env = VecImagePerturbation(toy_vec_env(observation_space=IMAGES), **{**OFF, "noise": 0.2})
+    th.manual_seed(0)
+    images = env.perturb(np.full((500, 3, 16, 16), 128, np.uint8)) / 255
+    stds = images.std(axis=(1, 2, 3))  # uniform up to 0.2, a little less where it is clipped
+    assert stds.min() < 0.02
+    assert 0.15 < stds.max() < 0.21
+    assert 0.08 < stds.mean() < 0.12

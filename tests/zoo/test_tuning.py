@@ -62,6 +62,7 @@ def test_the_weight_is_not_sampled_where_there_is_none_to_choose():
     ("policy_kwargs.foo: {low: 1, high: 2}", "policy_kwargs.foo of .* is no argument"),
     ("gamma: {low: 1}", "gamma of .* must have low and high"),
     ("gamma: {low: 2, high: 1}", "gamma of .* low < high"),
+    ("gamma: {low: 1, high: 1}", "gamma of .* low < high"),
     ("gamma: {low: 1e-3, high: 1}", r"gamma of .* \(write 1.0e-3, not 1e-3\), not '1e-3'"),
     ("gamma: {low: 0, high: 1, log: true}", "low=0 must be positive"),
     ("gamma: {choices: 3}", "list of choices"),

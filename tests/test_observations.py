@@ -1,0 +1,98 @@
+"""What environments return is checked before it reaches a network, and what is wrong is named."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from small_problems import ToyEnv, tiny_tdpg, train_epochs
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg.envs.lava import LavaEnv
+
+
+class BrokenEnv(ToyEnv):
+    """Returns something else at the second step of its third episode, or at its first reset."""
+
+    def __init__(self, broken, at_reset=False):
+        super().__init__(gives_state=False)
+        self.broken, self.at_reset = np.asarray(broken, np.float32), at_reset
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        return (self.broken if self.at_reset else observation), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return (self.broken if self.n_resets == 3 and self.t == 2 else observation), *rest
+
+
+def broken_model(broken, **kwargs):
+    env = DummyVecEnv([lambda: ToyEnv(gives_state=False), lambda: BrokenEnv(broken, **kwargs)])
+    return tiny_tdpg(env, n_episodes=8, mi_estimator="mine")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38])
+def test_a_number_that_no_network_can_take_is_named_with_environment_step_and_component(value):
+    model = broken_model([0.0, value])
+    message = rf"environment 1 returned the observation {value:g} in component \[1\] at step 2 of its episode".replace(
+        "+", r"\+"
+    )
+    with pytest.raises(ValueError, match=message):
+        train_epochs(model, 1)
+    for parameter in [*model.policy.parameters(), *model.estimator.parameters()]:
+        assert np.isfinite(parameter.detach().numpy()).all()
+
+
+def test_a_bad_state_is_named_as_well():
+    env = LavaEnv()
+    dynamics = env._dynamics
+    env._dynamics = lambda state, action: np.where(np.arange(2) == 1, np.nan, dynamics(state, action))
+    env._sensor = lambda state: np.zeros((len(state), 2), np.float32)
+    env._terminal_cost = env._cost = lambda state, action=None: np.zeros(len(state))
+    with pytest.raises(ValueError, match=r"environment 0 returned the state nan in component \[1\] at step 1"):
+        train_epochs(tiny_tdpg(BatchedVecEnv(env, 4), n_episodes=4), 1)
+
+
+@pytest.mark.parametrize("at_reset", [False, True])
+def test_an_observation_of_a_wrong_shape_is_named_with_its_environment(at_reset):
+    with pytest.raises(ValueError, match=r"environment 1 returned an observation of a wrong shape \(3,\).*\(2,\)"):
+        train_epochs(broken_model(np.zeros(3), at_reset=at_reset), 1)
+
+
+class WrongShapeEnv(ToyEnv):
+    """Says two numbers, and returns three."""
+
+    def _observe(self):
+        return np.zeros(3, np.float32)
+
+
+@pytest.mark.parametrize("others", [WrongShapeEnv, ToyEnv], ids=["all", "one"])
+def test_a_wrong_shape_from_another_process_is_explained(others):
+    env = SubprocVecEnv([WrongShapeEnv, others])
+    try:
+        with pytest.raises(ValueError, match=r"(wrong shape|shape \(3,\)).*\(2,\)"):
+            train_epochs(tiny_tdpg(env, n_episodes=4), 1)
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(("n_episodes", "mi_estimator", "warns"), [
+    (39, "mine", True), (40, "mine", False), (39, "infonce", True), (4, "logdet", False), (4, "vib", False),
+])  # fmt: skip
+def test_too_few_episodes_for_the_critics_are_reported_with_the_number_needed(n_episodes, mi_estimator, warns, recwarn):
+    # Two TRVs and two components of the state.
+    train_epochs(tiny_tdpg(n_episodes=n_episodes, mi_estimator=mi_estimator), 1)
+    messages = [str(w.message) for w in recwarn if "are too few for" in str(w.message)]
+    assert len(messages) == warns
+    assert all(f"n_episodes={n_episodes} are too few" in m and "n_episodes=40 or more" in m for m in messages)
+
+
+def test_without_a_penalty_no_number_of_episodes_is_too_few(recwarn):
+    train_epochs(tiny_tdpg(n_episodes=4, mi_estimator="mine", beta=float("inf")), 1)
+    assert not [w for w in recwarn if "too few" in str(w.message)]
+
+
+def test_images_cannot_stand_in_for_the_state():
+    space = spaces.Box(0, 255, (3, 16, 16), np.uint8)
+    with pytest.raises(ValueError, match=r"an image of shape \(3, 16, 16\) cannot stand in for it"):
+        TDPG("TRVPolicy", DummyVecEnv([lambda: ToyEnv(observation_space=space, gives_state=False)]), n_episodes=4)
