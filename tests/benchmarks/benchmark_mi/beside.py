@@ -9,7 +9,8 @@ From the repository's root, in the project's environment, with the package's own
 
 It takes ten minutes of one core, and adds a row to ``beside.csv`` for each sample: those that have the fewest rows
 come first, and of these the ones at which ours takes the longest. So it can be stopped and started again. Rows of an
-older version of ours are to be removed by hand. The package's estimates differ from those of ``theirs.csv`` on another processor.
+older version of ours are to be removed by hand. On another processor, the package's estimates differ from those of
+``theirs.csv``.
 """
 
 from __future__ import annotations
@@ -99,8 +100,8 @@ def table(passes: pd.DataFrame) -> str:
     medians = equal.groupby("n").median()
     lines += [
         "",
-        f"At least as accurate: {len(equal)} of {len(both)}; of these at least {AIM} times as fast: {(equal >= AIM).sum()}. "
-        f"Least {equal.min():.1f}; median " + ", ".join(f"{value:.1f} at n = {n}" for n, value in medians.items()),
+        f"At least as accurate: {len(equal)} of {len(both)}; of these at least {AIM} times as fast: "
+        f"{(equal >= AIM).sum()}. Least {equal.min():.1f}; median " + ", ".join(f"{value:.1f} at n = {n}" for n, value in medians.items()),
     ]
     return "\n".join(lines)
 
