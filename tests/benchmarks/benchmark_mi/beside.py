@@ -98,10 +98,11 @@ def table(passes: pd.DataFrame) -> str:
         )
     equal = both[both["equal"]]["ratio"]
     medians = equal.groupby("n").median()
+    by_size = ", ".join(f"{value:.1f} at n = {n}" for n, value in medians.items())
     lines += [
         "",
         f"At least as accurate: {len(equal)} of {len(both)}; of these at least {AIM} times as fast: "
-        f"{(equal >= AIM).sum()}. Least {equal.min():.1f}; median " + ", ".join(f"{value:.1f} at n = {n}" for n, value in medians.items()),
+        f"{(equal >= AIM).sum()}. Least {equal.min():.1f}; median {by_size}",
     ]
     return "\n".join(lines)
 
