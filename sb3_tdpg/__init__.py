@@ -1,8 +1,10 @@
 """Task-Driven Policy Gradient (TDPG) for Stable-Baselines3."""
 
+import importlib
 import importlib.util
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 # In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. When the checkout itself is on
 # sys.path (as the working directory, or by PYTHONPATH), no finder knows that they are part of this package.
@@ -18,11 +20,13 @@ for _name in ("envs", "hyperparams"):
         _spec.loader.exec_module(globals()[_name])
 
 from sb3_tdpg import envs, hyperparams
-from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
-from sb3_tdpg.measurement.callback import InformationCallback
-from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
-from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
+
+if TYPE_CHECKING:
+    from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
+    from sb3_tdpg.measurement.callback import InformationCallback
+    from sb3_tdpg.policies import TRVPolicy
+    from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
+    from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
 
 __version__ = "0.1.0"
 
@@ -39,3 +43,22 @@ __all__ = [
     "hyperparams",
     "make_episodes_env",
 ]
+
+_MODULES = {
+    "TDPG": "tdpg",
+    "BatchedVecEnv": "vec_env",
+    "InformationCallback": "measurement.callback",
+    "MINECallback": "callbacks",
+    "SelectionCallback": "callbacks",
+    "TRVPolicy": "policies",
+    "TrainingCheckpointCallback": "callbacks",
+    "TrainingDivergedError": "tdpg",
+    "make_episodes_env": "vec_env",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # torch takes seconds: it is imported with the first class that needs it, not to print a help text.
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -221,18 +221,17 @@ class TrainingCheckpointCallback(TDPGCallback):
 class TDPGProgressBar(ProgressBarCallback):
     """SB3's progress bar with the epoch's cost and information, and the failures where episodes report success."""
 
-    _open: ClassVar[TDPGProgressBar | None] = None
+    _open: ClassVar[list[TDPGProgressBar]] = []
 
     def _on_training_start(self) -> None:
-        # An interrupted training leaves its bar open, and rich shows only one at a time.
-        if TDPGProgressBar._open is not None:
-            TDPGProgressBar._open.pbar.close()
         super()._on_training_start()
-        TDPGProgressBar._open = self
+        self._open.append(self)
 
-    def _on_training_end(self) -> None:
-        super()._on_training_end()
-        TDPGProgressBar._open = None
+    @classmethod
+    def close(cls) -> None:
+        """Close the bar of a training that has ended or was interrupted, or the terminal's cursor stays hidden."""
+        while cls._open:
+            cls._open.pop().pbar.close()
 
     def _on_rollout_end(self) -> None:
         model = cast(EpisodicAlgorithm, self.model)

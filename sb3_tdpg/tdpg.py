@@ -394,10 +394,13 @@ class TDPG(EpisodicAlgorithm):
         """
         if total_timesteps is None:
             total_timesteps = defaults_for(self.observation_space).total_epochs * self.n_episodes * self.horizon
-        with threads(self.n_threads):
-            return super().learn(
-                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-            )
+        try:
+            with threads(self.n_threads):
+                return super().learn(
+                    total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+                )
+        finally:
+            TDPGProgressBar.close()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]

@@ -2,9 +2,14 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -48,23 +53,26 @@ def kept_by_this_process(folder: Path) -> Iterator[None]:
     """
     Make a folder of results, and keep other processes out of it until the block ends or this process does.
 
+    A new folder that is still empty then is removed, with the new folders above it.
+
     :raises ValueError: if another process keeps it.
     :raises OSError: if the folder cannot be written to.
     """
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".writable", dir=folder):
         pass
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
+    with ExitStack() as stack:
+        if fcntl is not None:
+            descriptor = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as e:
+                raise ValueError(f"another process is writing to {folder}: wait for it, or give another folder") from e
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as e:
-            raise ValueError(f"another process is writing to {folder}: wait for it, or give another folder") from e
-        yield
-    finally:
-        os.close(descriptor)
+            yield
+        finally:
+            with suppress(OSError):  # not empty
+                for path in new:
+                    path.rmdir()

@@ -36,8 +36,14 @@ def process_pool(
     :param initargs: Arguments of the initializer.
     """
     # All workers are forked from one process that has imported the package once and computed nothing.
-    context: Any = mp.get_context("forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn")
-    context.set_forkserver_preload(["sb3_tdpg"])
+    context: Any = mp.get_context("spawn")
+    if "forkserver" in mp.get_all_start_methods():
+        from multiprocessing import forkserver
+
+        context = mp.get_context("forkserver")
+        context.set_forkserver_preload(["sb3_tdpg.tdpg"])
+        with _ignoring_ctrl_c():  # also while the server imports
+            forkserver.ensure_running()
     # Only this process holds the writing end, so the workers see when it is closed, or when this process has died.
     reading, writing = context.Pipe(duplex=False)
     with ProcessPoolExecutor(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
@@ -48,6 +54,19 @@ def process_pool(
             raise
         pool.shutdown()
         writing.close()
+
+
+@contextmanager
+def _ignoring_ctrl_c() -> Iterator[None]:
+    """Ignore Ctrl-C, here and for good in processes that are started meanwhile; in threads do nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _start_worker(reading: Connection, initializer: Callable[..., Any] | None, initargs: tuple[Any, ...]) -> None:

@@ -133,7 +133,7 @@ class TDPGExperimentManager(ExperimentManager):
         self.env_name = EnvironmentName(block)  # the name by which the zoo looks the block up
         try:
             hyperparams, saved = super().read_hyperparameters()
-        except (OSError, ValueError, AttributeError, yaml.YAMLError) as e:
+        except (OSError, ValueError, TypeError, AttributeError, yaml.YAMLError) as e:  # TypeError: an empty block
             reason = " ".join(str(e).split())
             raise ValueError(
                 f"{self.config} has no readable block {block!r} for {self.algo} ({reason}): choose another one with "

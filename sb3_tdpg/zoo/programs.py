@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import pickle
 import runpy
 import sys
 import warnings
@@ -157,7 +158,12 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
     if given.save is not None:
         plt.switch_backend("agg")  # the plots end with plt.show(), which does nothing here
         warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
-    {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
+    try:
+        {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
+    except (pickle.UnpicklingError, EOFError, LookupError, TypeError) as e:
+        if given.kind != "from-file":
+            raise
+        raise ValueError(f"`{' '.join(flags)}` names no results that `plot --kind all -o FILE` has written") from e
     if given.save is not None and plt.get_fignums():  # --kind all prints tables only
         given.save.parent.mkdir(parents=True, exist_ok=True)
         plt.savefig(given.save, dpi=150)

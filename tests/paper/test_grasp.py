@@ -155,7 +155,7 @@ def test_the_critics_are_fitted_to_one_policy_after_the_other_and_read_on_fresh_
     fit = Mine.fit
 
     def note(critic, batch):
-        fits.append((id(critic), critic.is_warm, batch.states.shape[1]))
+        fits.append((id(critic), bool(critic.is_warm), batch.states.shape[1]))
         return fit(critic, batch)
 
     monkeypatch.setattr(Mine, "fit", note)

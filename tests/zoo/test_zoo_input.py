@@ -1,6 +1,7 @@
 """Bad input of the zoo's programs is told in one line, before anything is written; parallel trainings share nothing."""
 
 import json
+import pickle
 import re
 
 import pytest
@@ -28,6 +29,9 @@ BAD = {
     "infinite limit": ([*TUNE, "--cost-limit", "inf"], "--cost-limit inf must be"),
     "log": ([*TUNE, "--space", "space.yml"], "log: 'maybe', which must be true or false"),
     "record": (["train", "--resume", "empty"], "does not say how its training was started"),
+    "empty block": ([*TRAIN, "--block", "Empty-v0", "-conf", "empty.yml"], "has no readable block 'Empty-v0'"),
+    "key of a space": ([*TUNE, "--space", "number.yml"], "5 of number.yml is no argument of TDPG"),
+    "file of results": (["plot", "--kind", "from-file", "-i", "results.pkl"], "results.pkl` names no results"),
     "optimize": ([*TRAIN, "-optimize"], "sb3-tdpg tune"),
 }
 
@@ -37,6 +41,9 @@ def test_bad_input_is_told_in_a_line_and_leaves_nothing_behind(arguments, messag
     (here / "empty").mkdir()
     (here / "empty" / "run.json").write_text("{}")
     (here / "space.yml").write_text(yaml.safe_dump({"learning_rate": dict(low=1.0e-4, high=1.0e-3, log="maybe")}))
+    (here / "number.yml").write_text("5: {low: 1, high: 2}\n")
+    (here / "empty.yml").write_text("Empty-v0:\n")
+    (here / "results.pkl").write_bytes(pickle.dumps({}))
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert re.search(message, error), error
