@@ -391,7 +391,7 @@ def test_an_action_that_kills_every_restarted_actor_is_reported_in_the_end(make)
         env.step(action)
 
 
-@pytest.mark.parametrize("max_restarts", [0, 1])
+@pytest.mark.parametrize("max_restarts", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_an_actor_that_does_not_answer_counts_as_dead(max_restarts, make, tmp_path):
     env = make([lambda: SleepingEnv(tmp_path / "marker")], 1, max_restarts=max_restarts, step_timeout=2.0)
     env.reset()

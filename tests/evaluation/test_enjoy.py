@@ -114,7 +114,7 @@ def test_a_deterministic_policy_repeats_an_episode_that_starts_alike(ball):
 def test_recording_does_not_change_the_episodes(ball, tmp_path):
     settings = dict(env_kwargs=dict(SAME_START, pixel_noise_std=0.1, renderer="fast"), n_episodes=1)
     episodes = enjoy(ball, "BallCatch-v0", **settings)
-    recorded = enjoy(ball, "BallCatch-v0", **settings, record=tmp_path / "film.gif")
+    recorded = enjoy(ball, "BallCatch-v0", **settings, record=tmp_path / "film.mp4")
     for episode, seen in zip(episodes, recorded, strict=True):
         np.testing.assert_array_equal(episode.trvs, seen.trvs)
         np.testing.assert_array_equal(episode.costs, seen.costs)

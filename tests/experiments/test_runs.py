@@ -241,10 +241,8 @@ def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
     assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
 
 
-@pytest.mark.parametrize(
-    "storage",
-    [pytest.param([], id="pool", marks=pytest.mark.slow), pytest.param(["--storage", "study.log"], id="storage")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", [[], ["--storage", "study.log"]], ids=["pool", "storage"])
 def test_the_workers_of_a_command_that_is_killed_end_with_it(storage, tmp_path):
     if storage:
         pytest.importorskip("optuna")

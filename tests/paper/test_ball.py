@@ -44,7 +44,8 @@ def tiny(monkeypatch):
     return asked
 
 
-@pytest.mark.parametrize("n_seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_seeds", [1, 2])
 def test_from_nothing_to_tables_figures_and_records(n_seeds, tmp_path, tiny):
     out, published = tmp_path / "out", tmp_path / "docs"
     summary = ball.reproduce_ball(out, n_seeds=n_seeds, n_eval_episodes=2, n_timesteps=100, publish=published)

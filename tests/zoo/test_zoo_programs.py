@@ -33,6 +33,7 @@ def test_a_block_of_ours_trains_for_a_hundred_steps(env, here):  # noqa: F811
     assert loaded(here, env).num_timesteps >= 100
 
 
+@pytest.mark.slow
 def test_train_does_not_load_what_only_other_programs_need():
     show = "import sys; print(*(name for name in sys.modules if '.' not in name))"
     ours, theirs = (
