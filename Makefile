@@ -8,7 +8,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines wheel clean
+.PHONY: help venv demo test test-slow soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -36,6 +36,9 @@ test: $(STAMP) ## run the tests but for the slow ones
 
 test-slow: $(STAMP) ## run the slow tests
 	OMP_NUM_THREADS=1 $(PY) -m pytest -m slow -n $(JOBS) --dist worksteal
+
+soak: $(STAMP) ## endurance: leaks, killed trainings, killed workers (a quarter of an hour)
+	$(PY) tests/soak.py
 
 lint: $(STAMP) ## check style and format
 	$(PY) -m ruff check .

@@ -39,6 +39,8 @@ MAX_RETRIES = 3
 FORMS = "postgresql://user:password@host/database (many machines) or a path that ends in .log (one machine)"
 POSTGRES = dict(connect_timeout=5, keepalives_idle=30, keepalives_interval=10, keepalives_count=3)  # seconds
 OPEN_ATTEMPTS = 5
+OUTAGE = (StorageInternalError, sa.exc.DBAPIError)
+PATIENCE = 60.0  # seconds
 
 SPACE = "space"  # attribute of a study
 JOB, HEARTBEAT, STARTED, REASON = "job", "heartbeat", "started", "reason"  # attributes of a trial
@@ -210,7 +212,8 @@ def work(
         more for each worker. ``None``: run the jobs of :func:`enqueue_once`.
     :param describe: Describes a complete trial; default: its values.
     :param report: Gets a line of text for each trial.
-    :raises ValueError: if the storage does not answer any more.
+    :raises ValueError: if the storage does not answer for a minute. After a shorter outage, the trials that it has cost
+        are run again.
     """
     if n_trials is not None and n_trials < 1:
         raise ValueError(f"n_trials={n_trials} must be at least 1")
@@ -256,14 +259,35 @@ def work(
                 time.sleep(1.0)
             else:
                 return
-        except StorageInternalError as e:
-            raise ValueError(f"the storage does not answer: {_one_line(e)}") from e
         except (Exception, KeyboardInterrupt) as e:
-            trials = study.get_trials()
-            if not any(number in trial.system_attrs.get("retry_history", ()) for trial in trials):
-                if number is not None and trials[number].state == TrialState.FAIL:
-                    # A trial may be interrupted any number of times.
-                    max_retries = None if isinstance(e, KeyboardInterrupt) else MAX_RETRIES
-                    RetryHeartbeatStaleTrialCallback(max_retries)(study, trials[number])
+            if outage := _outage_in(e):
+                report(f"the storage does not answer ({_one_line(outage)}): waiting for it")
+            trials = _trials_when_answered(study)
+            if any(number in trial.system_attrs.get("retry_history", ()) for trial in trials):
+                report(f"trial {number} was taken over by another worker: its result is dropped")
+                continue
+            if number is not None and trials[number].state == TrialState.FAIL:
+                # A trial may be interrupted any number of times.
+                max_retries = None if outage or isinstance(e, KeyboardInterrupt) else MAX_RETRIES
+                RetryHeartbeatStaleTrialCallback(max_retries)(study, trials[number])
+            if not outage:
                 raise
-            report(f"trial {number} was taken over by another worker: its result is dropped")
+
+
+def _outage_in(error: BaseException | None) -> BaseException | None:
+    """Return the storage's error that has led to another one, as Optuna's ``tell`` raises after an outage."""
+    while error is not None and not isinstance(error, OUTAGE):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _trials_when_answered(study: optuna.Study) -> list[FrozenTrial]:
+    """Return the trials of a study; wait for a database that is being restarted."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return study.get_trials()
+        except OUTAGE as e:
+            if time.monotonic() > deadline:
+                raise ValueError(f"the storage has not answered for {PATIENCE:g} seconds: {_one_line(e)}") from e
+            time.sleep(0.5)

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from scipy.integrate import quad
 from scipy.stats import beta as beta_distribution
-from small_problems import ToyEnv, tiny_tdpg, train_epochs
+from small_problems import ToyEnv, tiny_tdpg, train_epochs, words
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch.distributions import Normal, kl_divergence
 
@@ -101,6 +101,7 @@ def test_no_episode_costs_more_than_the_bound_and_some_come_near(reading):
         (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
         (dict(start_beta=(0.0, 1.0)), re.escape("start_beta=(0.0, 1.0) must be two positive numbers")),
     ],
+    ids=words,
 )
 def test_bad_keywords_are_told(given, message):
     with pytest.raises(ValueError, match=message):

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
+from small_problems import words
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_tdpg  # noqa: F401  (registers the environments)
@@ -415,7 +416,7 @@ def test_the_rows_of_the_varying_launch_differ_from_table_two_in_the_launch_alon
     (dict(texture="bricks"), r"texture='bricks' is unknown: use one of \['brick', 'blue_tiles', .*'red_planks'\]"),
     (dict(texture=np.zeros((8, 8), np.uint8)), r"shape \(8, 8\) and dtype uint8; expected \(height, width, 3\)"),
     (dict(texture=np.zeros((8, 8, 3))), "dtype float64; expected"),
-], ids=str)  # fmt: skip
+], ids=words)  # fmt: skip
 def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
     with pytest.raises(ValueError, match=message):
         fast_env(**keywords)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from small_problems import words
 
 from sb3_tdpg import BatchedVecEnv
 from sb3_tdpg.envs.ball_bullet import BulletRenderer
@@ -56,7 +57,7 @@ def test_the_renderers_agree_in_500_states_with_each_texture(texture):
     (dict(fov=40.0), 0.995),
     (dict(fov=120.0), 0.98),  # the sides of the floor are in view
     (dict(texture=np.random.default_rng(0).integers(0, 256, (75, 200, 3), dtype=np.uint8)), 0.995),
-], ids=str)  # fmt: skip
+], ids=words)  # fmt: skip
 def test_the_renderers_agree_in_other_scenes_too(changes, lowest):
     within_two, _ = compare(scene(**changes), random_states(100))
     assert within_two > lowest

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from small_problems import words
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -300,7 +301,7 @@ def test_a_step_before_the_first_reset_or_after_the_end_asks_for_a_reset():
     (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
     (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
     (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
-], ids=str)  # fmt: skip
+], ids=words)  # fmt: skip
 def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
     with pytest.raises(ValueError, match=message):
         LavaEnv(**keywords)

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from panda_oracle import mixed_actions, oracle_actions, run_python
+from small_problems import words
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -331,7 +332,7 @@ def test_the_registered_threshold_is_three_failures_in_a_hundred():
     (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
     (dict(depth_noise_std=np.nan), "depth_noise_std=nan must be finite"),
     (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
-], ids=str)  # fmt: skip
+], ids=words)  # fmt: skip
 def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
     with pytest.raises(ValueError, match=message):
         PandaGraspEnv(**keywords)

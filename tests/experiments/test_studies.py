@@ -139,6 +139,36 @@ def test_a_trial_outlasts_a_restart_of_the_database(tmp_path, postgres):  # noqa
     assert len(team.lines("begin")) == len(team.lines("end")) == 1
 
 
+def test_a_trial_whose_result_cannot_be_told_in_an_outage_is_run_again(tmp_path, monkeypatch):
+    study, said, failures = open_quick(str(tmp_path / "study.log")), [], iter([True])
+    tell = study._storage.set_trial_state_values
+
+    def tell_after_an_outage(trial_id, state, values=None):
+        if state == TrialState.COMPLETE and next(failures, False):
+            raise optuna.exceptions.StorageInternalError("the server is being restarted")
+        return tell(trial_id, state, values)
+
+    monkeypatch.setattr(study._storage, "set_trial_state_values", tell_after_an_outage)
+    points = []
+    work(study, lambda trial: points.append(trial.suggest_float("x", 0, 1)) or 1.0, 1, report=said.append)
+    assert len(points) == 2
+    assert points[0] == points[1]
+    assert "the storage does not answer (the server is being restarted): waiting for it" in said
+    assert [t.state for t in study.get_trials() if t.state in FINISHED + ALIVE] == [TrialState.COMPLETE]
+
+
+def test_a_storage_that_never_answers_again_ends_the_worker(tmp_path, monkeypatch):
+    study = open_quick(str(tmp_path / "study.log"))
+    monkeypatch.setattr("sb3_tdpg.experiments.studies.PATIENCE", 0.2)
+
+    def fail(*args, **kwargs):
+        raise optuna.exceptions.StorageInternalError("it is gone")
+
+    monkeypatch.setattr(study._storage, "get_all_trials", fail)
+    with pytest.raises(ValueError, match=r"has not answered for 0\.2 seconds: it is gone"):
+        work(study, lambda _: 1.0, 1, report=lambda _: None)
+
+
 def test_workers_that_start_at_once_run_at_most_one_trial_each_beyond_those_asked_for(workers, url):
     team = workers(2)
     team.join(team.start(*[0.5] * 4))

@@ -1,0 +1,109 @@
+"""
+Mutation testing: ``make mutants`` changes the code in small ways and counts the changes that the tests notice.
+
+It covers what computes the results: the losses, the update, the estimators of the information, the certificates and the
+environments. ``mutmut`` changes one operator, number or argument at a time, and runs the tests that reach the changed
+function until one fails. Statements that only word an error or a warning are not changed. By default a random sample
+of the changes is tried; ``--all`` tries every one, for hours. A run that is stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+from statsmodels.stats.proportion import proportion_confint
+
+from sb3_tdpg.common.processes import usable_cores
+
+ROOT = Path(__file__).resolve().parents[1]
+TREE = ROOT / "build" / "mutants"
+GOAL = 0.9
+CODE = [
+    "losses.py", "advantages.py", "auto_weight.py", "buffers.py", "tdpg.py", "information/*.py", "certificates/*.py",
+    "envs/*.py",
+]  # fmt: skip
+TESTS = [
+    "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
+    "test_passes.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py", "information", "certificates", "envs",
+]  # fmt: skip
+SETTINGS = """
+[mutmut]
+source_paths = sb3_tdpg
+only_mutate =
+    {code}
+do_not_mutate_patterns =
+    \\braise \\w+\\(
+    \\bwarnings\\.warn\\(
+    \\bassert\\b
+pytest_add_cli_args_test_selection =
+    {tests}
+pytest_add_cli_args =
+    -m
+    not slow
+use_git_change_detection = false
+"""
+
+
+def stage() -> None:
+    """Lay the tree out as in a wheel, ``envs`` inside the package: mutmut derives a module's name from its path."""
+    TREE.mkdir(parents=True, exist_ok=True)
+    ignore = shutil.ignore_patterns("__pycache__")
+    inside = {name: f"sb3_tdpg/{name}" for name in ("envs", "hyperparams")}
+    for source, target in {"sb3_tdpg": "sb3_tdpg", **inside, "tests": "tests"}.items():
+        shutil.copytree(ROOT / source, TREE / target, ignore=ignore, dirs_exist_ok=True)
+    code = "\n    ".join(f"sb3_tdpg/{path}" for path in CODE)
+    tests = "\n    ".join(f"tests/{path}" for path in TESTS if (ROOT / "tests" / path).exists())
+    (TREE / "setup.cfg").write_text((ROOT / "setup.cfg").read_text() + SETTINGS.format(code=code, tests=tests))
+
+
+def mutmut(*arguments: str, check: bool = True) -> str:
+    """Run it in the tree; return what it prints."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ""}
+    command = [sys.executable, "-m", "mutmut", *arguments]
+    done = subprocess.run(command, cwd=TREE, env=environment, stdout=subprocess.PIPE, text=True)
+    if check and done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)[:200]} failed:\n{done.stdout[-3000:]}")
+    return done.stdout
+
+
+def results() -> dict[str, str]:
+    """Return the state of each mutant: killed, survived, timeout, no tests, not checked, ..."""
+    return dict(re.findall(r"^\s*(\S+): (.+)$", mutmut("results", "--all", "true"), re.MULTILINE))
+
+
+def main() -> int:
+    """Print the share of the changes that the tests notice, and those that they do not; 1 if the goal is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--all", action="store_true", help="try all changes")
+    parser.add_argument("--sample", type=int, default=400, help="number of changes to try")
+    parser.add_argument("--seed", type=int, default=0, help="of the sample")
+    parser.add_argument("--only", default="", help="only mutants whose name contains this text")
+    given = parser.parse_args()
+    stage()
+    # No mutant has that name: this makes the mutants and finds out which tests reach them.
+    mutmut("run", "--max-children", "1", "nothing.*", check=False)
+    names = sorted(name for name in results() if given.only in name)
+    chosen = names if given.all else random.Random(given.seed).sample(names, min(given.sample, len(names)))
+    mutmut("run", "--max-children", str(usable_cores()), *chosen)
+    states = {name: state for name, state in results().items() if name in set(chosen)}
+    survivors = sorted(name for name, state in states.items() if state in ("survived", "no tests"))
+    for name in survivors:
+        print(mutmut("show", name))
+    n_killed = len(states) - len(survivors)
+    low, high = proportion_confint(n_killed, len(states), method="wilson")
+    print(dict(Counter(states.values())))
+    share = f"{n_killed / len(states):.1%} ({low:.1%} to {high:.1%} of all {len(names)}, with 95 % confidence)"
+    print(f"{n_killed} of {len(states)} changes are noticed: {share}; goal {GOAL:.0%}")
+    return int(n_killed / len(states) < GOAL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
