@@ -1,6 +1,7 @@
 # Every target that needs Python first makes the virtual environment below, once.
 PYTHON ?= python3
 VENV ?= .venv
+OLDEST ?= .venv-oldest
 JOBS ?= 2
 EXTRAS ?= zoo,postgres,ray,hub,tests,plots,docs,dev
 
@@ -8,7 +9,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines wheel clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -36,6 +37,21 @@ test: $(STAMP) ## run the tests but for the slow ones
 
 test-slow: $(STAMP) ## run the slow tests
 	OMP_NUM_THREADS=1 $(PY) -m pytest -m slow -n $(JOBS) --dist worksteal
+
+test-oldest: $(OLDEST)/.installed ## run the tests with the lowest versions that setup.cfg allows
+	OMP_NUM_THREADS=1 $(OLDEST)/bin/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile
+
+# No extra "hub": rl-zoo3 2.8 needs an older huggingface_hub.
+$(OLDEST)/.installed: setup.cfg constraints.txt constraints-oldest.txt
+	mkdir -p build
+	grep -v -i -E "^($$(sed -n 's/[=<].*//p' constraints-oldest.txt | paste -s -d '|' -))==" constraints.txt > build/constraints-oldest.txt
+	cat constraints-oldest.txt >> build/constraints-oldest.txt
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --disable-pip-version-check -c build/constraints-oldest.txt -e '.[zoo,postgres,tests,plots]'
+	@touch $@
+
+mutants: $(STAMP) ## change the code in small ways and count the changes that the tests notice (an hour)
+	$(PY) tests/mutants.py
 
 soak: $(STAMP) ## endurance: leaks, killed trainings, killed workers (a quarter of an hour)
 	$(PY) tests/soak.py
