@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
+from pandas.errors import EmptyDataError
 from stable_baselines3.common.monitor import get_monitor_files, load_results
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -96,11 +97,7 @@ def read_run(folder: Path) -> Publication:
             "started it, or give the folder of one run"
         )
     config = json.loads((folder / "config.json").read_text())
-    settings, records = with_numbers(config["settings"]), pd.read_csv(folder / "episodes.csv")
-    if missing := sorted({"attempts", "scenario", "cost"} - set(records)) or ["rows"] * (len(records) == 0):
-        raise ValueError(
-            f"{folder / 'episodes.csv'} has no {', '.join(missing)}: it is not whole; run the command again"
-        )
+    settings, records = with_numbers(config["settings"]), _whole_records(folder / "episodes.csv", config)
     files = {name: folder / name for name in ("config.json", "episodes.csv", "selected.json")}
     notes = [_selection_note(folder, settings)]
     if (attempts := int(records["attempts"].iloc[0])) > 1:
@@ -126,6 +123,23 @@ def read_run(folder: Path) -> Publication:
         files={name: path for name, path in files.items() if path.exists()},
         metrics=sorted(folder.glob("progress_*.csv")),
     )
+
+
+def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
+    """Read the episodes of a run; a file that was cut is refused."""
+    # Early versions recorded neither scenarios nor the number of episodes.
+    expected = config.get("n_eval_episodes", 0) * len(config.get("scenarios", ()))
+    try:
+        records = pd.read_csv(path)
+    except EmptyDataError:
+        records = pd.DataFrame()
+    columns = ["attempts", "scenario", "cost"]
+    if len(records) < max(expected, 1) or records.reindex(columns=columns).isna().any(axis=None):
+        raise ValueError(
+            f"{path} is not whole: it has {len(records)} of {expected or 'some'} episodes, with the columns "
+            f"{', '.join(records) or 'none'}; needed are {', '.join(columns)}. Delete it and run the command again"
+        )
+    return records
 
 
 def read_zoo_folder(

@@ -16,6 +16,7 @@ from published_cards import REPO_ID, blocks, costs_of, text_of
 from small_problems import assert_same_parameters, parameters, tiny_tdpg, train_epochs
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.rerun import rerun
@@ -165,6 +166,18 @@ def test_an_unfinished_run_is_refused_and_nothing_is_written(missing, runs, tmp_
     message = "holds no training" if missing == "config.json" else f"no finished run, since {missing} is missing"
     with pytest.raises(ValueError, match=message):
         write_model_card(copy, tmp_path / "card", REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+@pytest.mark.parametrize("kept", [0, 0.5, 0.98, "model,seed\nPG,0\n"])
+def test_records_that_are_not_whole_are_refused(kept, runs, tmp_path, capsys):
+    copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
+    text = (copy / "episodes.csv").read_text()
+    (copy / "episodes.csv").write_text(kept if isinstance(kept, str) else text[: int(kept * len(text))])
+    assert main(["push", str(copy), "--repo-id", REPO_ID, "--dry-run", "--card", str(tmp_path / "card")]) == 2
+    message = capsys.readouterr().err.strip()
+    assert "episodes.csv" in message and "Delete it and run the command again" in message
+    assert "\n" not in message
     assert not (tmp_path / "card").exists()
 
 
