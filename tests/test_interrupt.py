@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 
@@ -19,6 +20,8 @@ def interrupted(arguments, marker):
     """Run Python in a terminal, press Ctrl-C when it has printed the marker; return exit code and output."""
     pid, terminal = pty.fork()
     if pid == 0:
+        # A shell starts a job in the background with Ctrl-C ignored, and children inherit that.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.execv(sys.executable, [sys.executable, *arguments])
     output, pressed = b"", False
     while True:
