@@ -317,3 +317,23 @@ def test_the_weight_falls_at_most_by_twice_the_rate():
     assert weight.value == pytest.approx(before * math.exp(-0.6))
     weight.update(-1e6, 1.0)
     assert weight.value == pytest.approx(before * math.exp(-0.6 + 0.3))
+
+
+def test_an_epoch_logs_what_it_did():
+    model = tiny_tdpg(n_episodes=40, beta=1 / 75, n_epochs=2, batch_size=20, clip_range=0.2, mi_estimator="logdet")
+    modes = []
+    step = model.policy.optimizer.step
+    model.policy.optimizer.step = lambda *_: (modes.append(model.policy.training), step())[1]
+    train_epochs(model, 1)
+    logged = model.logger.name_to_value
+    cost = model.rollout_buffer.episode_costs.mean()
+    assert logged["train/objective"] == pytest.approx(cost + 75 * model.information.sum(), rel=1e-5)
+    assert logged["train/n_updates"] == 2
+    assert logged["train/trv_std"] == pytest.approx(model.rollout_buffer.stds.mean(), rel=1e-5)
+    # What was minimised is the sum of both parts, of which the penalty is divided as the advantages are.
+    assert logged["train/loss"] > logged["train/policy_loss"]
+    assert {f"train/{name}" for name in ("mi_loss", "mi_coef", "grad_norm", "approx_kl", "clip_fraction")} <= set(
+        logged
+    )
+    assert "tensorboard" in model.logger.name_to_excluded["train/n_updates"]
+    assert modes == [True] * 4

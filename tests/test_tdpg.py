@@ -256,6 +256,12 @@ def test_clipping_can_be_turned_off_when_a_model_is_loaded(tmp_path):
     assert loaded.max_grad_norm == math.inf
 
 
+def test_objects_of_a_file_may_be_replaced_when_it_is_loaded(tmp_path):
+    tiny_tdpg(learning_rate=1e-3).save(tmp_path / "model.zip")
+    model = TDPG.load(tmp_path / "model.zip", custom_objects={"learning_rate": 3e-5})
+    assert model.learning_rate == 3e-5
+
+
 def test_a_policy_gradient_model_warm_starts_tdpg(tmp_path):
     model = tiny_tdpg(beta=math.inf, mi_estimator="mine")
     train_epochs(model, 1)

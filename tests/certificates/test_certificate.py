@@ -207,6 +207,9 @@ def test_the_band_at_a_rank_is_the_quantile_of_its_own_order_statistic():
     # F at the highest of n costs is Beta(n, 1), the lowest Beta(1, n): closed forms.
     n, confidence = 20, 0.95
     share = (1 - confidence) / n  # every rank is used
-    below = np.cumsum(cost_distribution(np.arange(1.0, n + 1), 100.0, confidence).probabilities)
+    costs = np.arange(1.0, n + 1)
+    distribution = cost_distribution(costs, 100.0, confidence)
+    assert distribution.values.tolist() == [*costs, 100.0]
+    below = np.cumsum(distribution.probabilities)
     assert below[n - 1] == pytest.approx(share ** (1 / n))
     assert below[0] == pytest.approx(1 - (1 - share) ** (1 / n))

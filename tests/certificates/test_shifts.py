@@ -18,6 +18,7 @@ from sb3_tdpg.certificates import shifts
 from sb3_tdpg.certificates.certificate import cost_distribution, worst_mean
 from sb3_tdpg.certificates.lava import _load
 from sb3_tdpg.certificates.shifts import (
+    Budget,
     Shift,
     TrainingEpisodes,
     _divergences,
@@ -364,3 +365,17 @@ def test_a_bound_below_a_cost_in_training_is_refused(bound, message, model, tmp_
     arguments = ["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--n-episodes", "3000"]
     assert main([*arguments, "--cost-bound", bound, "--out", str(tmp_path / "out")]) == 2
     assert re.search(message, capsys.readouterr().err)
+
+
+def test_the_budget_with_the_lowest_bound_is_taken(episodes, monkeypatch):
+    loose, tight = Budget(0.01, 0.5), Budget(0.02, 0.0)
+    monkeypatch.setattr(TrainingEpisodes, "budgets", lambda *_: [loose, tight])
+    assert episodes.certify(Shift("any")).budget == tight
+
+
+def test_the_measured_divergence_adds_up_over_the_steps(episodes, monkeypatch):
+    # The last action needs no step of its own: it or the last TRVs, whichever moved less.
+    monkeypatch.setattr(shifts, "_divergences", lambda *_: np.array([[1.0], [10.0], [100.0], [1000.0], [7e4], [5e4]]))
+    shift = lava_shift("any", sensor_bias=(0.01, 0.0))
+    assert shift.name == "any"
+    assert episodes.measure(shift, 10)[1] == pytest.approx(51111.0)

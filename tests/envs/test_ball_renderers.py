@@ -134,3 +134,16 @@ def test_a_policy_has_the_same_mean_cost_with_both_renderers(read_position):
     reference, fast = costs("pybullet"), costs("fast")
     assert reference.mean() < 100  # it is a policy that looks: standing still costs about 100
     assert abs(reference.mean() - fast.mean()) < reference.std(ddof=1) / np.sqrt(60)
+
+
+def test_the_box_around_the_ball_cuts_nothing_off(monkeypatch):
+    renderer = FastRenderer(scene())
+    states = random_states(300, seed=5)
+    states[:, 2] += np.linspace(-2, 4, 300)  # also where it leaves the picture above and below
+    boxed = renderer.images(states).copy()
+
+    def whole(self, centre):
+        return np.zeros((len(centre), 2), int), np.full((len(centre), 2), 64)
+
+    monkeypatch.setattr(FastRenderer, "_bounding_box", whole)
+    np.testing.assert_array_equal(boxed, renderer.images(states))

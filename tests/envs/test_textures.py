@@ -1,0 +1,49 @@
+"""Results depend on the walls, so each must stay the picture that it is."""
+
+import numpy as np
+import pytest
+
+from sb3_tdpg.envs.textures import TEST_TEXTURES, floor_texture, load_texture
+
+# Mean of each colour, and the mean step between neighbouring texels along rows and columns.
+PICTURES = {
+    "floor": (214.000, 227.000, 247.000, 0.100, 0.100),
+    "brick": (159.725, 96.929, 85.205, 9.746, 14.470),
+    "blue_tiles": (87.898, 129.138, 179.005, 9.115, 9.056),
+    "green_leaves": (70.909, 121.098, 39.669, 8.960, 8.966),
+    "yellow_stripes": (197.440, 173.944, 67.919, 6.467, 11.635),
+    "grey_plaster": (145.067, 143.080, 140.092, 13.421, 13.511),
+    "violet_dots": (142.889, 98.381, 159.315, 15.523, 15.522),
+    "turquoise_waves": (76.636, 157.193, 153.722, 7.764, 11.260),
+    "red_planks": (133.929, 54.528, 40.735, 14.662, 5.812),
+    "random-100": (160.696, 143.650, 117.039, 9.720, 9.817),
+    "random-101": (26.182, 149.188, 83.112, 6.914, 5.827),
+    "random-102": (93.637, 131.449, 134.047, 8.541, 8.579),
+    "random-103": (47.644, 73.812, 149.917, 6.554, 6.549),
+    "random-104": (67.994, 145.010, 139.093, 10.197, 11.729),
+    "random-105": (146.843, 144.121, 94.129, 6.421, 6.419),
+    "random-106": (122.602, 56.410, 67.484, 7.993, 7.837),
+    "random-107": (69.323, 52.569, 166.841, 7.882, 7.835),
+    "random-108": (62.528, 148.279, 154.825, 5.807, 7.680),
+    "random-109": (38.421, 149.087, 157.152, 8.149, 7.898),
+    "random-110": (186.156, 96.574, 162.033, 9.689, 5.830),
+    "random-111": (86.274, 154.474, 71.268, 6.747, 7.597),
+    "40%-violet_dots": (152.993, 97.507, 114.846, 10.271, 12.961),
+}
+
+
+def described(picture):
+    pixels = picture.astype(float)
+    steps = [np.abs(np.diff(pixels, axis=axis)).mean() for axis in (0, 1)]
+    return [*pixels.mean(axis=(0, 1)), *steps]
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_wall_is_the_picture_that_the_results_were_measured_with(name):
+    picture = floor_texture() if name == "floor" else load_texture(name)
+    # A texel may be rounded the other way on another machine.
+    assert described(picture) == pytest.approx(PICTURES[name], abs=0.01)
+
+
+def test_every_wall_of_the_test_is_checked():
+    assert set(TEST_TEXTURES) < set(PICTURES)
