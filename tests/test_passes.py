@@ -337,3 +337,9 @@ def test_an_epoch_logs_what_it_did():
     )
     assert "tensorboard" in model.logger.name_to_excluded["train/n_updates"]
     assert modes == [True] * 4
+
+
+def test_a_small_weight_is_a_penalty_too():
+    model = tiny_tdpg(n_episodes=40, beta=10.0, mi_estimator="logdet")
+    train_epochs(model, 1)
+    assert model.logger.name_to_value["train/mi_loss"] == pytest.approx(0.1 * model.information.sum(), rel=1e-4)

@@ -21,6 +21,7 @@ from sb3_tdpg.certificates.shifts import (
     Budget,
     Shift,
     TrainingEpisodes,
+    _budget,
     _divergences,
     beta_kl,
     encode,
@@ -379,3 +380,8 @@ def test_the_measured_divergence_adds_up_over_the_steps(episodes, monkeypatch):
     shift = lava_shift("any", sensor_bias=(0.01, 0.0))
     assert shift.name == "any"
     assert episodes.measure(shift, 10)[1] == pytest.approx(51111.0)
+
+
+def test_a_budget_has_the_divergence_of_every_step():
+    steps = [cost_distribution(np.full(50, kl), confidence=None) for kl in (1.0, 10.0, 100.0, 1000.0, 7e4, 5e4)]
+    assert _budget(steps, 0.5, 0.0).kl == pytest.approx(51111.5)

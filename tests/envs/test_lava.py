@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_tdpg  # noqa: F401  (registers the environments)
 from sb3_tdpg.envs import ENTRY_POINTS
+from sb3_tdpg.envs.lava import LAVA as LAVA_EDGE
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import LAVA, LAVA_TABLE_READING
 from sb3_tdpg.vec_env import BatchedVecEnv
@@ -310,3 +311,11 @@ def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, mess
 def test_a_misspelt_keyword_is_not_swallowed():
     with pytest.raises(TypeError, match="sensor_noise"):
         LavaEnv(sensor_noise=0.1)
+
+
+def test_nothing_leaves_the_lava():
+    env = LavaEnv()
+    state = np.array([[LAVA_EDGE, 0.0], [LAVA_EDGE + 0.1, -1.0]], np.float32)
+    for _ in range(3):
+        state = env._dynamics(state, np.full((2, 1), -3.0))
+        assert state[:, 0] == pytest.approx([LAVA_EDGE] * 2)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_tdpg.envs.textures import TEST_TEXTURES, floor_texture, load_texture
+from sb3_tdpg.envs.textures import TEST_TEXTURES, built_in_texture, floor_texture, load_texture
 
 # Mean of each colour, and the mean step between neighbouring texels along rows and columns.
 PICTURES = {
@@ -40,6 +40,7 @@ def described(picture):
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_wall_is_the_picture_that_the_results_were_measured_with(name):
+    built_in_texture.cache_clear()
     picture = floor_texture() if name == "floor" else load_texture(name)
     # A texel may be rounded the other way on another machine.
     assert described(picture) == pytest.approx(PICTURES[name], abs=0.01)
