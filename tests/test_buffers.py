@@ -91,6 +91,14 @@ def test_the_information_batch_has_a_mask_only_if_an_episode_ended_early(buffer)
     assert buffer.episode_batch().information_batch().alive is None
 
 
+def test_a_forgotten_episode_has_neither_cost_nor_life(buffer):
+    for t in range(T):
+        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, 1.0))
+    buffer.clear_episodes(np.array([1]))
+    assert buffer.costs.sum(0).tolist() == [T, 0, *[T] * (N - 2)]
+    assert buffer.alive.sum(0).tolist() == [T, 0, *[T] * (N - 2)]
+
+
 def test_where_no_episode_runs_the_encoder_has_a_density(buffer):
     buffer.add_step(0, slice(None), **rows(N, 7.0))
     buffer.full = True
