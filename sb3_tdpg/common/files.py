@@ -23,9 +23,8 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
     """
     Give a path to write to; it replaces the target when the block ends without an error.
 
-    After a power cut there is the old or the new content, never a part of it.
-
-    :param path: The target; folders are made. Several processes may replace it at once.
+    Folders are made. Several processes may replace a target at once. After a power cut there is the old or the new
+    content, never a part of it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     # In a folder of its own: a compressed file contains its name, which must not vary.

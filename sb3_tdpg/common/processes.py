@@ -27,13 +27,9 @@ def process_pool(
     """
     Open a pool of worker processes, which start tasks in the order in which they are submitted.
 
-    Every worker computes with one thread, in a process that has computed nothing before. Workers ignore Ctrl-C; an
-    exception in the ``with`` block, such as ``KeyboardInterrupt``, stops all of them at once. They also end when this
-    process is killed.
-
-    :param n_processes: Number of workers.
-    :param initializer: Called once in each worker before its first task.
-    :param initargs: Arguments of the initializer.
+    Every worker computes with one thread, in a process that has computed nothing before; it calls the ``initializer``
+    before its first task. Workers ignore Ctrl-C; an exception in the ``with`` block, such as ``KeyboardInterrupt``,
+    stops all of them at once. They also end when this process is killed.
     """
     # All workers are forked from one process that has imported the package once and computed nothing.
     context: Any = mp.get_context("spawn")

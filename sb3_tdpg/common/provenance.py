@@ -56,13 +56,7 @@ def provenance() -> dict[str, Any]:
 
 
 def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str] = ()) -> str:
-    """
-    Say in a sentence how a summary was made.
-
-    :param command: The command that makes it again.
-    :param how: The result of :func:`provenance`.
-    :param commits: The commits at which the runs were made, if they are known.
-    """
+    """Say how a summary was made: the command that makes it again, its :func:`provenance`, the commits of its runs."""
     versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
     git: Mapping[str, Any] = how["git"] or dict(commit="outside a checkout", dirty=False)
     commit = git["commit"] + " with uncommitted changes" * git["dirty"]
@@ -85,9 +79,8 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
 
-    :param path: The file, which may be missing.
-    :param config: What it must hold, and nothing else: a file of an earlier version may lack a setting.
-    :param what: What lies in its folder, for the message.
+    The file may be missing. A setting that it lacks (a file of an earlier version may) is a difference. ``what`` names
+    the content of its folder in the message.
     """
     if not path.exists():
         return
@@ -141,11 +134,9 @@ def _excerpt(text: str, start: int) -> str:
 
 def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
     """
-    Write a frame as CSV without its index, atomically.
+    Write a frame as CSV without its index, atomically; the same frame gives the same bytes.
 
-    :param frame: Records or a table.
-    :param path: ``.csv``, or ``.csv.gz`` or ``.csv.xz`` (smaller) to compress it; folders are made. The same frame
-        gives the same bytes.
+    The path ends in ``.csv``, or in ``.csv.gz`` or ``.csv.xz`` (smaller) to compress it; folders are made.
     """
     if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
         raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")

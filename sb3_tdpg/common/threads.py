@@ -18,12 +18,11 @@ def set_threads(n: int) -> None:
 @contextmanager
 def threads(n: int | None) -> Iterator[None]:
     """
-    Run a block of code, or a function (``@threads(1)``), with this many threads; ``None`` changes nothing.
+    Run a block of code, or a function (``@threads(1)``), with this many threads of torch and of the linear algebra of
+    NumPy and SciPy; ``None`` changes nothing.
 
     One thread is best for small arrays. A second thread gains 10 % if a core is free. If other programs use the cores,
     the two threads wait for each other at every step and can take a hundred times as long.
-
-    :param n: threads of torch, and of NumPy's and SciPy's linear algebra
     """
     if n is None:
         yield

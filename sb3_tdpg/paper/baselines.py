@@ -7,12 +7,12 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, make_output_format
@@ -71,13 +71,9 @@ class TimedRun(Run):
 
 @dataclass(frozen=True)
 class SB3Run(TimedRun):
-    """
-    A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew.
+    """A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew."""
 
-    :param algo: ``"ppo"`` or ``"ppo_lstm"``; the block is in ``hyperparams/<algo>.yml``.
-    """
-
-    algo: str = "ppo"
+    algo: str = "ppo"  # or "ppo_lstm"; the block is in hyperparams/<algo>.yml
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -90,7 +86,8 @@ class SB3Run(TimedRun):
         return {**super().config, "algo": self.algo}
 
     def _learn(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
-        algorithm, path = _algorithm(self.algo), folder / "model.zip"
+        algorithm: Any = {"ppo": PPO, "ppo_lstm": RecurrentPPO}[self.algo]
+        path = folder / "model.zip"
         if path.exists():
             return algorithm.load(path, device="cpu"), False
         settings = self.settings
@@ -106,13 +103,6 @@ class SB3Run(TimedRun):
         return model, False
 
 
-def _algorithm(name: str) -> Any:
-    try:
-        return PPO if name == "ppo" else import_module("sb3_contrib").RecurrentPPO
-    except ImportError as e:
-        raise ImportError("RecurrentPPO needs sb3-contrib: pip install sb3-contrib") from e
-
-
 def training_time(folder: Path) -> dict[str, float]:
     """Return the total ``wall_s`` and ``cpu_s`` of the training of a run, including failed attempts."""
     times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
@@ -121,17 +111,11 @@ def training_time(folder: Path) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Baseline(Method):
-    """
-    One row of the table: how it is trained.
+    """One row of the table: how it is trained."""
 
-    :param algo: ``"tdpg"``, ``"ppo"`` or ``"ppo_lstm"``; the block is in ``hyperparams/<algo>.yml``.
-    :param max_seeds: Train at most this many seeds; for expensive methods.
-    :param is_shown: Whether the table shows it; a first stage need not be shown.
-    """
-
-    algo: str = "tdpg"
-    max_seeds: float = math.inf
-    is_shown: bool = True
+    algo: str = "tdpg"  # or "ppo", "ppo_lstm"; the block is in hyperparams/<algo>.yml
+    max_seeds: float = math.inf  # fewer for expensive methods
+    is_shown: bool = True  # a first stage need not be shown
 
     def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
         """Return the timed run of this baseline with one seed."""
@@ -257,8 +241,6 @@ GRASP_BASELINES = Comparison(
     digits=3,
 )
 
-COLUMNS = ["env_id", *RECORD_COLUMNS]
-
 
 def reproduce_baselines(
     out: Path,
@@ -306,7 +288,7 @@ def reproduce_baselines(
         sections += [f"## {each.title}", baselines_table(table, each.columns, seeds, each.digits)]
         if has_groups:
             sections += ["Row by row:", baselines_table(table, [row.name for row in each.rows[1:]], digits=each.digits)]
-    frame = read_records(everything)[COLUMNS].round({"cost": 4})
+    frame = read_records(everything)[["env_id", *RECORD_COLUMNS]].round({"cost": 4})
     write_frame_atomically(frame, out / "episodes.csv.xz")
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True).round(4), out / "seeds.csv")
     return write_results(out, [*sections, FOOTER], everything, "make reproduce-baselines", given.publish)

@@ -54,21 +54,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Method:
-    """
-    One column of a table: how it is trained and evaluated.
-
-    :param label: Title of the column.
-    :param block: Block of ``hyperparams/tdpg.yml``.
-    :param start: Label of the method whose policy it starts from, with the same seed; ``None``: from scratch.
-    :param renderer: Renderer of the images for the evaluation, if the environment has several.
-    :param overrides: Settings that replace those of the block.
-    :param max_attempts: See :class:`~sb3_tdpg.experiments.runs.Run`.
-    """
+    """One column of a table, with the title ``label``: how it is trained (see ``Run``) and evaluated."""
 
     label: str
     block: str
-    start: str | None = None
-    renderer: str = "fast"
+    start: str | None = None  # label of the method whose policy it starts from, with the same seed
+    renderer: str = "fast"  # of the images in the evaluation, if the environment has several
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
 
@@ -85,11 +76,9 @@ def make_tasks(
     overrides: Mapping[str, Any],
 ) -> list[Task]:
     """
-    Make the runs of several methods, some of which start from the policy of another one with the same seed.
+    Make the runs of several methods with their seeds, and list the rows that each is evaluated on.
 
-    :param methods: Methods with their seeds, each after the method that it starts from.
-    :param rows: Returns the rows that a method is evaluated on.
-    :param overrides: Settings that replace those of every block.
+    A method that starts from the policy of another one with the same seed comes after it.
     """
     tasks: list[Task] = []
     for method, seed in methods:
@@ -134,10 +123,7 @@ def comparisons_table(
     """
     Write how likely a seed of one method beats a seed of another one, and the paired difference of their means.
 
-    :param table: Records with a column ``train_seed``.
-    :param comparisons: Labels of a method and of the method that it is compared with; missing methods are left out.
-    :param kinds: Rows over which the mean is taken, by name.
-    :param quantity: Name of the mean in the header.
+    Each mean is over the rows of one of ``kinds``. Comparisons with a method that the records lack are left out.
     """
     columns = ["method", "compared with", "rows", "probability of being better [95 %]"]
     columns += [f"{quantity} of the method", f"{quantity} of the other", "difference [95 %]"]
@@ -162,12 +148,7 @@ def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> st
 def write_results(
     out: Path, sections: Sequence[str], tasks: Sequence[Task], command: str, publish: Path | None = None
 ) -> str:
-    """
-    Write ``summary.md`` and ``config.json``, copy all files to another folder if asked to, and return the summary.
-
-    :param command: The command that makes the results again.
-    :param publish: Folder that gets the copy, without the runs.
-    """
+    """Write ``summary.md`` and ``config.json``, copy all but the runs to ``publish`` if given, return the summary."""
     how = provenance()
     write_run_config(out / "config.json", dict(runs=[run.config for run, *_ in tasks], provenance=how))
     # There are several commits if the reproduction was resumed after a change.

@@ -158,11 +158,7 @@ def _seed_means(
 
 
 def failures_by_yaw(records: pd.DataFrame) -> Figure:
-    """
-    Draw the share of failed grasps over the mug's yaw in polar coordinates, which shows the effect of the handle.
-
-    :param records: Episodes with the columns ``model``, ``yaw`` (rad) and ``cost`` (1 for a failure).
-    """
+    """Draw the share of failed grasps over the mug's yaw (rad) in polar coordinates: the effect of the handle."""
     figure = new_figure(5.2, 5.2)
     axes = figure.add_subplot(projection="polar")
     _draw_failures(figure, axes, records, records["yaw"] % (2 * np.pi), np.linspace(0, 2 * np.pi, 25))
@@ -172,12 +168,7 @@ def failures_by_yaw(records: pd.DataFrame) -> Figure:
 
 
 def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
-    """
-    Draw the share of failed grasps over the height of the camera above its usual place.
-
-    :param records: Episodes with the columns ``model``, ``camera`` (m) and ``cost`` (1 for a failure).
-    :param n_bins: Number of intervals of the height.
-    """
+    """Draw the share of failed grasps over the height of the camera above its usual place, ``camera`` (m)."""
     figure = new_figure(WIDTH * 0.7, 3.2)
     axes = figure.add_subplot()
     tidy(axes)

@@ -28,7 +28,7 @@ from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.scale import default_scale
-from sb3_tdpg.robustness.sensor import kind_of
+from sb3_tdpg.robustness.sensor import horizon_of, kind_of
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
@@ -161,8 +161,7 @@ def _look_at(env_id: str, env_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, 
     except Exception as e:
         raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
     with closing(env):
-        horizon = env.get_attr("horizon", [0])[0] if env.has_attr("horizon") else None
-        return env.observation_space, horizon, default_scale(env.observation_space, env)
+        return env.observation_space, horizon_of(env), default_scale(env.observation_space, env)
 
 
 def _check_fit(models: Models, rows: Sequence[Row]) -> None:

@@ -30,26 +30,15 @@ Models = Mapping[str, Sequence[Any]]
 
 @dataclass(frozen=True)
 class Plan:
-    """
-    Settings that all rows share.
-
-    :param env_id: A registered id.
-    :param env_kwargs: Keywords of the unperturbed environment.
-    :param sources: Models by method; files, if several processes run them.
-    :param n_episodes: Episodes of each model in each row.
-    :param seed: Seed of environments, policies and perturbations.
-    :param deterministic: Act without noise.
-    :param scale: Scale of the components of a vector, so that all models meet the same perturbations; ``None`` for
-        images.
-    """
+    """Settings that all rows share."""
 
     env_id: str
-    env_kwargs: Mapping[str, Any]
-    sources: Mapping[str, Sequence[Source]]
-    n_episodes: int
-    seed: int
+    env_kwargs: Mapping[str, Any]  # of the unperturbed environment
+    sources: Mapping[str, Sequence[Source]]  # by method; files, if several processes run them
+    n_episodes: int  # of each model in each row
+    seed: int  # of environments, policies and perturbations
     deterministic: bool
-    scale: np.ndarray | None
+    scale: np.ndarray | None  # of the components of a vector, the same for all models; None for images
 
 
 def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:

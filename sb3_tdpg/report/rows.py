@@ -13,7 +13,7 @@ from gymnasium import spaces
 from sb3_tdpg.common.provenance import jsonable
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.robustness import applicable, scene_perturbations
-from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS
+from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS, find_applicable
 
 UNPERTURBED = "unperturbed"
 ALL = "all perturbations"
@@ -24,21 +24,13 @@ FAST: Mapping[str, Mapping[str, Any]] = {"BallCatch-v0": dict(renderer="fast")}
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One condition in which every model is run.
+    """One condition in which every model is run."""
 
-    :param perturbation: Name of the perturbation, or title of a test row of the environment.
-    :param severity: 1 to 5, and 0 if there are no severities.
-    :param kind: ``"unperturbed"``, ``"own"`` (a test row of the environment), ``"sensor"`` or ``"scene"``.
-    :param scenario: The environment with its keywords.
-    :param value: The parameter of a sensor perturbation.
-    """
-
-    perturbation: str
-    severity: int
-    kind: str
+    perturbation: str  # its name, or the title of a test row of the environment
+    severity: int  # 1 to 5, and 0 if there are no severities
+    kind: str  # "unperturbed", "own" (a test row of the environment), "sensor" or "scene"
     scenario: Scenario
-    value: float | None = None
+    value: float | None = None  # the parameter of a sensor perturbation
 
     @property
     def title(self) -> str:
@@ -86,15 +78,13 @@ def make_rows(
     for name in names:
         if name not in PERTURBATIONS and name not in scenes:
             raise ValueError(f"perturbation={name!r} is unknown; this environment has {known}")
-        if name not in known:
-            objection = PERTURBATIONS[name].objection(space, horizon)
-            raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
+        sensor = None if name in scenes else find_applicable(name, space, horizon)
         for severity in severities:
-            if name in scenes:
+            if sensor is None:
                 scenario = Scenario(name, env_id, {**env_kwargs, **scenes[name][severity - 1]})
                 rows.append(Row(name, severity, "scene", scenario))
             else:
-                rows.append(Row(name, severity, "sensor", plain, PERTURBATIONS[name].value(severity)))
+                rows.append(Row(name, severity, "sensor", plain, sensor.value(severity)))
     # The first row of a table of the paper is the training row.
     for own in PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:] if scenarios is None else scenarios:
         rows.append(Row(own.name, 0, "own", Scenario(own.name, own.env_id, {**env_kwargs, **own.env_kwargs})))
