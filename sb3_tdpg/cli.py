@@ -11,6 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
+
+from sb3_tdpg.common.files import kept_by_this_process
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
@@ -44,7 +48,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(out: Path, **options: Any) -> None:
-    from sb3_tdpg.common.files import kept_by_this_process
     from sb3_tdpg.paper.lava import demo
 
     with kept_by_this_process(out):
@@ -80,7 +83,6 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
             flag = "--no-controls" if name == "controls" else f"--{name.replace('_', '-')}"
             others = " and ".join(other for other in EXPERIMENTS if name in EXPERIMENTS[other].flags)
             raise ValueError(f"{flag} is for {others}, not for {experiment}")
-    from sb3_tdpg.common.files import kept_by_this_process
 
     out = out or Path("results", chosen.folder)
     with kept_by_this_process(out):
@@ -89,7 +91,7 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
 
 
 def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
-    from sb3_tdpg.evaluation.enjoy import enjoy, parse_keywords
+    from sb3_tdpg.evaluation.enjoy import enjoy
 
     enjoy(model, env, parse_keywords(env_kwargs), **options)
 
@@ -104,8 +106,6 @@ def _zoo(program: str, arguments: Sequence[str]) -> None:
 
 
 def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> None:
-    from sb3_tdpg.common.files import kept_by_this_process
-    from sb3_tdpg.evaluation.enjoy import parse_keywords
     from sb3_tdpg.experiments.sweep import sweep
 
     out = options.pop("out") or Path("results", f"sweep-{options['block'] or env}")
@@ -117,8 +117,6 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
 
 def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, **options: Any) -> None:
     from sb3_tdpg.certificates.lava import certify_lava
-    from sb3_tdpg.common.files import kept_by_this_process
-    from sb3_tdpg.evaluation.enjoy import parse_keywords
 
     if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
@@ -131,9 +129,7 @@ def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: P
 
 
 def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:
-    from sb3_tdpg.common.files import kept_by_this_process
     from sb3_tdpg.common.processes import usable_cores
-    from sb3_tdpg.evaluation.enjoy import parse_keywords
     from sb3_tdpg.report import parse_models, robustness_report
 
     out = out or Path("results", f"report-{env.rpartition(':')[2]}")
@@ -162,6 +158,41 @@ def _pull(repo_id: str, to: Path) -> None:
     from sb3_tdpg.hub import pull_from_hub
 
     print(f"{repo_id} is in {pull_from_hub(repo_id, to)}")
+
+
+def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
+    """
+    Parse keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
+
+    :param texts: ``key=value`` each, with a YAML value: a number, a text, true, false, null or a list of these.
+    :raises ValueError: if a text has another form, or a key occurs twice.
+    """
+    keywords: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (equals and key.isidentifier()):
+            raise ValueError(f"{text!r} is not a keyword of an environment: write key=value, for instance horizon=10")
+        if key in keywords:
+            raise ValueError(f"{text!r}: {key} is given twice")
+        try:
+            keywords[key] = _plain(yaml.safe_load(value))
+        except (yaml.YAMLError, TypeError) as e:
+            raise ValueError(
+                f"{text!r}: the value must be a number, a text, true, false, null or a list of these"
+            ) from e
+    return keywords
+
+
+def _plain(value: Any) -> Any:
+    """Refuse anything but scalars and lists, and read 1e-3 as a number, which PyYAML reads as text."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return float(value)
+    if not isinstance(value, (str, bool, int, float, type(None))):
+        raise TypeError(f"{value!r} is a {type(value).__name__}")
+    return value
 
 
 # rl-zoo3's programs parse their own flags.

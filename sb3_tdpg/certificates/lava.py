@@ -21,7 +21,7 @@ from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit
-from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, legend_above, log_axis, new_figure, tidy
+from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, legend_above, log_axis, new_panels
 from sb3_tdpg.tdpg import TDPG
 
 if TYPE_CHECKING:
@@ -226,8 +226,7 @@ def _theorem_table(theorem: pd.DataFrame, random: pd.DataFrame) -> str:
 
 def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float) -> Figure:
     """Draw the bound over the cost, and both over the size of the shift, from ``random.csv`` and ``paper.csv``."""
-    figure = new_figure(WIDTH, 4.0)
-    against_cost, against_size = figure.subplots(1, 2, sharey=True)
+    figure, ((against_cost, against_size),) = new_panels(WIDTH, 4.0, 1, 2, sharey=True)
     for color, label in zip(cycle(PALETTE), random["model"].unique(), strict=False):
         group = random[random["model"] == label]
         rows = paper[(paper["model"] == label) & (paper["sensor_kl"] > 0)]
@@ -246,7 +245,6 @@ def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float
     for axes in (against_cost, against_size):
         axes.axhline(trivial, color=INK, linestyle=(0, (4, 3)), linewidth=1)
         axes.grid(alpha=0.25)
-        tidy(axes)
     log_axis(against_cost, "x", subs=(1, 3))
     log_axis(against_cost, "y", subs=(1, 2, 5))
     against_size.set_xscale("log")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg.envs.scenarios import Scenario
@@ -109,38 +108,3 @@ class _Recorder(gym.Wrapper):
         if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
             raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
         return picture
-
-
-def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
-    """
-    Parse keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
-
-    :param texts: ``key=value`` each, with a YAML value: a number, a text, true, false, null or a list of these.
-    :raises ValueError: if a text has another form, or a key occurs twice.
-    """
-    keywords: dict[str, Any] = {}
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not (equals and key.isidentifier()):
-            raise ValueError(f"{text!r} is not a keyword of an environment: write key=value, for instance horizon=10")
-        if key in keywords:
-            raise ValueError(f"{text!r}: {key} is given twice")
-        try:
-            keywords[key] = _plain(yaml.safe_load(value))
-        except (yaml.YAMLError, TypeError) as e:
-            raise ValueError(
-                f"{text!r}: the value must be a number, a text, true, false, null or a list of these"
-            ) from e
-    return keywords
-
-
-def _plain(value: Any) -> Any:
-    """Refuse anything but scalars and lists, and read 1e-3 as a number, which PyYAML reads as text."""
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            return float(value)
-    if not isinstance(value, (str, bool, int, float, type(None))):
-        raise TypeError(f"{value!r} is a {type(value).__name__}")
-    return value

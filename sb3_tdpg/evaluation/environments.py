@@ -22,13 +22,10 @@ def scenario_env(
     scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int | None = None, sensor: EnvWrapper | None = None
 ) -> VecEnv:
     """
-    Make a new environment of a scenario, wrapped as the model needs it.
+    Make a new environment of a scenario (see ``make_episodes_env``), wrapped as an SB3 model needs it.
 
-    :param model: An SB3 model. If its own environment normalises observations (``VecNormalize``), the new one does so
-        with the same statistics, frozen.
-    :param n_episodes: Number of episodes to run at a time.
-    :param n_envs: Number of environments; default: see :func:`~sb3_tdpg.vec_env.make_episodes_env`.
-    :param sensor: A wrapper to put around the environment, inside those of the model.
+    If the model's own environment normalises observations (``VecNormalize``), the new one does so with the same
+    statistics, frozen. A ``sensor`` is put around the environment, inside the wrappers of the model.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False

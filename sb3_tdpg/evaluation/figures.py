@@ -35,8 +35,7 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
 
     :param progress: Log of SB3's CSV logger by label: ``pandas.read_csv("progress.csv")``.
     """
-    figure = new_figure(WIDTH, 2.8)
-    cost, information = (figure.add_subplot(1, 2, i) for i in (1, 2))
+    figure, ((cost, information),) = new_panels(WIDTH, 2.8, 1, 2)
     for color, (label, frame) in zip(cycle(PALETTE), progress.items(), strict=False):
         epochs = frame["time/iterations"]
         cost.plot(epochs, frame["rollout/ep_cost_mean"], color=color, label=label)
@@ -49,7 +48,6 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
     for axes in (cost, information):
         axes.set_xlabel("policy epoch", fontsize=9)
         axes.grid(alpha=0.25)
-        tidy(axes)
     legend_above(figure, cost)
     return figure
 
@@ -60,9 +58,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
 
     :param frame: From :func:`~sb3_tdpg.evaluation.interval_frame`.
     """
-    figure = new_figure(WIDTH * 0.75, 3.4)
-    axes = figure.add_subplot()
-    tidy(axes)
+    figure, ((axes,),) = new_panels(WIDTH * 0.75, 3.4)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
     axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
     axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # visible also with one step
@@ -150,6 +146,17 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) ->
 def new_figure(width: float, height: float) -> Figure:
     """Make an empty figure with a constrained layout; the size is in inches."""
     return import_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
+
+
+def new_panels(
+    width: float, height: float, n_rows: int = 1, n_columns: int = 1, **options: Any
+) -> tuple[Figure, np.ndarray]:
+    """Make a figure as :func:`new_figure` does, with tidy panels, ``(n_rows, n_columns)``."""
+    figure = new_figure(width, height)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False, **options)
+    for axes in panels.flat:
+        tidy(axes)
+    return figure, panels
 
 
 def log_axis(axes: Axes, which: str, subs: tuple[int, ...]) -> None:

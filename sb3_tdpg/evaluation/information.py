@@ -93,7 +93,7 @@ def information_report(
     seed: int = 0,
     *,
     names: Sequence[str] | None = None,
-    at_end: Callable[[], Any] | None = None,
+    at_end: Callable[[], Any] = lambda: None,
 ) -> InformationReport:
     """
     Run fresh episodes and estimate what the policy's TRVs know about the state at each time step.
@@ -117,7 +117,6 @@ def information_report(
     batches, costs = zip(*(encode_episodes(model, env, seed=each) for each in seeds), strict=True)
     batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*batches, strict=True)))
     batch = batch.select(th.arange(n_episodes))
-    at_end = at_end or (lambda: None)
     interval = information_interval(batch, seed=seed)
     at_end()
     known = state_knowledge(batch, names, seed=seed)

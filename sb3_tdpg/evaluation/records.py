@@ -91,9 +91,8 @@ def run_episodes(
     at_end: Callable[[], Any] = lambda: None,
 ) -> pd.DataFrame:
     """
-    Run one model in one scenario that it fits; see :func:`evaluate_scenarios`.
+    Run one model in one scenario that it fits; see :func:`evaluate_scenarios`, and for ``sensor`` ``scenario_env``.
 
-    :param sensor: A wrapper to put around the environment, inside those of the model.
     :param at_end: Called at the end of each episode.
     :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``:
         first the first episodes of all environments, then the second ones, and so on

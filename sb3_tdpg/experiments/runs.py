@@ -187,12 +187,9 @@ def read_progress(folder: Path) -> pd.DataFrame:
 
 def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: int | None = None) -> None:
     """
-    Complete runs in parallel processes, with a progress bar; Ctrl-C keeps finished runs and checkpoints.
+    Complete runs (see :func:`complete_run`) in parallel processes, with a progress bar; default: one for each core.
 
-    :param tasks: Runs, their folders and scenarios, see :func:`complete_run`. A run that starts from the policy of
-        another one waits for it.
-    :param n_eval_episodes: Episodes of each scenario.
-    :param jobs: Number of runs at a time; default: the number of cores.
+    A run that starts from the policy of another one waits for it. Ctrl-C keeps finished runs and checkpoints.
     """
     jobs = jobs or usable_cores()
     for _, folder, _ in tasks:  # an error here comes before the progress bar

@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.figures import (
-    INK,
-    WIDTH,
-    import_matplotlib,
-    legend_above,
-    log_axis,
-    new_figure,
-    short_name,
-    tidy,
-)  # fmt: skip
+from sb3_tdpg.evaluation.figures import INK, WIDTH, import_matplotlib, legend_above, log_axis, new_panels, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,15 +25,13 @@ def tradeoff_figure(runs: pd.DataFrame, rows: Mapping[str, str], best: pd.Series
     Draw cost against information, one point for each run, and beside it the cost of each run in each scenario.
 
     :param runs: ``label``, ``seed``, ``cost``, ``information`` (nats) and the columns of ``rows`` for each run, in the
-        order of drawing.
+        order of drawing. ``best`` is the selected one.
     :param rows: Column of the mean cost by name of the scenario, the reference first.
-    :param best: The selected run, which is marked.
-    :param cost_limit: Drawn as a line.
     """
     matplotlib = import_matplotlib()
     has_rows = len(rows) > 1
-    figure = new_figure(WIDTH, 4.2)
-    panels = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.15)) if has_rows else [figure.add_subplot()]
+    widths = (1, 1.15) if has_rows else (1,)
+    figure, (panels,) = new_panels(WIDTH, 4.2, 1, len(widths), sharey=True, width_ratios=widths)
     labels = list(runs["label"].unique())
     shades = matplotlib.colormaps["viridis_r"](np.linspace(0.12, 1.0, len(labels)))
     colors = {label: INK if label == "inf" else shade for label, shade in zip(labels, shades, strict=True)}
@@ -72,7 +61,6 @@ def tradeoff_figure(runs: pd.DataFrame, rows: Mapping[str, str], best: pd.Series
         axes.axhline(cost_limit, color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
         axes.grid(alpha=0.25)
         axes.margins(y=0.08)
-        tidy(axes)
     where: dict[str, Any] = dict(xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(0, 3))
     style: dict[str, Any] = dict(ha="right", fontsize=8, color=LIMIT_COLOR)
     scatter.annotate(f"cost limit {cost_limit:g}", (0.99, cost_limit), **where, **style)

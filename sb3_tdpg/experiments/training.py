@@ -50,9 +50,8 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
     """
     Make the environments of a training, and remove their settings from a block.
 
-    :param env_id: A registered id.
-    :param settings: ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of
-        ``VecNormalize``, to which the zoo adds ``gamma``) are removed.
+    These are ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of ``VecNormalize``,
+    to which the zoo adds ``gamma``).
     """
     env = make_episodes_env(
         env_id,

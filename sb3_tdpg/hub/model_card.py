@@ -60,12 +60,10 @@ def model_card(
     publication: Publication, results: pd.DataFrame, repo_id: str, pictures: Collection[str] = ()
 ) -> ModelCard:
     """
-    Make the card. As for any Stable-Baselines3 model, the metric is the mean reward, here the negative cost.
+    Make the card of a repository, with the results of :func:`results_with_intervals`.
 
-    :param publication: What is published.
-    :param results: From :func:`results_with_intervals`.
-    :param repo_id: The repository that the card is for.
-    :param pictures: Files in the folder of the card; ``training.png`` and ``replay.mp4`` are shown.
+    As for any Stable-Baselines3 model, the metric is the mean reward, here the negative cost. Of the ``pictures`` in
+    the folder, ``training.png`` and ``replay.mp4`` are shown.
     """
     changes = {row.name: _changes(publication, row.env_kwargs) for row in publication.scenarios}
     task = "reinforcement-learning"

@@ -150,7 +150,6 @@ def read_zoo_folder(
 
     This is the policy at the end of the training or, if there is none, ``best_model.zip``.
 
-    :param folder: The folder.
     :param scenarios: Where to evaluate; default: the rows of the paper's table or, without any, the training
         environment, whose keywords hold unless a scenario replaces them.
     :param n_eval_episodes: Episodes of each scenario.

@@ -7,7 +7,7 @@ Dimension key: T time steps, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -29,6 +29,7 @@ from sb3_tdpg.measurement.interval_bounds import (
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
+COMPONENT_CONFIDENCE = 0.95  # of a lower limit for one component of the state, which is one-sided
 # Shares of the probability to miss. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
@@ -79,13 +80,6 @@ def normal_quantile(miss: float) -> float:
     return NormalDist().inv_cdf(1 - miss)
 
 
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Find where a function crosses zero."""
-    from scipy.optimize import brentq  # its import takes half a second
-
-    return brentq(function, low, high)
-
-
 def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
     Divide the probability to miss between two limits, given the gap between their bounds.
@@ -98,13 +92,15 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
     :param miss: Probability that either limit misses.
     :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.
     """
+    from scipy.optimize import brentq  # its import takes half a second
+
     normal, gap, least = NormalDist(), max(0.0, gap), normal_quantile(miss)  # in this order NaN becomes 0
 
     def excess(c: float) -> float:
         return normal.cdf(-c) + normal.cdf(-c - gap) - miss
 
     # With a wide gap, rounding can put the root just below its lower limit.
-    c = _root(excess, least, normal_quantile(miss / 2) + 1e-9) if excess(least) > 0 else least
+    c = brentq(excess, least, normal_quantile(miss / 2) + 1e-9) if excess(least) > 0 else least
     return normal.cdf(-c)
 
 
@@ -117,12 +113,14 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
     of one, independent ones about Bonferroni's. The probability must be below 0.5.
     """
+    from scipy.optimize import brentq
+
     slopes = np.sqrt([(1 - rho) / (1 + rho) for rho in np.clip(correlations, -1 + 1e-9, 1)])
 
     def excess(c: float) -> float:
         return NormalDist().cdf(-c) + 2 * owens_t(c, slopes).sum() - miss
 
-    return _root(excess, normal_quantile(miss) - 1e-9, normal_quantile(miss / (1 + len(slopes))) + 1e-9)
+    return brentq(excess, normal_quantile(miss) - 1e-9, normal_quantile(miss / (1 + len(slopes))) + 1e-9)
 
 
 def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, float]:
@@ -231,9 +229,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     )
 
 
-def component_estimates(
-    batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     r"""
     Bound the information of the TRVs about each component of the state from below, I[x^k_t; x~_t].
 
@@ -242,10 +238,9 @@ def component_estimates(
     Gaussian critic gives the better bound.
 
     :param batch: As for :func:`information_interval`.
-    :param confidence: Confidence of the lower limits, which are one-sided.
     :param seed: Seed of the division of the episodes and of the noise.
-    :return: the estimates and their lower limits, ``(T, X)`` each, nats; NaN where a component is constant and where
-        too few episodes are alive
+    :return: the estimates and their lower limits, each with a confidence of 95 %, ``(T, X)`` each, nats; NaN where a
+        component is constant and where too few episodes are alive
     :raises ValueError: as ``check_batch``.
     """
     values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
@@ -254,7 +249,7 @@ def component_estimates(
             of_one = step._replace(states=step.states[:, [k]])
             bounds = dict(critic=critic_bounds(of_one, rng)[0], gaussian=gaussian_bound(of_one, rng))
             values[0, t, k] = max(bound.value for bound in bounds.values())
-            _, values[1, t, k] = limit(bounds, 1 - confidence, sign=-1)
+            _, values[1, t, k] = limit(bounds, 1 - COMPONENT_CONFIDENCE, sign=-1)
     return values[0], values[1]
 
 

@@ -19,8 +19,8 @@ from sb3_tdpg.evaluation.figures import (
     legend_above,
     log_axis,
     new_figure,
+    new_panels,
     short_name,
-    tidy,
 )  # fmt: skip
 from sb3_tdpg.evaluation.records import rollout_states
 
@@ -44,8 +44,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Fig
     shown = records[records["scenario"].isin(names)]
     if missing := sorted(set(names) - set(shown["scenario"])):
         raise ValueError(f"the records have no episodes of the scenarios {missing}")
-    figure = new_figure(WIDTH, 2.9)
-    panels = _panels(figure, 1, len(scenarios))[0]
+    figure, (panels,) = new_panels(WIDTH, 2.9, 1, len(scenarios), sharex=True, sharey=True)
     low, high = shown["cost"].min(), shown["cost"].max()
     is_positive = low > 0
     if is_positive:
@@ -80,8 +79,8 @@ def lava_trajectories(
     :param n_episodes: Number of episodes in a panel; all panels have the same start positions.
     """
     matplotlib = import_matplotlib()
-    figure = new_figure(WIDTH, 0.6 + 2.4 * len(NOISE_VARIANCES))
-    panels = _panels(figure, len(NOISE_VARIANCES), len(models))
+    n_rows = len(NOISE_VARIANCES)
+    figure, panels = new_panels(WIDTH, 0.6 + 2.4 * n_rows, n_rows, len(models), sharex=True, sharey=True)
     colors = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(WALL, LAVA), "viridis")
     for row, variance in zip(panels, NOISE_VARIANCES, strict=True):
         for axes, (label, model) in zip(row, models.items(), strict=True):
@@ -109,15 +108,14 @@ def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_ro
     :param noise_rows: Ordered scenarios, which follow the training row in the left panel.
     :param other_rows: Unordered scenarios for the right panel.
     """
-    figure = new_figure(WIDTH, 3.6)
-    panels = figure.subplots(1, 2, sharey=True, width_ratios=(len(noise_rows) + 1, len(other_rows)))
+    widths = len(noise_rows) + 1, len(other_rows)
+    figure, (panels,) = new_panels(WIDTH, 3.6, 1, 2, sharey=True, width_ratios=widths)
     for axes, rows in zip(panels, (["Training", *noise_rows], list(other_rows)), strict=True):
         for color, model, at, seeds in _seed_means(records, "cost", rows, spacing=0.1):
             axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4, alpha=0.7)
             style = "-" if axes is panels[0] else ""
             axes.plot(at, seeds.median().to_numpy(), style + "_", color=color, linewidth=1.2, markersize=9, label=model)
         axes.set_xticks(range(len(rows)), [short_name(row) for row in rows])
-        tidy(axes)
     log_axis(panels[0], "y", subs=(1, 2, 5))
     panels[0].set_ylabel("mean episode cost", fontsize=9)
     panels[0].set_xlabel("standard deviation of the pixel noise", fontsize=9)
@@ -132,14 +130,12 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
 
     :param records: With the columns ``train_seed`` and ``distance`` (m).
     """
-    figure = new_figure(WIDTH, 3.2)
-    axes = figure.add_subplot()
+    figure, ((axes,),) = new_panels(WIDTH, 3.2)
     rows, width = list(records["scenario"].unique()), 0.8 / records["model"].nunique()
     for color, model, at, seeds in _seed_means(records, "distance", rows, spacing=width):
         axes.bar(at, seeds.median(), width=0.9 * width, color=color, alpha=0.45, label=model)
         axes.plot(at, seeds.T.to_numpy(), ".", color=color, markersize=4)
     axes.set_xticks(range(len(rows)), rows)
-    tidy(axes)
     log_axis(axes, "y", subs=(1, 2, 5))
     axes.set_ylabel("final distance from the ball (m)", fontsize=9)
     legend_above(figure, axes)
@@ -169,9 +165,7 @@ def failures_by_yaw(records: pd.DataFrame) -> Figure:
 
 def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
     """Draw the share of failed grasps over the height of the camera above its usual place, ``camera`` (m)."""
-    figure = new_figure(WIDTH * 0.7, 3.2)
-    axes = figure.add_subplot()
-    tidy(axes)
+    figure, ((axes,),) = new_panels(WIDTH * 0.7, 3.2)
     centimetres = 100 * records["camera"]
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
     _draw_failures(figure, axes, records, centimetres, edges)
@@ -190,14 +184,6 @@ def _draw_failures(figure: Figure, axes: Axes, records: pd.DataFrame, at: pd.Ser
         axes.plot(middles[order], share[order], color=color, label=str(label), marker=".")
     axes.set_ylim(bottom=0)
     legend_above(figure, axes)
-
-
-def _panels(figure: Figure, n_rows: int, n_columns: int) -> np.ndarray:
-    """Panels with common axes: ``(n_rows, n_columns)``."""
-    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
-    for axes in panels.flat:
-        tidy(axes)
-    return panels
 
 
 def _draw_corridor(axes: Axes, horizon: int) -> None:

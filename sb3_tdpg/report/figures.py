@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from gymnasium import spaces
 
-from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, legend_above, log_axis, new_figure, tidy
+from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, legend_above, log_axis, new_panels
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.numbers import CLEAR, Numbers
@@ -41,7 +41,6 @@ def degradation_curves(numbers: Numbers) -> Figure:
             axes.plot(curve["severity"], curve["iqm"], **style, markersize=3.5, linewidth=1.3, label=label)
         axes.set_title(name, fontsize=9)
         axes.grid(alpha=0.25)
-        tidy(axes)
     panels[0, 0].set_xticks(sorted({0, *levels["severity"]}))
     _log_if_wide(panels[0, 0], levels, "y")
     figure.supxlabel("severity (0: unperturbed)", fontsize=9)
@@ -78,17 +77,15 @@ def comparison_figure(numbers: Numbers) -> Figure:
 def _intervals(numbers: Numbers, frame: pd.DataFrame, columns: Sequence[str]) -> tuple[Figure, Axes]:
     """Draw an interval for each perturbation (rows) and method; the columns hold the value and the two ends."""
     names, labels = list(frame["perturbation"].unique()), list(frame["model"].unique())
-    figure = new_figure(WIDTH, 1.1 + 0.24 * len(names))
-    axes = figure.add_subplot()
+    figure, ((axes,),) = new_panels(WIDTH, 1.1 + 0.24 * len(names))
     for i, label in enumerate(labels):
         style = _styles(numbers)[label]
         value, low, high = (frame[frame["model"] == label].set_index("perturbation").loc[names, c] for c in columns)
         at = np.arange(len(names)) + 0.22 * (i - (len(labels) - 1) / 2)
         axes.hlines(at, low, high, color=style["color"], linewidth=2, alpha=0.5)
         axes.plot(value, at, style["marker"], color=style["color"], markersize=4.5, label=label)
-    axes.set_yticks(range(len(names)), names, fontsize=9)
+    axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    tidy(axes)
     return figure, axes
 
 
@@ -116,7 +113,6 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
             axes.plot(seen, dots + "-", color=color, linewidth=0.9, markersize=4, label=f"severity {row.severity}")
         axes.plot(flat[:, component], dots + "-", color=INK, linewidth=1.6, markersize=5, label=UNPERTURBED, zorder=0)
         axes.set_title(name, fontsize=9)
-        tidy(axes)
     figure.supxlabel("time step $t$", fontsize=9)
     figure.supylabel(f"component {component} of the observation", fontsize=9)
     legend_above(figure, panels[0, 0], 6)
@@ -139,8 +135,7 @@ def _grid(n: int) -> tuple[Figure, np.ndarray]:
     """Make a figure with n panels that share their axes, in evenly filled rows of up to five."""
     n_columns = n if n <= 5 else min((5, 4, 3), key=lambda columns: -n % columns)
     n_rows = -(-n // n_columns)
-    figure = new_figure(WIDTH, 0.7 + 1.8 * n_rows)
-    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+    figure, panels = new_panels(WIDTH, 0.7 + 1.8 * n_rows, n_rows, n_columns, sharex=True, sharey=True)
     for axes in panels.flat[n:]:
         axes.set_axis_off()
     for axes in panels.flat[max(0, n - n_columns) : n]:

@@ -22,10 +22,8 @@ class Perturber:
     """
     Apply a perturbation to whole batches, and remember what was drawn for each episode.
 
-    The perturbation has its own random generator, so the random numbers of the environment do not change.
-
-    :param perturbation: A perturbation that applies to the space.
-    :param scale: Scales of the components of a vector, in the space's shape; unused for images.
+    The perturbation applies to the space. It has its own random generator, so the random numbers of the environment do
+    not change. The scales of the components of a vector have the space's shape; images need none.
     """
 
     def __init__(
@@ -64,11 +62,7 @@ class Perturber:
             self._episode[name][which] = values
 
     def __call__(self, observations: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
-        """
-        Perturb the next observation of each episode, and return a new array ``(n, *obs)``.
-
-        :param which: Indices of their environments, ``(n,)``; ``None``: all.
-        """
+        """Perturb the next observations of the environments ``which``, ``(n,)``, or all: a new array ``(n, *obs)``."""
         index = slice(None) if which is None else which
         episode = {name: values[index] for name, values in self._episode.items()}  # views of all, or copies
         if self.perturbation.raw:

@@ -45,10 +45,8 @@ FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
 
 def run(program: str, arguments: Sequence[str]) -> None:
     """
-    Run a program of the zoo.
+    Run a program of the zoo (``train``, ``tune``, ``enjoy``, ``record-video`` or ``plot``) with its flags and ours.
 
-    :param program: ``train``, ``tune``, ``enjoy``, ``record-video`` or ``plot``.
-    :param arguments: Its flags: those of the zoo and some of ours; ``--help`` lists both.
     :raises ValueError: if the zoo refuses them.
     """
     given, flags = _split(program, arguments)

@@ -81,10 +81,8 @@ def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
 
 def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: float) -> dict[str, Any]:
     """
-    Return a block with sampled values in it; the other ``policy_kwargs`` of the block stay.
+    Return a block with the values of :func:`sample` in it; the other ``policy_kwargs`` of the block stay.
 
-    :param block: Hyperparameters, as in the YAML files.
-    :param values: From :func:`sample`, or the ``params`` of a trial.
     :param cost_scale: Unit of :data:`WEIGHT`: the absolute value of the cost limit.
     """
     block = {**block, "policy_kwargs": copy.deepcopy(dict(block.get("policy_kwargs") or {}))}

@@ -31,7 +31,6 @@ from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
-OBJECTIVES = ("information", "shift")
 N_EVALUATIONS = 10
 RECORD = "study.json"  # settings of a study, in the folder of its results
 COST, INFORMATION = "cost", "information"  # attributes of a trial; cost minus limit is also a constraint
@@ -167,15 +166,11 @@ class TuningManager(TDPGExperimentManager):
 
 
 class _Measuring(BaseCallback):
-    """
-    Measure cost and information on fresh episodes at intervals, and stop a training that falls behind other trials.
-
-    :param limit: Limit on the cost; infinite: the cost itself is minimised.
-    :param interval: Environment steps between two measurements.
-    """
+    """Measure cost and information on fresh episodes at intervals, and stop a training that falls behind others."""
 
     def __init__(self, trial: optuna.Trial, env: VecEnv, limit: float, interval: int) -> None:
         super().__init__()
+        # With an infinite limit the cost itself is minimised. The interval is in environment steps.
         self.trial, self.env, self.limit, self.interval = trial, env, limit, interval
         self.is_pruned, self.last, self._next = False, (math.inf, math.inf), interval
 

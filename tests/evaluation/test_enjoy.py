@@ -12,9 +12,9 @@ from PIL import Image
 from small_problems import ToyEnv, tiny_tdpg
 from stable_baselines3 import PPO
 
-from sb3_tdpg.cli import main
+from sb3_tdpg.cli import main, parse_keywords
 from sb3_tdpg.evaluation.animation import Episode, save_animation
-from sb3_tdpg.evaluation.enjoy import enjoy, parse_keywords
+from sb3_tdpg.evaluation.enjoy import enjoy
 
 pytest.importorskip("matplotlib")
 
