@@ -1,7 +1,5 @@
 """The ball-catching scene in PyBullet: the reference of the camera's images, and the view from the side."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ball-catching problem (Section IV-B of the paper): a camera is the only sensor."""
 
-from __future__ import annotations
-
 import os
 import time
 from importlib import import_module

@@ -12,8 +12,6 @@ It agrees with TinyRenderer in 99.8 % of the pixels and is 65 times as fast, bec
 Dimension key: N images, K side of the window around a ball; images are ``(N, 3, 64, 64)``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from .ball_scene import FAR, IMAGE_SIZE, LIGHT, NEAR, PLANE_COPIES, PLANE_HALF, WALL_SCALE, WALL_X, WALL_Z, BallScene

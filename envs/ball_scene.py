@@ -5,8 +5,6 @@ Coordinates: x forward, y to the left, z upward; the floor is z = 0, and the cam
 +x. Lengths are in metres.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

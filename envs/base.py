@@ -3,8 +3,6 @@
 Dimension key: N episodes side by side, X state, U action; observations have shape ``(N, *obs)``.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

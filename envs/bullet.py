@@ -1,7 +1,5 @@
 """A connection to a Bullet world of its own, and what all pictures of such a world share."""
 
-from __future__ import annotations
-
 import functools
 import os
 import sys

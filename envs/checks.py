@@ -1,7 +1,5 @@
 """Checks of the environments' keywords: each error names the keyword, its value and what was expected."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 

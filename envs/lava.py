@@ -1,7 +1,5 @@
 """The lava problem (Section IV-A of the paper): a double integrator between a wall and a lava pit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Noise on the pixels of images, in the two modes of the ball-catching problem."""
 
-from __future__ import annotations
-
 import numpy as np
 
 NOISE_MODES = ("minmax", "clip")

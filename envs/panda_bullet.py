@@ -4,8 +4,6 @@ The simulation of a grasp: PyBullet moves the arm down, closes the gripper, and 
 A *pose* is that of the hand at the grasp, ``(x, y, z, yaw)``; a *state* is that of the mug's frame, also ``(4,)``.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The depth camera of the grasping scene: PyBullet draws only the mug; the depth of the table is known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from .bullet import BulletWorld

@@ -1,7 +1,5 @@
 """The grasping problem (Section IV-C of the paper): lift a mug by its rim, from one depth image."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from functools import cached_property

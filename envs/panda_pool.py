@@ -1,7 +1,5 @@
 """Grasps and depth images of a batch, in this process or shared among several."""
 
-from __future__ import annotations
-
 import multiprocessing
 import signal
 import warnings

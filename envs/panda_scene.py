@@ -5,8 +5,6 @@ Coordinates: the robot is at the origin and looks along +x, y is to its left, z 
 Lengths are in metres, angles in radians.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from typing import Any

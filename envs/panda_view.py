@@ -1,7 +1,5 @@
 """The grasping scene from the side, for pictures, videos and PyBullet's window; never an observation."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

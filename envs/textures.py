@@ -6,8 +6,6 @@ Dimension key: S texels a side of a procedural texture, H and W rows and columns
 its columns run upwards and its rows to the right. So procedural textures are drawn upright and turned back at the end.
 """
 
-from __future__ import annotations
-
 import colorsys
 import functools
 import os

@@ -1,7 +1,5 @@
 """Read tuned settings in the YAML format of rl-zoo3; ``tdpg.yml`` has a block for each environment and variant."""
 
-from __future__ import annotations
-
 from importlib import resources
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The command line: ``python -m sb3_tdpg`` or ``sb3-tdpg``."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

@@ -1,7 +1,5 @@
 """The one writer of Markdown tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

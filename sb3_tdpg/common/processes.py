@@ -1,7 +1,5 @@
 """Pools of worker processes."""
 
-from __future__ import annotations
-
 import multiprocessing as mp
 import os
 import signal

@@ -1,7 +1,5 @@
 """Limit the threads of torch and of NumPy's linear algebra."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

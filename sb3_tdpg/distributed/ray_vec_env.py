@@ -4,8 +4,6 @@ Environments on the machines of a Ray cluster, or on the cores of this machine.
 Dimension key: N environments in the order of ``env_fns``; each actor has a contiguous share B of them.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

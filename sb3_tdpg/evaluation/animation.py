@@ -4,23 +4,18 @@ Videos of a policy: the environment's pictures, and below them the task-relevant
 Dimension key: T time steps of an episode, Z TRVs.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator, Sequence
 from itertools import cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.evaluation.figures import INK, PALETTE, tidy
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DPI = 100
 MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below

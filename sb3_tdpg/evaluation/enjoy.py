@@ -1,7 +1,5 @@
 """Watch a saved policy: run some episodes, print their costs, record them as a video."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The environment of a scenario, wrapped for a model, and the checks that the two fit together."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Random numbers that depend on one seed, and leave the rest of the program as it was."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import random

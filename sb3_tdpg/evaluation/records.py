@@ -4,8 +4,6 @@ From scenarios to records: one row for each episode of a model, or its true stat
 Dimension key: T horizon, N episodes, X state.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ The rollout loop that everything after the training shares: run a policy for who
 Dimension key: E environments, X state, Z TRVs, ``*obs`` and ``*action`` as in the spaces.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple

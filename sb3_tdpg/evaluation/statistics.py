@@ -4,8 +4,6 @@ Statistics over training seeds for few runs, computed by rliable.
 They follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """From records to tables: statistics over episodes, and numbers beside the paper's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

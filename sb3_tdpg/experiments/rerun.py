@@ -5,8 +5,6 @@ Repeat a recorded run.
 in the folder ``again``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """Training runs: from settings to a trained and evaluated model in a folder, resumable, one at a time or many."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import shutil

@@ -5,8 +5,6 @@ Optuna's heartbeats show which workers are alive, and the trial of a dead worker
 adds heartbeats for journal files, jobs that are run once each, and a loop that also waits for other workers' trials.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

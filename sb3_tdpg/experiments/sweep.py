@@ -6,8 +6,6 @@ keeps the numbers of its run, so that every worker can write the summary. Give a
 share a file system: then the selected model is at hand, and a killed run goes on from its checkpoint.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """From a block of ``hyperparams/tdpg.yml`` to a model that is ready to learn."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pkgutil import resolve_name
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The model card: results with intervals, use, how the model was made, and the metadata that the Hub reads."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection

@@ -1,7 +1,5 @@
 """What a model card is made from: the folder of a run, a folder of rl-zoo3, or a publication made by hand."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import zipfile

@@ -1,7 +1,5 @@
 """Write the folder of a model, with the files that rl-zoo3 asks for, and exchange it with the Hugging Face Hub."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A callback that logs a confidence interval of the information."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sb3_tdpg.callbacks import TDPGCallback

@@ -4,8 +4,6 @@ Check an information interval with tests whose outcome is known in advance.
 Dimension key: T time steps, N episodes, Z TRVs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

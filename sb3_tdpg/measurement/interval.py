@@ -4,8 +4,6 @@ Confidence intervals for I[x_t; x~_t] from named lower and upper bounds.
 Dimension key: T time steps, N episodes, X state, Z TRVs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass

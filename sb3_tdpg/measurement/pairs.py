@@ -5,8 +5,6 @@ Dimension key: M problems, K folds, N pairs, R marginal samples for each pair, X
 variables, D components of either or both, J = 4 features of each: its normal score and three cosines of its rank.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from typing import Any, NamedTuple

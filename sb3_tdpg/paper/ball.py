@@ -1,7 +1,5 @@
 """Reproduce Table II, ball catching: policy gradient, TDPG, and the ablations without the penalty."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Compare TDPG with baselines on the same environments: PPO, recurrent PPO, augmentation, weight decay, VIB."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -1,7 +1,5 @@
 """Shared by all reproductions: the runs of several methods, tables, and the files of a result."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence

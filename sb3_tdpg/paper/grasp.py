@@ -1,7 +1,5 @@
 """Reproduce Table III, grasping: policy gradient, TDPG, and the ablation without the penalty."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

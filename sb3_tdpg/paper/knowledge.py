@@ -4,8 +4,6 @@ What the TRVs of the image problems know, by regression and by bounds on the inf
 Dimension key: T horizon, N episodes, Z TRVs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Mapping, Sequence

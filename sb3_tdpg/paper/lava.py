@@ -1,7 +1,5 @@
 """Reproduce Table I, the lava problem: a quick demonstration, and the full reproduction with many seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Make a report: check the arguments, run the missing rows, aggregate, draw, write."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from importlib import import_module

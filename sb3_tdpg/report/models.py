@@ -1,7 +1,5 @@
 """Read the models of a report: group the arguments into methods, and load the files."""
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import json

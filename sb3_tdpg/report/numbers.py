@@ -4,8 +4,6 @@ Aggregate the records of a report: costs with intervals, added costs, comparison
 Dimension key: S models of a method, R rows, E episodes, G groups of rows (a perturbation with all its severities).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

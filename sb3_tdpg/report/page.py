@@ -1,7 +1,5 @@
 """The page of a report: compute its tables and verdicts, and fill the Markdown template."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

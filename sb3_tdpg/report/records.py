@@ -1,7 +1,5 @@
 """Run the episodes of a report: every model in every row, in parallel, with a file for each finished row."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Fill the templates of the report, and turn its Markdown into one HTML file."""
 
-from __future__ import annotations
-
 import base64
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """List the rows of a report: the unperturbed environment, each perturbation by severity, and the own test rows."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

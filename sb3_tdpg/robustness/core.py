@@ -4,8 +4,6 @@ The application of a perturbation to the episodes of N environments, for both wr
 Dimension key: N environments, n of them at a time.
 """
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

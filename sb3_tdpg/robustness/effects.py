@@ -7,8 +7,6 @@ observations (``raw``) are ``(n, *obs)`` in the units of their space.
 Dimension key: n episodes side by side, C channels, H and W rows and columns, D components, K steps of delay.
 """
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The registry of perturbations: each row is a :class:`Perturbation`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

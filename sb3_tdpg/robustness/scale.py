@@ -4,8 +4,6 @@ The unit of vector perturbations: how much each component of the observation var
 Dimension key: E environments; scales have the shape of the observation space.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

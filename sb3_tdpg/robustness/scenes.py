@@ -1,7 +1,5 @@
 """Perturbations of the scene, such as another texture or camera pose, which are keywords of the environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -4,8 +4,6 @@ The units of observations for perturbations, so that a severity means the same i
 Dimension key: N environments, C channels, H and W rows and columns, D components of a vector.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import gymnasium as gym

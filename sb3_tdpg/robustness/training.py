@@ -4,8 +4,6 @@ Random changes to the images of a training, so that the bottleneck has something
 Dimension key: N environments, C channels, H and W rows and columns.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch as th
 from gymnasium import spaces

@@ -4,8 +4,6 @@ The wrappers that perturb observations: one for a Gymnasium environment, one for
 Dimension key: N environments side by side.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The experiment manager of rl-zoo3, extended for the environments and the algorithm of this plugin."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

@@ -1,7 +1,5 @@
 """The command-line programs of rl-zoo3, with a few flags of this plugin in front of the zoo's."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import pickle

@@ -1,7 +1,5 @@
 """The search space of ``tune``: read from YAML, sampled by Optuna, put into a block."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 import math

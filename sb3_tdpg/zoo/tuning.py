@@ -6,8 +6,6 @@ Hence there are two objectives: ``information`` is the least information under a
 rule for selecting a policy), ``shift`` the least expected cost in an environment other than the training environment.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import math
