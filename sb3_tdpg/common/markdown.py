@@ -1,5 +1,6 @@
-"""The one writer of Markdown tables."""
+"""Write Markdown: tables, and pages from templates."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,3 +37,19 @@ def markdown_table(
     lines = [[cell(name) for name in frame.columns], marks]
     lines += [[cell(value) for value in row] for row in frame.itertuples(index=False, name=None)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def fill_template(package: str, template: str, **values: Any) -> str:
+    """Fill a template of the folder ``templates/`` of a package; there is never more than one empty line."""
+    try:
+        from jinja2 import Environment, PackageLoader
+    except ImportError as e:
+        raise ImportError("pages of results need jinja2: pip install sb3_tdpg[plots]") from e
+    env = Environment(loader=PackageLoader(package), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    env.filters.update(md=escaped, repr=repr)
+    return re.sub(r"\n{3,}", "\n\n", env.get_template(template).render(**values)).lstrip()
+
+
+def escaped(name: str) -> str:
+    """Escape the characters of a user's name that are Markdown syntax."""
+    return re.sub(r"([\\`*\[\]<>]|(?<!\w)_|_(?!\w))", r"\\\1", name)

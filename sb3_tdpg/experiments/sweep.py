@@ -20,7 +20,7 @@ import gymnasium as gym
 import pandas as pd
 
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
-from sb3_tdpg.common.markdown import markdown_table
+from sb3_tdpg.common.markdown import fill_template, markdown_table
 from sb3_tdpg.common.processes import process_pool
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
@@ -38,20 +38,6 @@ N_INFORMATION = 1000  # episodes
 
 # Among policies with almost no information, which of them has the least is chance: the cheapest of them is taken.
 TIE = 0.01  # nats
-
-NOT_SELECTED = "**No run costs less than {limit:g}, so none is selected**: train longer or loosen the limit."
-SELECTED = (
-    "**Selected: beta = {best.label}, seed {best.seed}** (cost {best.cost:.4g}, information {best.information:.3g} "
-    "nat; {where}). {n_below} of {n} runs are below a cost of {limit:g}; of those within {tie:g} nat of the one with "
-    "the least information, it is the cheapest."
-)
-EVERY_RUN = (
-    "Cost and its standard deviation over episodes; information in nats, summed over time, on fresh rollouts: the "
-    "log-det upper bound, which the selection goes by, and a lower bound. Both are estimated from the same rollouts, "
-    "and the lower bound is never above the upper one; on other rollouts both would differ a little. "
-    "`met_block_limits`: whether an epoch met the limits of the block's own selection, if it has one; otherwise the "
-    "model is that of the last epoch."
-)
 
 
 def parse_inverse_beta(beta: str | float) -> float:
@@ -318,38 +304,37 @@ def _write(plan: _Plan, runs: pd.DataFrame, failures: Mapping[str, str]) -> str:
     save_figure(tradeoff_figure(runs, plan.columns, best, plan.cost_limit), out / "sweep.png")
     write_run_config(out / "config.json", {**plan.config, "cost_limit": plan.cost_limit, "runs": [*runs["folder"]]})
     summary = _summary(plan, runs, best, failures)
-    write_atomically(out / "summary.md", summary + "\n")
+    write_atomically(out / "summary.md", summary)
     return summary
 
 
 def _summary(plan: _Plan, runs: pd.DataFrame, best: pd.Series | None, failures: Mapping[str, str]) -> str:
-    limit = plan.cost_limit
-    is_below = runs["cost"] < limit
-    selection = NOT_SELECTED.format(limit=limit)
-    if best is not None:
-        is_here = (plan.out / "selected.zip").exists()
-        where = "`selected.zip`" if is_here else f"not in this folder: `runs/{best.folder}/model.zip` of its worker"
-        counts = dict(n_below=is_below.sum(), n=len(runs), limit=limit, tie=TIE)
-        selection = SELECTED.format(best=best, where=where, **counts)
+    limit = f"{plan.cost_limit:g}"
+    is_below = runs["cost"] < plan.cost_limit
     by_beta = runs.groupby("label", sort=False)
     overview = {
         "beta": list(by_beta.groups),
         "seeds": by_beta.size(),
         "cost: mean (worst)": _mean_and_worst(by_beta["cost"]),
         "information in nats: mean (most)": _mean_and_worst(by_beta["information"], "{:.2g}"),
-        f"runs below {limit:g}": is_below.groupby(runs["label"], sort=False).sum(),
+        f"runs below {limit}": is_below.groupby(runs["label"], sort=False).sum(),
     }
-    parts = [f"# Sweep over beta: {plan.block}", selection, "![cost against information](sweep.png)"]
-    parts += ["## By beta", markdown_table(pd.DataFrame(overview))]
-    if len(plan.columns) > 1:
-        costs = {f"beta {beta}": _mean_and_worst(group[list(plan.columns.values())]) for beta, group in by_beta}
-        table = markdown_table(pd.DataFrame({"scenario": list(plan.columns), **costs}))
-        parts += ["## Robustness", "Mean episode cost: mean over seeds (worst seed).", table]
+    costs = {f"beta {beta}": _mean_and_worst(group[list(plan.columns.values())]) for beta, group in by_beta}
+    robustness = markdown_table(pd.DataFrame({"scenario": list(plan.columns), **costs}))
     shown = runs[["label", "seed", "cost", "std", "information", "information_lower", "met_block_limits"]]
-    parts += ["## Every run", EVERY_RUN, markdown_table(shown.rename(columns={"label": "beta"}), digits=4)]
-    if failures:
-        parts += ["## Failed", "\n".join(f"- `{job}`: {reason}" for job, reason in failures.items())]
-    return "\n\n".join([*parts, how_made("sb3-tdpg sweep", provenance())])
+    return fill_template(
+        "sb3_tdpg.experiments",
+        "sweep.md",
+        block=plan.block,
+        best=best,
+        is_here=(plan.out / "selected.zip").exists(),
+        counts=dict(n=len(runs), n_below=is_below.sum(), limit=limit, tie=TIE),
+        overview=markdown_table(pd.DataFrame(overview)),
+        robustness=robustness if len(plan.columns) > 1 else "",
+        runs=markdown_table(shown.rename(columns={"label": "beta"}), digits=4),
+        failures=failures,
+        made=how_made("sb3-tdpg sweep", provenance()),
+    )
 
 
 def _mean_and_worst(values: pd.DataFrame, form: str = "{:.4g}") -> list[str]:

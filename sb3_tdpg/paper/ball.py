@@ -74,17 +74,6 @@ PAPER_METHODS: tuple[Method, ...] = (
 WITHOUT_CONTROLS = ("PG", "PG, perturbed images", "TDPG")
 COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG, plain images", NO_PENALTY_PLAIN), ("TDPG", "PG"))
 
-COMPARISON = (
-    "Probability that a seed of the method has a lower mean cost over these rows than a seed of the other method: 0.5 "
-    "is no difference. The difference of the mean costs is taken seed by seed. The images of each method are those of "
-    "its table above; policies score the same with both renderers."
-)
-KNOWLEDGE = (
-    "In front of random walls, with a random darkening of each episode: the share of the variance of the robot's "
-    "position, of the darkening and of the wall's colour that is linear in the TRVs (R^2 in front of walls that the "
-    "regression has not seen, mean over time and seeds)."
-)
-
 
 def reproduce_ball(
     out: Path, *, launch: str = "fixed", controls: bool = True, n_seeds: int = 5, n_paper_seeds: int = 1, **options: Any
@@ -141,9 +130,11 @@ def reproduce_ball(
 
     costs, distances = aggregate_seeds(table), aggregate_seeds(table.assign(cost=table["distance"]))
     cost_rows = [*rows, *group_rows(rows)]
-    distance_rows = [_distance_row(row) for row in cost_rows]
-    quantity = "final distance between robot and ball in m"
-    sections = [f"# Ball catching ({'Table II' if is_fixed else 'a launch that varies'})"]
+    distance_rows = [
+        replace(row, paper={m: PaperResult(p.distance) for m, p in row.paper.items() if p.distance is not None})
+        for row in cost_rows
+    ]
+    quantity, results = "final distance between robot and ball in m", {}
     for title, names in {
         "Methods evaluated on images by PyBullet": labels["pybullet"],
         "Methods evaluated on images by the ray caster": labels["fast"],
@@ -151,11 +142,10 @@ def reproduce_ball(
     }.items():
         if names:
             is_shown = costs["model"].isin(names)
-            sections += [f"## {title}", comparison_markdown(costs[is_shown], cost_rows)]
-            sections += [comparison_markdown(distances[is_shown], distance_rows, quantity=quantity, digits=3)]
-    if is_fixed:
-        sections += ["## Goals", common.goals_table(costs, GOALS)]
-    sections += ["## Effect of the penalty", COMPARISON, common.comparisons_table(table, COMPARISONS, KINDS)]
+            results[title] = dict(
+                cost=comparison_markdown(costs[is_shown], cost_rows),
+                distance=comparison_markdown(distances[is_shown], distance_rows, quantity=quantity, digits=3),
+            )
     with threads(1):  # sums are the same on any number of cores
         knowledge = [
             dict(model=m.label, train_seed=seed, **trv_knowledge(TDPG.load(path, device="cpu"), launch_kwargs))
@@ -163,9 +153,19 @@ def reproduce_ball(
             for seed in seeds
             for path in [folders[m.label, seed] / "model.zip"]
         ]
-    sections += ["## What the TRVs know", KNOWLEDGE, common.write_knowledge(pd.DataFrame(knowledge), ["model"], out)]
     command = "make reproduce-ball" + ("-varying" if not is_fixed else "-controls" if controls else "")
-    return common.write_results(out, sections, tasks, command, given.publish)
+    return common.write_results(
+        out,
+        "ball.md",
+        tasks,
+        command,
+        given.publish,
+        scenario="Table II" if is_fixed else "a launch that varies",
+        results=results,
+        goals=common.goals_table(costs, GOALS) if is_fixed else "",
+        comparisons=common.comparisons_table(table, COMPARISONS, KINDS),
+        knowledge=common.write_knowledge(pd.DataFrame(knowledge), ["model"], out),
+    )
 
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:
@@ -183,8 +183,3 @@ def group_rows(rows: Sequence[Scenario]) -> list[Scenario]:
         paper = {method: PaperResult(mean, distance=distance) for method, (mean, distance) in means.items()}
         result.append(Scenario(name, "BallCatch-v0", paper=paper))
     return result
-
-
-def _distance_row(row: Scenario) -> Scenario:
-    paper = {m: PaperResult(result.distance) for m, result in row.paper.items() if result.distance is not None}
-    return replace(row, paper=paper)

@@ -42,12 +42,6 @@ N_RECORDED_SEEDS = 5
 FORMER_LABELS = {"its control": NO_PENALTY, "control, plain images": NO_PENALTY_PLAIN}
 """Labels of the ablations in older records."""
 
-FOOTER = (
-    "Interquartile mean of the episode cost over training seeds [95% bootstrap interval over seeds]; stochastic "
-    "policies, evaluation seed 0. The lowest cost is in bold. In grasping the cost is the share of failed grasps. The "
-    "times of a training include all attempts and both stages: median over the seeds trained here, one thread."
-)
-
 
 @dataclass(frozen=True)
 class TimedRun(Run):
@@ -272,7 +266,7 @@ def reproduce_baselines(
     everything = [task for _, tasks in comparisons for task in tasks]
     complete_runs(everything, **given.of_runs)
 
-    sections, seed_tables = ["# Baselines"], []
+    shown, seed_tables = {}, []
     for each, tasks in comparisons:
         trained = read_records(tasks)
         seeds = _seed_table(trained, tasks)
@@ -283,13 +277,16 @@ def reproduce_baselines(
         has_groups = set(GROUPS) <= set(each.columns)
         table = with_groups(table) if has_groups else table
         table = table.sort_values("model", key=lambda column, each=each: column.map(each.labels.index), kind="stable")
-        sections += [f"## {each.title}", baselines_table(table, each.columns, seeds, each.digits)]
-        if has_groups:
-            sections += ["Row by row:", baselines_table(table, [row.name for row in each.rows[1:]], digits=each.digits)]
+        row_names = [row.name for row in each.rows[1:]]
+        shown[each.title] = dict(
+            overview=baselines_table(table, each.columns, seeds, each.digits),
+            rows=baselines_table(table, row_names, digits=each.digits) if has_groups else "",
+        )
     frame = read_records(everything)[["env_id", *RECORD_COLUMNS]].round({"cost": 4})
     write_frame_atomically(frame, out / "episodes.csv.xz")
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True).round(4), out / "seeds.csv")
-    return write_results(out, [*sections, FOOTER], everything, "make reproduce-baselines", given.publish)
+    command = "make reproduce-baselines"
+    return write_results(out, "baselines.md", everything, command, given.publish, comparisons=shown)
 
 
 def _seed_table(records: pd.DataFrame, tasks: Sequence[Task]) -> pd.DataFrame:

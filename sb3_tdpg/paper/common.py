@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from sb3_tdpg.common.files import write_atomically
-from sb3_tdpg.common.markdown import markdown_table
+from sb3_tdpg.common.markdown import fill_template, markdown_table
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
@@ -144,7 +144,7 @@ def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> st
 
 
 def write_results(
-    out: Path, sections: Sequence[str], tasks: Sequence[Task], command: str, publish: Path | None = None
+    out: Path, template: str, tasks: Sequence[Task], command: str, publish: Path | None, **values: Any
 ) -> str:
     """Write ``summary.md`` and ``config.json``, copy all but the runs to ``publish`` if given, return the summary."""
     how = provenance()
@@ -152,7 +152,7 @@ def write_results(
     # There are several commits if the reproduction was resumed after a change.
     gits = [json.loads((folder / "config.json").read_text())["provenance"]["git"] for _, folder, _ in tasks]
     commits = sorted({git["commit"][:7] for git in gits if git is not None})
-    summary = "\n\n".join([*sections, how_made(command, how, commits)]) + "\n"
+    summary = fill_template("sb3_tdpg.paper", template, made=how_made(command, how, commits), **values)
     write_atomically(out / "summary.md", summary)
     if publish is not None:
         publish.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 """Reproduce Table III, grasping: policy gradient, TDPG, and the ablation without the penalty."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,9 @@ from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import PANDA_GRASP, PANDA_GRASP_CAMERA
 from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure, training_curves
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
-from sb3_tdpg.paper import common
+from sb3_tdpg.paper import common, knowledge
 from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
-from sb3_tdpg.paper.knowledge import ESTIMATES, KNOWLEDGE, PENALTY, estimates_table, knowledge_table, penalty_table
 from sb3_tdpg.tdpg import TDPG
 
 # Seeds below 100 were used to make the blocks.
@@ -45,12 +45,6 @@ def _methods(block: str) -> tuple[Method, ...]:
 
 METHODS = {"fixed": _methods("PandaGrasp-v0"), "varying": _methods("PandaGrasp-v0-camera")}
 """The methods, by whether the height of the camera is fixed or varies."""
-
-QUANTITY = "share of failed grasps"
-COMPARISON = (
-    "Probability that a seed of the method fails less often in these rows than a seed of the other method: 0.5 is no "
-    "difference. The difference of the shares is taken seed by seed: both start from the same policy."
-)
 
 
 def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **options: Any) -> str:
@@ -95,30 +89,30 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
     save_figure(training_curves(second_stage), out / "training.png")
 
     aggregated = aggregate_seeds(records)
-    sections = [
-        f"# Grasping ({'Table III' if is_fixed else 'a camera whose height varies'})",
-        comparison_markdown(aggregated, rows, quantity=QUANTITY, digits=3),
-    ]
-    if is_fixed:
-        sections += ["## Goals", common.goals_table(aggregated, GOALS)]
     kinds = {row.name.lower(): (row.name,) for row in rows}
     logs = {seed: read_progress(folders["TDPG", seed]) for seed in seeds}
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
     with threads(1):  # sums are the same on any number of cores
-        knowledge = knowledge_table(models, rows[:2])
-        sections += [
-            "## Effect of the penalty",
-            COMPARISON,
-            common.comparisons_table(records, COMPARISONS, kinds, "failed grasps"),
-            PENALTY,
-            markdown_table(penalty_table(logs)),
-            "## What the TRVs know",
-            KNOWLEDGE,
-            common.write_knowledge(knowledge, ["model", "mugs"], out),
-        ]
-        if is_fixed:
-            first = {label: models[label, FIRST_SEED] for label in ("PG", "TDPG")}
-            estimates = markdown_table(estimates_table(first), digits=2)
-            sections += ["## How much information is it?", ESTIMATES, estimates]
-    command = f"make reproduce-grasp{'' if is_fixed else '-camera'}"
-    return common.write_results(out, sections, tasks, command, given.publish)
+        known = knowledge.knowledge_table(models, rows[:2])
+        first = {label: models[label, FIRST_SEED] for label in ("PG", "TDPG")}
+        estimates = markdown_table(knowledge.estimates_table(first), digits=2) if is_fixed else ""
+        comparisons = common.comparisons_table(records, COMPARISONS, kinds, "failed grasps")
+    return common.write_results(
+        out,
+        "grasp.md",
+        tasks,
+        f"make reproduce-grasp{'' if is_fixed else '-camera'}",
+        given.publish,
+        scenario="Table III" if is_fixed else "a camera whose height varies",
+        results=comparison_markdown(aggregated, rows, quantity="share of failed grasps", digits=3),
+        goals=common.goals_table(aggregated, GOALS) if is_fixed else "",
+        comparisons=comparisons,
+        penalty=markdown_table(knowledge.penalty_table(logs)),
+        last_epochs=knowledge.LAST_EPOCHS,
+        knowledge=common.write_knowledge(known, ["model", "mugs"], out),
+        n_bound=knowledge.N_BOUND,
+        ln_bound=f"{math.log(knowledge.N_BOUND):.1f}",
+        estimates=estimates,
+        n_fitted=knowledge.FITTED_MUGS,
+        ln_fitted=f"{math.log(knowledge.FITTED_MUGS):.1f}",
+    )

@@ -44,26 +44,6 @@ CRITICS: Mapping[str, Mapping[str, Any]] = {
     "MINE at 1e-3, standardised state": dict(warmup_gradient_steps=2000, gradient_steps=1000, standardize=True),
 }  # fmt: skip
 
-KNOWLEDGE = (
-    "On mugs of two rows of the table: the share of the variance of the mug's position and yaw (its sine and cosine) "
-    "that a regression on the TRVs, their squares and products explains (R^2 on mugs that it has not seen, mean over "
-    "seeds), and bounds on the information in nats. I[x; x~] itself lies between the bounds, since the image is a "
-    f"function of the state and there is no memory. The lower bound cannot exceed ln {N_BOUND} = "
-    f"{math.log(N_BOUND):.1f}."
-)
-ESTIMATES = (
-    "Policies of the first seed, in nats; both columns of a policy estimate the same quantity. On fresh mugs the "
-    "estimate of a fitted critic is a lower bound except for the bias of the logarithm of a mean; on the mugs that it "
-    f"was fitted to it is no bound. The lower bound cannot exceed ln {FITTED_MUGS} = {math.log(FITTED_MUGS):.1f} on "
-    f"{FITTED_MUGS} mugs. The critics are fitted to PG first (the paper's in 500,000 steps, ours in 2,000), then to "
-    "TDPG (in 100,000 and 1,000 steps)."
-)
-PENALTY = (
-    "Each seed of TDPG: the first epoch with a penalty (none if no epoch met the limit on the failures: then TDPG is "
-    "its own ablation), the last weight 1/beta in failures per nat, the bound on the information in the first and the "
-    f"last epoch, and the share of failed grasps in the last {LAST_EPOCHS} epochs of training."
-)
-
 
 def trv_knowledge(
     model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_walls: int = 64, n_episodes: int = 10

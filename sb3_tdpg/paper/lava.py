@@ -52,11 +52,6 @@ TITLES = {
 }
 SEED_COLUMNS = dict(model="method", train_seed="seed", attempts="trainings", selected="limits met")
 COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ratio")
-SEEDS = (
-    "Every seed: the mean cost in the training row and its standard deviation over episodes; the ratio of the mean "
-    "cost at sigma^2 = 1 to the mean cost in the training row; the number of trainings until one met the limits, and "
-    "whether one did."
-)
 
 
 def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
@@ -148,22 +143,24 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
     longest_first = sorted(everything, key=lambda task: (task[0].method != "TDPG", task[0].method == "PG"))
     complete_runs(longest_first, **given.of_runs)
 
-    sections, seed_tables = ["# The lava problem (Table I)"], []
+    groups, seed_tables = {}, []
     for group, of_group in tasks.items():
         records = read_records(of_group)
         write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
-        sections += [f"## {TITLES[group]}", comparison_markdown(aggregate_seeds(records), LAVA)]
-        sections += [_goals_table(by_seed, GOALS.get(group, {}))]
-        sections += [SEEDS, markdown_table(by_seed.rename(columns={**SEED_COLUMNS, **COLUMNS}))]
+        groups[TITLES[group]] = dict(
+            comparison=comparison_markdown(aggregate_seeds(records), LAVA),
+            goals=_goals_table(by_seed, GOALS.get(group, {})),
+            seeds=markdown_table(by_seed.rename(columns={**SEED_COLUMNS, **COLUMNS})),
+        )
         if group in READINGS:
             folders = {method: folders_of(of_group)[method, FIRST_SEED] for method in METHODS}
             models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
             one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]
             _write_figures(out, f"_{group}", one_seed, folders, models, group)
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True), out / "seeds.csv")
-    return write_results(out, sections, everything, "make reproduce-lava", given.publish)
+    return write_results(out, "lava.md", everything, "make reproduce-lava", given.publish, groups=groups)
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:

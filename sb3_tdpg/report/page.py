@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.common.markdown import markdown_table
+from sb3_tdpg.common.markdown import escaped, fill_template, markdown_table
 from sb3_tdpg.report.numbers import CLEAR, MIN_CLEAR, Numbers
 from sb3_tdpg.report.records import Plan
-from sb3_tdpg.report.rendering import escaped, render
 from sb3_tdpg.report.rows import ALL, UNPERTURBED, Row
 from sb3_tdpg.robustness.registry import find
 
@@ -56,8 +55,8 @@ def write_page(numbers: Numbers, page: Page) -> str:
     verdicts = [_verdict(numbers, label) for label in numbers.models[1:]]
     few = [label for label, names in page.sources.items() if 1 < len(names) < MIN_SEEDS]
     limits = dict(few=few, min_seeds=MIN_SEEDS, clear=CLEAR, min_clear=MIN_CLEAR)
-    return render(
-        "report.md", page=page, numbers=numbers, costs=costs, tables=tables, verdicts=verdicts,
+    return fill_template(
+        "sb3_tdpg.report", "report.md", page=page, numbers=numbers, costs=costs, tables=tables, verdicts=verdicts,
         all=ALL if has_all else None, unperturbed=UNPERTURBED, **limits,
     )  # fmt: skip
 
