@@ -7,14 +7,9 @@ NOISE_MODES = ("minmax", "clip")
 
 def noisy_pixels(images: np.ndarray, std: float, mode: str, rng: np.random.Generator) -> np.ndarray:
     """
-    Add Gaussian noise to every pixel, and bring the images back to [0, 1].
+    Add Gaussian noise to every pixel of images in [0, 1], ``(N, C, H, W)`` float32, and bring them back to [0, 1].
 
-    :param images: ``(N, C, H, W)`` float32 in [0, 1]
-    :param std: Standard deviation of the noise.
-    :param mode: ``"minmax"``, as in the paper: subtract the minimum of each image, then divide by its maximum.
-        ``"clip"``: clip the values to [0, 1].
-    :param rng: Source of the noise.
-    :return: a new array of the same shape, float32
+    ``"minmax"``, as in the paper, subtracts the minimum of each image, then divides by its maximum; ``"clip"`` clips.
     """
     noisy: np.ndarray = std * rng.standard_normal(images.shape, dtype=np.float32) + images
     if mode == "minmax":

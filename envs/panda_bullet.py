@@ -77,9 +77,8 @@ class GraspSimulation(BulletWorld):
     """
     Robot, table and mug in a Bullet world of their own, without visual shapes.
 
-    Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone.
-
-    :param solver_iterations: Of Bullet's contact solver in a time step; ``None``: the motion's.
+    Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone. A
+    number of ``solver_iterations`` of Bullet's contact solver in a time step replaces that of the motion.
     """
 
     def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None = None) -> None:

@@ -15,12 +15,7 @@ from sb3_tdpg.common.files import kept_by_this_process
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run a command.
-
-    :param arguments: The arguments after the program's name; default: ``sys.argv``.
-    :return: exit code: 0 done, 2 bad input, 130 interrupted
-    """
+    """Run a command (default: that of ``sys.argv``); return the exit code: 0 done, 2 bad input, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if _is_for_the_zoo(arguments):
         command: Callable[..., None] = _zoo

@@ -136,10 +136,9 @@ def varies(inputs: np.ndarray) -> np.ndarray:
 
 class Regression:
     """
-    A ridge regression and a kernel ridge regression of its residuals, for each target separately.
+    A ridge regression and a kernel ridge regression of its residuals, for each target, ``(n, Y)``, separately.
 
-    :param inputs: ``(n, X)``; constant components are ignored.
-    :param targets: ``(n, Y)``
+    Constant components of the inputs, ``(n, X)``, are ignored.
     """
 
     def __init__(self, inputs: np.ndarray, targets: np.ndarray) -> None:

@@ -55,10 +55,7 @@ def trv_knowledge(
     time step a linear regression is fitted on half of the walls, and R^2 is computed on the other half: on the same
     walls it could memorise the colours.
 
-    :param model: A model of ``BallCatch-v0``.
-    :param env_kwargs: Keywords of the environment, for instance of a varying launch.
-    :param n_walls: Number of random walls, even.
-    :param n_episodes: Number of episodes in front of each wall.
+    :param n_walls: Number of random walls, even, with ``n_episodes`` in front of each.
     :return: R^2, averaged over time and not below 0, of ``"position"`` (d_t), ``"brightness"`` (the factor) and
         ``"wall"`` (its mean colour, averaged over red, green and blue)
     """

@@ -74,14 +74,11 @@ def demo(
     out: Path, *, reading: str = "table", seed: int = 0, n_eval_episodes: int = 1000, n_timesteps: int | None = None
 ) -> str:
     """
-    Train PG and TDPG on the lava problem, compare them on the rows of Table I, draw the figures.
+    Train PG and TDPG on the lava problem, compare them on the rows of Table I, draw the figures; see also ``Options``.
 
     :param out: Folder for ``episodes.csv``, ``table.md``, ``histograms.png``, ``trajectories.png``, ``training.png``,
         ``config.json`` and the runs with their models.
     :param reading: The cost definition, ``"table"`` or ``"text"``.
-    :param seed: Training seed.
-    :param n_eval_episodes: Episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as in the block.
     :return: the table
     """
     overrides = Options(n_timesteps=n_timesteps).overrides

@@ -47,12 +47,10 @@ class Sensor:
 
     An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
     becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed.
-
-    :param scale: Scale of the components of a vector, in the space's shape; see :func:`.observation_scale`.
     """
 
     space: spaces.Box
-    scale: np.ndarray | None = None
+    scale: np.ndarray | None = None  # of the components of a vector, in the space's shape; see `observation_scale`
 
     @property
     def is_image(self) -> bool:
