@@ -309,7 +309,3 @@ def _make_parser() -> argparse.ArgumentParser:
     add("repo_id", metavar="ORG/NAME")
     add("--to", type=Path, required=True, help="folder for the model")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -185,7 +185,7 @@ def read_progress(folder: Path) -> pd.DataFrame:
 
 def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: int | None = None) -> None:
     """
-    Complete runs (see :func:`complete_run`) in parallel processes, with a progress bar; default: one for each core.
+    Complete runs (see :func:`complete_run`) with a progress bar, as many at a time as ``jobs``, or as there are cores.
 
     A run that starts from the policy of another one waits for it. Ctrl-C keeps finished runs and checkpoints.
     """
