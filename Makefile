@@ -50,10 +50,10 @@ $(OLDEST)/.installed: setup.cfg constraints.txt constraints-oldest.txt
 	$(OLDEST)/bin/python -m pip install --disable-pip-version-check -c build/constraints-oldest.txt -e '.[zoo,postgres,tests,plots]'
 	@touch $@
 
-mutants: $(STAMP) ## change the code in small ways and count the changes that the tests notice (an hour)
+mutants: $(STAMP) ## change the code in small ways and count the changes that the tests notice (half an hour)
 	$(PY) tests/mutants.py
 
-soak: $(STAMP) ## endurance: leaks, killed trainings, killed workers (a quarter of an hour)
+soak: $(STAMP) ## endurance: leaks, killed trainings, killed workers (ten minutes)
 	$(PY) tests/soak.py
 
 lint: $(STAMP) ## check style and format
