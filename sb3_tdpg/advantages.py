@@ -7,10 +7,13 @@ Dimension key: T horizon, N episodes, X state, F features.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch as th
+from stable_baselines3.common.torch_layers import create_mlp
+from torch import nn
 
+from sb3_tdpg.features import RunningNorm
 from sb3_tdpg.losses import cost_to_go
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON
 
@@ -39,7 +42,7 @@ def episode_mean_advantages(
     return (episode_cost - episode_cost.mean()).expand_as(costs)
 
 
-def value_advantages(
+def regression_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
@@ -67,9 +70,112 @@ def value_advantages(
         values = _held_out_predictions(_state_features(states, alive), targets, alive, fold)
     else:
         values = _shared_values(states, targets, alive, fold, gamma)
+    return generalised_advantages(costs, values, gamma, gae_lambda)
+
+
+def generalised_advantages(costs: th.Tensor, values: th.Tensor, gamma: float, gae_lambda: float) -> th.Tensor:
+    """
+    Estimate advantages from values (GAE, Schulman et al., 2016).
+
+    :param costs: ``(T, N)``, zero after the end of an episode
+    :param values: V_t(x_t), ``(T, N)``, zero after the end of an episode
+    :return: ``(T, N)``
+    """
     next_values = th.cat([values[1:], th.zeros_like(values[:1])])
-    residuals = costs + gamma * next_values - values
-    return cost_to_go(residuals, gamma * gae_lambda)
+    return cost_to_go(costs + gamma * next_values - values, gamma * gae_lambda)
+
+
+class ValueFunction(nn.Module):
+    """
+    A network V_t(x_t) of the true state and the time left, fitted to each epoch's rollouts.
+
+    Unlike the regressions above it keeps what it has learnt in earlier epochs, so that a few long episodes suffice.
+    Only the baseline uses it, not the policy, so the true state may be unknown to the robot (an asymmetric critic,
+    Pinto et al., 2018).
+
+    :param state_dim: X
+    :param horizon: T
+    :param hidden_sizes: Hidden layers.
+    :param learning_rate: Of Adam.
+    :param n_epochs: Passes over the steps of an epoch.
+    :param batch_size: Steps of a minibatch.
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        horizon: int,
+        hidden_sizes: Sequence[int] = (64, 64),
+        learning_rate: float = 1e-3,
+        n_epochs: int = 10,
+        batch_size: int = 256,
+    ) -> None:
+        super().__init__()
+        self.horizon = horizon
+        self.n_epochs = n_epochs
+        self.batch_size = batch_size
+        self.norm = RunningNorm(state_dim)
+        self.network = nn.Sequential(*create_mlp(state_dim + 1, 1, list(hidden_sizes), nn.Tanh))
+        self.register_buffer("offset", th.zeros(()))
+        self.register_buffer("scale", th.ones(()))
+        self.optimizer = th.optim.Adam(self.network.parameters(), lr=learning_rate, fused=True)
+
+    offset: th.Tensor
+    scale: th.Tensor
+
+    def forward(self, states: th.Tensor, gamma: float) -> th.Tensor:
+        """
+        Predict the discounted cost from each step to the end.
+
+        :param states: x_0 to x_{T-1}, ``(T, N, X)``
+        :return: ``(T, N)``
+        """
+        return self.offset + self.scale * self.network(self._inputs(states, gamma))[..., 0]
+
+    def _inputs(self, states: th.Tensor, gamma: float) -> th.Tensor:
+        left = self.horizon - th.arange(len(states), device=states.device)
+        # The discounted number of steps that are left, as a share of that at the start.
+        share = left / self.horizon if gamma == 1 else (1 - gamma**left) / (1 - gamma**self.horizon)
+        return th.cat([self.norm(states), share[:, None, None].expand(*states.shape[:2], 1)], dim=-1)
+
+    def fit(self, states: th.Tensor, targets: th.Tensor, alive: th.Tensor, gamma: float) -> float:
+        """
+        Fit to the costs of an epoch.
+
+        :param states: ``(T, N, X)``
+        :param targets: ``(T, N)``
+        :param alive: ``(T, N)``
+        :return: share of the variance of the targets that the values explained before this fit
+        """
+        living = alive.bool()
+        y = targets[living]
+        with th.no_grad():
+            residual = y - self(states, gamma)[living]
+            explained = 1 - (residual.var() / y.var().clamp(min=1e-12)).item()
+            self.norm.update(states[living])
+            self._rescale(y)
+        x, z = self._inputs(states, gamma)[living], (y - self.offset) / self.scale
+        for _ in range(self.n_epochs):
+            for part in th.randperm(len(x), device=x.device).split(self.batch_size):
+                loss = (self.network(x[part])[:, 0] - z[part]).square().mean()
+                self.optimizer.zero_grad()
+                loss.backward()
+                self.optimizer.step()
+        return explained
+
+    @th.no_grad()
+    def _rescale(self, targets: th.Tensor) -> None:
+        """Let the network predict standardised targets, without a change of its values (van Hasselt et al., 2016)."""
+        # Slowly, because the last layer has to follow.
+        rate = 1.0 if self.norm.count < 1.5 * len(targets) else 0.1
+        offset = self.offset + rate * (targets.mean() - self.offset)
+        scale = self.scale + rate * (targets.std().clamp(min=1e-6) - self.scale)
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.mul_(self.scale / scale)
+        last.bias.copy_((self.scale * last.bias + self.offset - offset) / scale)
+        self.offset.copy_(offset)
+        self.scale.copy_(scale)
 
 
 def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold: th.Tensor, gamma: float) -> th.Tensor:
@@ -127,12 +233,16 @@ def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENT
     return th.cat([x, x.square(), th.exp(-squared_distance / 2)], dim=-1)
 
 
-BASELINES: dict[str, AdvantageFunction] = {"mean": episode_mean_advantages, "value": value_advantages}
+BASELINES: dict[str, AdvantageFunction | None] = {
+    "mean": episode_mean_advantages,
+    "regression": regression_advantages,
+    "value": None,  # a ValueFunction, which the algorithm keeps
+}
 
 
-def get_baseline(name: str) -> AdvantageFunction:
+def get_baseline(name: str) -> AdvantageFunction | None:
     """
-    Look up a baseline.
+    Look up a baseline; ``None`` for the network (:class:`ValueFunction`).
 
     :raises ValueError: if there is none of this name.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 
 class AutoWeight:
@@ -41,3 +42,12 @@ class AutoWeight:
             self.value = min(self.value, self.max_growth * self._start)
         elif cost <= self.cost_limit:
             self.value = self._start = scale / max(information, 1.0)
+
+    def warn_if_never_met(self, origin: str) -> None:
+        """Warn at the end of a training that never met the limit; ``origin`` says where it comes from."""
+        if self.value == 0.0:
+            warnings.warn(
+                f"no epoch met cost_limit={self.cost_limit:g}{origin}, so that there was no penalty on the "
+                "information: train for longer, or give a higher cost_limit",
+                stacklevel=3,
+            )

@@ -1,26 +1,42 @@
 """
-The rollouts of one policy epoch, episode by episode.
+The rollouts of one policy epoch, episode by episode, and what the policy makes of them.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.preprocessing import get_obs_shape
 
 from sb3_tdpg.features import flat_action_space
 from sb3_tdpg.information import InformationBatch
 
+STORED = ("observations", "states", "noise", "trvs", "means", "stds", "actions", "costs", "alive")
+
+Observations = th.Tensor | dict[str, th.Tensor]
+
+
+def each(x: Any, function: Callable[[Any], Any]) -> Any:
+    """Apply a function to an array, or to every array of a dict."""
+    return {key: function(value) for key, value in x.items()} if isinstance(x, dict) else function(x)
+
 
 class EpisodeBatch(NamedTuple):
-    """An epoch's rollouts as tensors on the training device."""
+    """
+    An epoch's rollouts as tensors on the training device: whole episodes, or segments of them.
 
-    observations: th.Tensor  #: ``(T, N, *obs)``, y_t
+    In segments, T is their length and N their number.
+    """
+
+    observations: Observations  #: ``(T, N, *obs)``, y_t, or a dict of such
     states: th.Tensor  #: ``(T, N, X)``, x_t
     noise: th.Tensor  #: ``(T, N, Z)``, eps_t
     trvs: th.Tensor  #: ``(T, N, Z)``, x~_t
@@ -29,23 +45,66 @@ class EpisodeBatch(NamedTuple):
     actions: th.Tensor  #: ``(T, N, U)``, u_t before clipping
     costs: th.Tensor  #: ``(T, N)``, zero after the end
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
+    advantages: th.Tensor  #: ``(T, N)``, zero until they are computed
+    prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at t = 0
 
-    def select(self, episodes: th.Tensor | slice) -> EpisodeBatch:
-        """Select episodes by their columns."""
-        return EpisodeBatch(*(x[:, episodes] for x in self))
+    def select(self, columns: th.Tensor | slice) -> EpisodeBatch:
+        """Select episodes or segments by their columns."""
+        return EpisodeBatch(*(each(x, lambda v: v[:, columns]) for x in self))
 
-    def information_batch(self) -> InformationBatch:
-        """Return what the mutual-information estimators use, detached."""
-        alive = None if bool(self.alive.all()) else self.alive.bool()
-        return InformationBatch(self.states, self.trvs, self.means, self.stds, alive)
+    def segments(self, n_steps: int) -> EpisodeBatch:
+        """
+        Cut the episodes into segments, and drop those after the end of an episode.
+
+        :param n_steps: Length of a segment; the last one of an episode is filled up with dead steps.
+        """
+        n_parts = math.ceil(self.alive.shape[0] / n_steps)
+        padding = n_parts * n_steps - self.alive.shape[0]
+
+        def cut(x: th.Tensor) -> th.Tensor:  # (T, N, ...) -> (n_steps, n_parts * N, ...)
+            padded = th.cat([x, x.new_zeros(padding, *x.shape[1:])]) if padding > 0 else x
+            return padded.unflatten(0, (n_parts, n_steps)).transpose(0, 1).flatten(1, 2)
+
+        parts = EpisodeBatch(*(each(x, cut) for x in self))
+        return parts.select(parts.alive[0].nonzero()[:, 0])
+
+    def information_batch(self, pooled: bool = False) -> InformationBatch:
+        """
+        Return what the mutual-information estimators use, detached.
+
+        :param pooled: Take the living steps of all times as samples of one variable: ``(1, n, ...)``.
+        """
+        batch = InformationBatch(self.states, self.trvs, self.means, self.stds)
+        if pooled:
+            return InformationBatch(*(x[self.alive.bool()][None] for x in batch[:4]))
+        return batch if bool(self.alive.all()) else batch._replace(alive=self.alive.bool())
+
+
+class PolicyStep(NamedTuple):
+    """Actions and TRVs of N episodes at one time step."""
+
+    actions: th.Tensor  # (N, U), not clipped
+    trvs: th.Tensor  # (N, Z)
+    means: th.Tensor  # (N, Z)
+    stds: th.Tensor  # (N, Z)
+    noise: th.Tensor  # (N, Z)
+
+
+class RebuiltTRVs(NamedTuple):
+    """The TRVs of whole episodes, rebuilt from the stored noise so that gradients flow through the recurrence."""
+
+    trvs: th.Tensor  # (T, N, Z)
+    means: th.Tensor  # (T, N, Z)
+    stds: th.Tensor  # (T, N, Z)
 
 
 class EpisodeBuffer(RolloutBuffer):
     """
     A rollout buffer of ``(T, N, ...)`` arrays: time step by episode instead of SB3's time step by environment.
 
-    ``buffer_size`` is the horizon T and ``n_envs`` the number of episodes N, whatever the number of environments. After
-    the end of a short episode the arrays hold zeros, and ``alive`` is 0 there.
+    ``buffer_size`` is the horizon T and ``n_envs`` the number of episodes N, whatever the number of environments; N
+    grows if an epoch has more of them. After the end of a short episode the arrays hold zeros, and ``alive`` is 0
+    there.
 
     :param state_dim: X
     :param trv_dim: Z
@@ -68,20 +127,24 @@ class EpisodeBuffer(RolloutBuffer):
 
     def reset(self) -> None:
         """Clear the buffer."""
-        shape = (self.buffer_size, self.n_envs)
-        assert self.observation_space.dtype is not None
-        self.observations = np.zeros((*shape, *self.obs_shape), self.observation_space.dtype)
-        self.states = np.zeros((*shape, self.state_dim), np.float32)
-        self.noise = np.zeros((*shape, self.trv_dim), np.float32)
-        self.trvs = np.zeros((*shape, self.trv_dim), np.float32)
-        self.means = np.zeros((*shape, self.trv_dim), np.float32)
-        self.stds = np.ones((*shape, self.trv_dim), np.float32)
-        self.actions = np.zeros((*shape, self.action_dim), np.float32)
-        self.costs = np.zeros(shape, np.float32)
-        self.alive = np.zeros(shape, np.float32)
+
+        def zeros(space: spaces.Space) -> np.ndarray:
+            # Pages of np.zeros that are never written to take no memory.
+            return np.zeros((self.buffer_size, self.n_envs, *get_obs_shape(space)), space.dtype)
+
+        def vectors(*dim: int) -> np.ndarray:
+            return np.zeros((self.buffer_size, self.n_envs, *dim), np.float32)
+
+        space = self.observation_space
+        self.observations: Any = each(space.spaces if isinstance(space, spaces.Dict) else space, zeros)
+        self.states = vectors(self.state_dim)
+        self.noise, self.trvs, self.means, self.stds = (vectors(self.trv_dim) for _ in range(4))
+        self.stds += 1.0
+        self.actions = vectors(self.action_dim)
+        self.costs, self.alive = vectors(), vectors()
         self.full = False
 
-    def add_step(self, t: np.ndarray | int, episode: np.ndarray | slice, **values: np.ndarray) -> None:
+    def add_step(self, t: np.ndarray | int, episode: np.ndarray | slice, **values: Any) -> None:
         """
         Store one step of some episodes.
 
@@ -90,9 +153,20 @@ class EpisodeBuffer(RolloutBuffer):
         :param values: ``observations``, ``states``, ``noise``, ``trvs``, ``means``, ``stds``, ``actions``, ``costs``,
             each ``(n, ...)``
         """
+        while isinstance(episode, np.ndarray) and episode.max() >= self.alive.shape[1]:
+            self._double()
         for name, value in values.items():
-            getattr(self, name)[t, episode] = value
+            parts = value if isinstance(value, dict) else {name: value}
+            arrays = getattr(self, name) if isinstance(value, dict) else {name: getattr(self, name)}
+            for key, part in parts.items():
+                arrays[key][t, episode] = part.reshape(-1, *arrays[key].shape[2:])
         self.alive[t, episode] = 1.0
+
+    def _double(self) -> None:
+        """Make room for as many episodes again."""
+        for name in STORED:
+            setattr(self, name, each(getattr(self, name), lambda x: np.concatenate([x, np.zeros_like(x)], axis=1)))
+        self.stds[:, self.stds.shape[1] // 2 :] = 1.0
 
     def clear_episodes(self, episodes: np.ndarray) -> None:
         """
@@ -103,12 +177,25 @@ class EpisodeBuffer(RolloutBuffer):
         self.costs[:, episodes] = 0.0
         self.alive[:, episodes] = 0.0
 
-    def episode_batch(self) -> EpisodeBatch:
-        """Return the epoch as tensors."""
+    def episode_batch(self, whole_horizon: bool = True) -> EpisodeBatch:
+        """
+        Return the epoch as tensors.
+
+        :param whole_horizon: Also the time steps after the end of the longest episode.
+        """
         assert self.full, "the epoch's rollouts are not complete"
-        return EpisodeBatch(*(self.to_torch(getattr(self, name), copy=False) for name in EpisodeBatch._fields))
+        n_episodes = int(self.alive[0].sum())
+        length = self.buffer_size if whole_horizon else int(self.alive.any(axis=1).sum())
+
+        def tensor(x: np.ndarray) -> th.Tensor:
+            return self.to_torch(x[:length, :n_episodes], copy=False)
+
+        stored = {name: each(getattr(self, name), tensor) for name in STORED}
+        trvs = stored["trvs"]
+        prev_trvs = th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
+        return EpisodeBatch(**stored, advantages=th.zeros_like(stored["costs"]), prev_trvs=prev_trvs)
 
     @property
     def episode_costs(self) -> np.ndarray:
         """Undiscounted cost of each episode, ``(N,)``."""
-        return self.costs.sum(axis=0)
+        return self.costs[:, self.alive[0] > 0].sum(axis=0)

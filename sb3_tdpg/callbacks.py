@@ -46,11 +46,13 @@ class MINECallback(TDPGCallback):
     """
 
     def _on_training_start(self) -> None:
-        estimator, n = self.tdpg.estimator, self.tdpg.n_episodes
-        if self.tdpg.needs_information and n < (needed := estimator.recommended_episodes):
+        model, estimator = self.tdpg, self.tdpg.estimator
+        n = model.epoch_size if model.pools_information else model.epoch_size // model.horizon
+        if model.needs_information and n < (needed := estimator.recommended_episodes):
+            name = "epoch_steps" if model.pools_information else "n_episodes"
             warnings.warn(
-                f"n_episodes={n} are too few for {type(estimator).__name__}, which reports information where there is "
-                f"none: give n_episodes={needed} or more (mi_estimator='logdet' needs the fewest)",
+                f"{name}={n} are too few for {type(estimator).__name__}, which reports information where there is "
+                f"none: give {name}={needed} or more (mi_estimator='logdet' needs the fewest)",
                 stacklevel=2,
             )
 
@@ -59,10 +61,12 @@ class MINECallback(TDPGCallback):
         if not model.needs_information:
             model.information = None
             return
-        batch = model.rollout_buffer.episode_batch().information_batch()
+        batch = model.rollout_buffer.episode_batch().information_batch(model.pools_information)
         diagnostics = model.estimator.fit(batch)
         with th.no_grad():
             information = model.estimator(batch).cpu().numpy()  # (T,), nats
+        if model.pools_information:  # one estimate for a step of any time
+            information = information * model.rollout_buffer.alive.sum(0)[model.rollout_buffer.alive[0] > 0].mean()
         model.information = information
         self.logger.record("mi/total", float(information.sum()))
         for name, value in diagnostics.items():

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
 import sys
 import warnings
 from abc import abstractmethod
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -26,16 +27,20 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tdpg.buffers import EpisodeBuffer
+from sb3_tdpg.advantages import ValueFunction
+from sb3_tdpg.buffers import EpisodeBuffer, each
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.information import InformationEstimator
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import Problem, check_numbers, named_shapes, read_problem
+from sb3_tdpg.problem import Problem, check_numbers, check_observations, named_shapes, read_problem
 from sb3_tdpg.settings import nearest_multiples
 
 # Checkpoints that were saved before the module moved name its old path.
 sys.modules.setdefault("sb3_tdpg.random_state", sys.modules[RandomState.__module__])
+
+
+SelfEpisodic = TypeVar("SelfEpisodic", bound="EpisodicAlgorithm")
 
 
 class TrainingDivergedError(ValueError):
@@ -53,7 +58,12 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     policy: TRVPolicy  # type: ignore[assignment]
     rollout_buffer: EpisodeBuffer
     estimator: InformationEstimator
-    n_episodes: int
+    value_function: ValueFunction | None = None
+    """With ``baseline="value"``."""
+    n_episodes: int | None
+    """Episodes of an epoch."""
+    epoch_steps: int | None = None
+    """Instead: an epoch ends when its episodes have that many steps."""
     # Plain numbers, so that a model that is loaded without an environment can rebuild its networks.
     horizon: int = 0
     state_dim: int = 0
@@ -72,6 +82,11 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         if is_cuda and not th.cuda.is_available():
             warnings.warn(f"device={str(device)!r}, but torch finds no GPU: the model is on the CPU", stacklevel=3)
         super().__init__(*args, device=device, **kwargs)  # type: ignore[misc]
+
+    @property
+    @abstractmethod
+    def pools_information(self) -> bool:
+        """Whether one estimate of the information is made for the steps of all times."""
 
     @property
     @abstractmethod
@@ -96,7 +111,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             raise ValueError(
                 "VecNormalize(norm_reward=True) rescales the cost and with it, silently, beta: use norm_reward=False"
             )
-        if self.n_episodes % env.num_envs != 0:
+        if self.n_episodes is not None and self.n_episodes % env.num_envs != 0:
             raise ValueError(
                 f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), so "
                 f"that each environment runs the same number of episodes: use "
@@ -113,7 +128,15 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     def _set_problem(self, problem: Problem, env: VecEnv) -> None:
         self._problem = problem
         self.horizon, self.state_dim = problem.horizon, problem.state_dim
-        self.n_steps = self.horizon * (self.n_episodes // env.num_envs)
+        self.n_steps = self.epoch_size // env.num_envs
+
+    @property
+    def epoch_size(self) -> int:
+        """Environment steps of an epoch whose episodes last to the horizon."""
+        if self.n_episodes is not None:
+            return self.horizon * self.n_episodes
+        assert self.epoch_steps is not None
+        return self.epoch_steps
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
@@ -135,7 +158,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         Roll out N whole episodes with the current policy (line 2 of Algorithm 2).
 
         Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
-        would favour short ones. All environments begin an epoch at t = 0.
+        would favour short ones. With ``epoch_steps`` an environment begins another episode as long as there are fewer
+        steps. All environments begin an epoch at t = 0.
 
         :param env: The training environments.
         :param callback: Called at each step, and at the beginning and the end.
@@ -153,16 +177,17 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
         n_envs = env.num_envs
-        obs = cast(np.ndarray, self._last_obs)
+        obs: Any = self._last_obs
         states = self._problem.initial_states(env, obs)  # (E, X)
         trvs = th.zeros(n_envs, self.policy.trv_dim, device=self.device)
         t = np.zeros(n_envs, np.int64)
         column = np.arange(n_envs)  # of the buffer, for the current episode of each environment
+        n_columns, n_stored = n_envs, 0
         # An epoch that ends early cannot be continued: leave the environments to be reset.
         self._last_obs = None
 
-        while (running := np.flatnonzero(column < self.n_episodes)).size > 0:
-            check_numbers("observation", obs, self.observation_space.shape, t)
+        while (running := np.flatnonzero(column >= 0)).size > 0:
+            check_observations(self.observation_space, obs, t)
             check_numbers("state", states, (self.state_dim,), t)
             with th.no_grad():
                 step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(t, self.horizon - 1))
@@ -171,7 +196,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             if isinstance(self.action_space, spaces.Box):
                 env_actions = np.clip(env_actions, self.action_space.low, self.action_space.high)
             with named_shapes(env):
-                new_obs, rewards, dones, infos = env.step(env_actions)
+                new_obs, rewards, dones, infos = cast(Any, env.step(env_actions))
 
             self.num_timesteps += n_envs
             callback.update_locals(locals())
@@ -180,7 +205,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             self._update_info_buffer(infos, dones)
 
             stored = {
-                "observations": obs.reshape(n_envs, *rollout_buffer.obs_shape),
+                "observations": obs,
                 "states": states,
                 "noise": step.noise.cpu().numpy(),
                 "trvs": step.trvs.cpu().numpy(),
@@ -189,9 +214,12 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 "actions": actions.reshape(n_envs, -1),
                 "costs": -rewards,
             }
-            rollout_buffer.add_step(t[running], column[running], **{k: v[running] for k, v in stored.items()})
+            rollout_buffer.add_step(
+                t[running], column[running], **{k: each(v, lambda x: x[running]) for k, v in stored.items()}
+            )
+            n_stored += running.size
 
-            states = self._problem.next_states(env, cast(np.ndarray, new_obs), dones, infos)
+            states = self._problem.next_states(env, new_obs, dones, infos)
             trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
             t = np.where(dones, 0, t + 1)
             finished = dones
@@ -199,13 +227,17 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 # RayVecEnv has restarted these environments: they run the episode again.
                 rollout_buffer.clear_episodes(column[running][lost[running]])
                 finished = dones & ~lost
-            column = np.where(finished, column + n_envs, column)
-            if (t[column < self.n_episodes] >= self.horizon).any():
+            for i in np.flatnonzero(finished & (column >= 0)):
+                if self.n_episodes is None:
+                    column[i], n_columns = (n_columns, n_columns + 1) if n_stored < self.epoch_size else (-1, n_columns)
+                else:
+                    column[i] = column[i] + n_envs if column[i] + n_envs < self.n_episodes else -1
+            if (t[column >= 0] >= self.horizon).any():
                 raise ValueError(
                     f"an episode did not end after horizon={self.horizon} steps: the environment must return "
                     "terminated or truncated there (or declare its true horizon)"
                 )
-            obs = cast(np.ndarray, new_obs)
+            obs = new_obs
 
         rollout_buffer.full = True
         if (t == 0).all():
@@ -296,18 +328,56 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         with replaced_atomically(target) as partial, partial.open("wb") as file:
             super().save(file, exclude, include)
 
+    @classmethod
+    def load(
+        cls: type[SelfEpisodic],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfEpisodic:
+        """
+        Load a saved model; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.load`.
+
+        :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to continue from a policy-gradient model.
+        :raises ValueError: if the file is damaged or TDPG did not save it.
+        """
+        # As in the constructor: a limit alone implies beta="auto", and a number for beta needs no limit.
+        if kwargs.get("cost_limit") is not None:
+            kwargs.setdefault("beta", "auto")
+        elif kwargs.get("beta", "auto") != "auto":
+            kwargs.setdefault("cost_limit", None)
+        for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
+            if kwargs.get(one) is not None:
+                kwargs.setdefault(other, None)
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (AssertionError, pickle.UnpicklingError) as e:
+            # "No data found in the saved file", "No params found ..."
+            if isinstance(e, AssertionError) and not str(e).startswith("No "):
+                raise
+            raise ValueError(
+                f"{path} is not a model of TDPG: the file is damaged, or another program made it "
+                f"({' '.join(str(e).split())[:200]})"
+            ) from e
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_problem"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         # The estimator's state dict holds its optimiser, too.
-        return ["policy", "policy.optimizer", "estimator"], []
+        value = [] if self.value_function is None else ["value_function", "value_function.optimizer"]
+        return ["policy", "policy.optimizer", "estimator", *value], []
 
 
 def check_policy(policy: Any, aliases: Collection[str]) -> None:
     """Raise a ``ValueError`` unless the policy is TDPG's."""
     if isinstance(policy, str) and policy not in aliases:
-        raise ValueError(f"policy={policy!r} is unknown: use one of {list(aliases)}")
+        hint = "" if not policy.endswith("Policy") else "; TRVPolicy takes vectors, images and dicts of them"
+        raise ValueError(f"policy={policy!r} is unknown: use one of {list(aliases)}{hint}")
     if not isinstance(policy, str) and not (isinstance(policy, type) and issubclass(policy, TRVPolicy)):
         raise ValueError(
             f"policy={policy!r} is neither 'TRVPolicy' nor a subclass of TRVPolicy; if it comes from a file, another "

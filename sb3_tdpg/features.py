@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -21,8 +23,11 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
     :param space: The observation space.
     :param normalize_images: Whether bytes are divided by 255; if not, images of floats in [0, 1] are accepted, too.
     :return: ``"image"``: uint8, channels first or last; ``"depth"``: a ``Box`` of floats, ``(1, H, W)`` with at least
-        12 pixels a side; ``"vector"``: anything else
+        12 pixels a side; ``"vector"``: anything else. A ``Dict`` is of the kind of its images, if it has any.
     """
+    if isinstance(space, spaces.Dict):
+        kinds = {observation_kind(part, normalize_images=normalize_images) for part in space.values()}
+        return next((kind for kind in ("image", "depth") if kind in kinds), "vector")
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
         channels, *sides = space.shape if len(space.shape) == 3 else (0,)
         if channels == 1 and min(sides) >= MIN_SIDE:
@@ -39,6 +44,75 @@ def flat_action_space(space: spaces.Space) -> spaces.Space:
     if isinstance(space, spaces.MultiBinary):
         return spaces.MultiBinary(int(np.prod(space.shape)))
     return space
+
+
+class RunningNorm(nn.Module):
+    """
+    Standardise vectors by the mean and the standard deviation of all that were seen, as SB3's ``VecNormalize``.
+
+    The statistics are saved with the network. They change only in :meth:`update`, so that an epoch's rollouts and its
+    gradients see the same inputs.
+
+    :param dim: Number of components.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", th.zeros(dim))
+        self.register_buffer("var", th.ones(dim))
+        self.register_buffer("count", th.tensor(1e-4))
+
+    mean: th.Tensor
+    var: th.Tensor
+    count: th.Tensor
+
+    @th.no_grad()
+    def update(self, x: th.Tensor) -> None:
+        """Include a batch, ``(n, dim)``, with n of at least 1."""
+        n, var, mean = len(x), *th.var_mean(x, dim=0, correction=0)
+        total, shift = self.count + n, mean - self.mean
+        self.var.copy_((self.count * self.var + n * var + shift.square() * self.count * n / total) / total)
+        self.mean.add_(shift * n / total)
+        self.count.copy_(total)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """``(..., dim) -> (..., dim)``, clipped to [-10, 10]."""
+        # A component that never changes carries nothing: its rounding must not be magnified.
+        return ((x - self.mean) / th.sqrt(self.var + 1e-8)).clamp(-10.0, 10.0)
+
+
+class ObservationNorm(nn.Module):
+    """
+    A :class:`RunningNorm` for each vector of an observation; images and one-hot inputs pass through.
+
+    :param space: The observation space, which may be a ``Dict``.
+    """
+
+    def __init__(self, space: spaces.Space) -> None:
+        super().__init__()
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        vectors = {k: x for k, x in parts.items() if isinstance(x, spaces.Box) and observation_kind(x) == "vector"}
+        self.norms = nn.ModuleDict({key: RunningNorm(math.prod(x.shape)) for key, x in vectors.items()})
+
+    def forward(self, observation: Any) -> Any:
+        """``(n, *obs) -> (n, *obs)``, or a dict of such."""
+        if isinstance(observation, dict):
+            return {key: self._standardized(x, key) for key, x in observation.items()}
+        return self._standardized(observation, "observation")
+
+    def _standardized(self, x: th.Tensor, key: str) -> th.Tensor:
+        return self.norms[key](x.flatten(1).float()).view(x.shape) if key in self.norms else x
+
+    def update(self, observations: Any, alive: th.Tensor) -> None:
+        """
+        Include an epoch's observations.
+
+        :param observations: ``(T, N, *obs)``, or a dict of such
+        :param alive: ``(T, N)``
+        """
+        for key, norm in self.norms.items():
+            x = observations[key] if isinstance(observations, dict) else observations
+            cast(RunningNorm, norm).update(x[alive.bool()].flatten(1).float())
 
 
 class TRVCnn(BaseFeaturesExtractor):

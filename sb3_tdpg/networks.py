@@ -127,6 +127,12 @@ class TimeMLP(nn.Module):
             return self.mlp(x)
         return self.mlp(x.flatten(0, 1)[None])[0].unflatten(0, x.shape[:2])
 
+    @th.no_grad()
+    def scale_output(self, factor: float) -> None:
+        """Scale the weights of the last layer, for a start with small outputs."""
+        for parameter in self.mlp.layers[-1].parameters():
+            parameter.mul_(factor)
+
     def at(self, x: th.Tensor, t: int) -> th.Tensor:
         """One step, the same for all episodes: ``(N, I) -> (N, O)``."""
         return self.mlp.at(x, t if self.time_varying else 0)

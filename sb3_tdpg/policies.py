@@ -9,43 +9,26 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution, make_proba_distribution
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
+from torch.nn import functional as F
 
-from sb3_tdpg.buffers import EpisodeBatch
-from sb3_tdpg.features import flat_action_space, observation_kind
+from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
+from sb3_tdpg.features import ObservationNorm, flat_action_space, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
-from sb3_tdpg.settings import POLICY_DEFAULTS
+from sb3_tdpg.settings import POLICY_DEFAULTS, check_net_arch
 
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
-
-
-class PolicyStep(NamedTuple):
-    """Actions and TRVs of N episodes at one time step."""
-
-    actions: th.Tensor  # (N, U), not clipped
-    trvs: th.Tensor  # (N, Z)
-    means: th.Tensor  # (N, Z)
-    stds: th.Tensor  # (N, Z)
-    noise: th.Tensor  # (N, Z)
-
-
-class RebuiltTRVs(NamedTuple):
-    """The TRVs of whole episodes, rebuilt from the stored noise so that gradients flow through the recurrence."""
-
-    trvs: th.Tensor  # (T, N, Z)
-    means: th.Tensor  # (T, N, Z)
-    stds: th.Tensor  # (T, N, Z)
 
 
 class TRVPolicy(BasePolicy):
@@ -58,24 +41,34 @@ class TRVPolicy(BasePolicy):
     ``predict`` takes and returns the memory as ``state=(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the index of the
     next time step, ``(n_envs,)``.
 
-    Three defaults are for vectors, images (uint8) and depth images (floats). The network sizes are the paper's.
+    Four defaults are for the presets "vector", "image" (uint8), "depth" (images of floats) and "long" (vectors over a
+    long horizon, see :mod:`sb3_tdpg.settings`). The network sizes of the first three are the paper's.
 
     :param observation_space: A vector, or an image with channels first.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: Number of time steps T; the algorithm passes the environment's.
-    :param trv_dim: Number of TRVs Z; default: 2, 8, 16.
+    :param preset: Which defaults to use; the algorithm passes that of the problem. ``None``: by the observation alone.
+    :param trv_dim: Number of TRVs Z; default: 2, 8, 16, and 16 more than the features.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
-        ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``.
-    :param activation_fn: Nonlinearity of the hidden layers; default: ELU, tanh, tanh (encoder) and ELU (head).
-    :param time_varying: Whether each time step has its own weights; default: up to a horizon of 50. The feature
-        extractor is always shared.
+        ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``, ``[64, 64]`` and ``[64, 64]``.
+    :param activation_fn: Nonlinearity of the hidden layers; default: ELU, tanh, tanh (encoder) and ELU (head), tanh.
+    :param time_varying: Whether each time step has its own weights; default: up to a horizon of 50, but not with the
+        preset "long". The feature extractor is always shared.
+    :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
+        store an observation before the action head can use it; default: no, no, no, yes (if they are as many or more).
+    :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all that
+        were seen in training, as by SB3's ``VecNormalize``; default: no, no, no, yes.
+    :param scale_actions: Whether the head's outputs are in units of the bounds of the action space: 0 is their middle,
+        1 the upper one, and a standard deviation of 1 half of their distance; default: no, no, no, yes.
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
-        Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen.
+        Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen. Default: yes,
+        yes, yes, no.
     :param squash_trv_log_var: Whether a tanh also keeps the log-variance in [-1, 1], before ``encoder_log_var_init`` is
         added, as in the paper's policies for images. The standard deviation is then at least 0.6, which hurts.
-    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3.
-    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2.
+    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3,
+        -4.
+    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -1.
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
     :param action_var_floor: Smallest variance of an action, likewise.
     :param features_extractor_class: Network in front of the encoder; default: flatten for vectors, the paper's two
@@ -88,6 +81,8 @@ class TRVPolicy(BasePolicy):
     """
 
     _has_warned = False  # of deterministic=True
+    action_middle: th.Tensor
+    action_range: th.Tensor
 
     def __init__(
         self,
@@ -97,11 +92,15 @@ class TRVPolicy(BasePolicy):
         use_sde: bool = False,
         *,
         horizon: int,
+        preset: str | None = None,
         trv_dim: int | None = None,
         net_arch: dict[str, Sequence[int]] | None = None,
         activation_fn: type[nn.Module] | None = None,
         time_varying: bool | None = None,
-        squash_trv_mean: bool = True,
+        skip: bool | None = None,
+        normalize_observations: bool | None = None,
+        scale_actions: bool | None = None,
+        squash_trv_mean: bool | None = None,
         squash_trv_log_var: bool = False,
         encoder_log_var_init: float | None = None,
         action_log_var_init: float | None = None,
@@ -113,8 +112,11 @@ class TRVPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        defaults = POLICY_DEFAULTS[observation_kind(observation_space, normalize_images=normalize_images)]
-        if features_extractor_class is None:
+        kind = observation_kind(observation_space, normalize_images=normalize_images)
+        defaults = POLICY_DEFAULTS[kind if preset is None else preset]
+        if features_extractor_class is None and isinstance(observation_space, spaces.Dict):
+            features_extractor_class = CombinedExtractor
+        elif features_extractor_class is None:
             features_extractor_class = defaults.features_extractor_class
             features_extractor_kwargs = {**defaults.features_extractor_kwargs, **(features_extractor_kwargs or {})}
         super().__init__(
@@ -128,9 +130,13 @@ class TRVPolicy(BasePolicy):
             squash_output=False,
         )
         self.horizon = horizon
-        self.trv_dim = defaults.trv_dim if trv_dim is None else trv_dim
-        self.time_varying = horizon <= MAX_TIME_VARYING_HORIZON if time_varying is None else time_varying
-        self.squash_trv_mean = squash_trv_mean
+        self.preset = preset
+        self.time_varying = (
+            horizon <= MAX_TIME_VARYING_HORIZON and preset != "long" if time_varying is None else time_varying
+        )
+        self.normalize_observations = _default(normalize_observations, defaults.is_long)
+        self.scale_actions = _default(scale_actions, defaults.is_long)
+        self.squash_trv_mean = _default(squash_trv_mean, not defaults.is_long)
         self.squash_trv_log_var = squash_trv_log_var
         self.activation_fn = activation_fn
         self.encoder_log_var_init = _default(encoder_log_var_init, defaults.encoder_log_var_init)
@@ -138,7 +144,12 @@ class TRVPolicy(BasePolicy):
         self.encoder_var_floor = encoder_var_floor
         self.action_var_floor = action_var_floor
         default_arch = dict(encoder=list(defaults.encoder), action_head=list(defaults.action_head))
-        self.net_arch = _check_net_arch(net_arch, default_arch)
+        self.net_arch = check_net_arch(net_arch, default_arch)
+
+        self.norm = ObservationNorm(observation_space) if self.normalize_observations else None
+        self.features_extractor = self.make_features_extractor()
+        self.features_dim = self.features_extractor.features_dim
+        self.trv_dim = _default(trv_dim, defaults.trv_dim + (self.features_dim if defaults.is_long else 0))
         for name, value in (("horizon", horizon), ("policy_kwargs: trv_dim", self.trv_dim)):
             if not (isinstance(value, (int, np.integer)) and value >= 1):
                 raise ValueError(f"{name}={value!r} must be an integer of at least 1")
@@ -146,8 +157,12 @@ class TRVPolicy(BasePolicy):
             if not floor >= 0:
                 raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
 
-        self.features_extractor = self.make_features_extractor()
-        self.features_dim = self.features_extractor.features_dim
+        self.skip = _default(skip, defaults.is_long and self.trv_dim >= self.features_dim)
+        if self.skip and self.trv_dim < self.features_dim:
+            raise ValueError(
+                f"policy_kwargs: skip=True adds the {self.features_dim} features to as many TRVs, but trv_dim="
+                f"{self.trv_dim}: give trv_dim={self.features_dim} or more, or skip=False"
+            )
         self.action_dist = make_proba_distribution(flat_action_space(action_space))
         self.encoder = TimeMLP(
             horizon,
@@ -161,6 +176,13 @@ class TRVPolicy(BasePolicy):
             activation_fn or defaults.action_head_activation_fn,
             time_varying=self.time_varying,
         )
+        if defaults.is_long:  # begin near the middle of the actions, and with little else than the features in the TRVs
+            self.encoder.scale_output(0.1)
+            self.action_head.scale_output(0.1)
+        if self.scale_actions and isinstance(action_space, spaces.Box):
+            bounds = th.as_tensor(np.stack([action_space.low, action_space.high]).reshape(2, -1))
+            self.register_buffer("action_middle", bounds.mean(0), persistent=False)
+            self.register_buffer("action_range", (bounds[1] - bounds[0]) / 2, persistent=False)
         self.optimizer = self.optimizer_class(
             self.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]  # the base class takes none, every optimiser does
@@ -177,18 +199,21 @@ class TRVPolicy(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         names = (
-            "horizon", "trv_dim", "net_arch", "activation_fn", "time_varying", "squash_trv_mean", "squash_trv_log_var",
-            "encoder_log_var_init", "action_log_var_init", "encoder_var_floor", "action_var_floor",
-            "features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
+            "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip",
+            "normalize_observations", "scale_actions", "squash_trv_mean", "squash_trv_log_var", "encoder_log_var_init",
+            "action_log_var_init", "encoder_var_floor", "action_var_floor", "features_extractor_class",
+            "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
         )  # fmt: skip
         data.update({name: getattr(self, name) for name in names}, lr_schedule=self._dummy_schedule)
         return data
 
     # -- the two conditional distributions --------------------------------------------------------------------
 
-    def _encoder_density(self, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return mean and standard deviation of q: ``(..., 2 Z) -> 2 x (..., Z)``."""
+    def _encoder_density(self, parameters: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return mean and standard deviation of q: ``(..., 2 Z)`` and ``(..., F)`` -> 2 x ``(..., Z)``."""
         mean, log_var = parameters.chunk(2, dim=-1)
+        if self.skip:
+            mean = mean + F.pad(features, (0, self.trv_dim - self.features_dim))
         if self.squash_trv_mean:
             mean = th.tanh(mean)
         if self.squash_trv_log_var:
@@ -201,7 +226,11 @@ class TRVPolicy(BasePolicy):
         if isinstance(self.action_dist, DiagGaussianDistribution):
             mean, log_var = parameters.chunk(2, dim=-1)
             variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
-            return self.action_dist.proba_distribution(mean, 0.5 * th.log(variance))
+            log_std = 0.5 * th.log(variance)
+            if self.scale_actions:
+                mean = self.action_middle + self.action_range * mean
+                log_std = log_std + self.action_range.log()
+            return self.action_dist.proba_distribution(mean, log_std)
         return self.action_dist.proba_distribution(parameters)
 
     def _variance(self, log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
@@ -237,8 +266,14 @@ class TRVPolicy(BasePolicy):
         :param prev_trv: x~_{t-1}, ``(N, Z)``; zero at the start of an episode
         :param t: time step of each episode, ``(N,)``
         """
-        inputs = th.cat([prev_trv, self.extract_features(observation, self.features_extractor)], dim=1)
-        return self._encoder_density(self._at_times(self.encoder, inputs, t))
+        features = self._features(observation)
+        return self._encoder_density(self._at_times(self.encoder, th.cat([prev_trv, features], dim=1), t), features)
+
+    def _features(self, observation: PyTorchObs) -> th.Tensor:
+        """Standardise vectors, if asked for, and extract the features: ``(n, *obs) -> (n, F)``."""
+        if self.norm is not None:
+            observation = self.norm(observation)
+        return self.extract_features(observation, self.features_extractor)
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
         """
@@ -262,16 +297,13 @@ class TRVPolicy(BasePolicy):
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Extract the features of every observation: ``(T, N, F)``."""
-        observations = batch.observations.flatten(0, 1)
-        if observations.dim() == 4:  # change the layout while the pixels are still bytes: it is cheaper
-            observations = observations.contiguous(memory_format=th.channels_last)
-        features = self.extract_features(observations, self.features_extractor)
-        return features.unflatten(0, batch.observations.shape[:2])
 
-    @staticmethod
-    def prev_trvs(trvs: th.Tensor) -> th.Tensor:
-        """Return x~_{t-1}, which is zero at t = 0: ``(T, N, Z) -> (T, N, Z)``."""
-        return th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
+        def flat(x: th.Tensor) -> th.Tensor:
+            x = x.flatten(0, 1)
+            # Change the layout while the pixels are still bytes: it is cheaper.
+            return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 else x
+
+        return self._features(each(batch.observations, flat)).unflatten(0, batch.alive.shape)
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
@@ -281,7 +313,7 @@ class TRVPolicy(BasePolicy):
 
         :return: ``(T, N)``
         """
-        mean, std = self._encoder_density(self.encoder(th.cat([self.prev_trvs(batch.trvs), features], dim=-1)))
+        mean, std = self._encoder_density(self.encoder(th.cat([batch.prev_trvs, features], dim=-1)), features)
         return th.distributions.Normal(mean, std, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
@@ -297,68 +329,41 @@ class TRVPolicy(BasePolicy):
             actions = actions[:, 0]
         return self._action_distribution(parameters).log_prob(actions).unflatten(0, trvs.shape[:2])
 
-    def rebuild_trvs(self, features: th.Tensor, noise: th.Tensor, start: th.Tensor | None = None) -> RebuiltTRVs:
+    def rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> RebuiltTRVs:
         """
-        Unroll Equation 15, ``x~_t = mean + std * eps_t``, from t = 0 with the stored noise.
+        Unroll Equation 15, ``x~_t = mean + std * eps_t``, with the stored noise.
+
+        Episodes start from zero, segments from the stored TRVs of the step before, without a gradient.
 
         :param features: ``(T, N, F)``
-        :param noise: eps_t, ``(T, N, Z)``
-        :param start: x~_{-1}, ``(N, Z)``; default: zero
+        :param batch: the rollouts, ``(T, N, ...)``
         """
-        trv = th.zeros_like(noise[0]) if start is None else start
+        trv, noise = batch.prev_trvs[0], batch.noise
         steps = []
         # unbind, not features[t]: the gradient of each features[t] would be as large as all features.
         for t, (features_t, noise_t) in enumerate(zip(features.unbind(), noise.unbind(), strict=True)):
-            mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features_t], dim=-1), t))
+            mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features_t], dim=-1), t), features_t)
             trv = mean + std * noise_t
             steps.append((trv, mean, std))
         return RebuiltTRVs(*(th.stack(x) for x in zip(*steps, strict=True)))
 
     def evaluate_episodes(
-        self, batch: EpisodeBatch, encoder_gradient: str, bptt_steps: int | None = None, rebuild: bool = False
+        self, batch: EpisodeBatch, encoder_gradient: str, rebuild: bool = False
     ) -> tuple[th.Tensor, RebuiltTRVs | None]:
         """
         Compute the log-probability whose gradient trains encoder and head.
 
+        :param batch: whole episodes, or segments of them
         :param encoder_gradient: ``"score"`` or ``"pathwise"``, see :class:`~sb3_tdpg.TDPG`.
-        :param bptt_steps: See :class:`~sb3_tdpg.TDPG`.
         :param rebuild: Also rebuild the TRVs from the noise when the gradient does not need them.
         :return: ``(T, N)``, and the rebuilt TRVs
         """
         features = self.episode_features(batch)
-        rebuilt = None
-        if rebuild or encoder_gradient == "pathwise":
-            if bptt_steps is None or bptt_steps >= self.horizon:
-                rebuilt = self.rebuild_trvs(features, batch.noise)
-            else:
-                rebuilt = self.rebuild_trvs_in_parts(features, batch, bptt_steps)
+        rebuilt = self.rebuild_trvs(features, batch) if rebuild or encoder_gradient == "pathwise" else None
         if encoder_gradient == "pathwise":
             assert rebuilt is not None
             return self.action_log_prob(rebuilt.trvs, batch), rebuilt
         return self.trv_log_prob(features, batch) + self.action_log_prob(batch.trvs, batch), rebuilt
-
-    def rebuild_trvs_in_parts(self, features: th.Tensor, batch: EpisodeBatch, n_steps: int) -> RebuiltTRVs:
-        """
-        Unroll Equation 15 in parts of the horizon: truncated back-propagation through time.
-
-        Each part starts from the stored TRVs of the step before it, without a gradient.
-
-        :param features: ``(T, N, F)``
-        :param batch: the rollouts, ``(T, N, ...)``
-        :param n_steps: Length of a part. All steps must share their weights.
-        """
-        assert not self.time_varying
-        horizon, n_episodes = batch.noise.shape[:2]
-        n_parts = math.ceil(horizon / n_steps)
-
-        def split(x: th.Tensor) -> th.Tensor:  # (T, N, .) -> (n_steps, n_parts * N, .)
-            padded = th.cat([x, x.new_zeros(n_parts * n_steps - horizon, *x.shape[1:])])
-            return padded.unflatten(0, (n_parts, n_steps)).transpose(0, 1).flatten(1, 2)
-
-        rebuilt = self.rebuild_trvs(split(features), split(batch.noise), split(self.prev_trvs(batch.trvs))[0])
-        return RebuiltTRVs(
-            *(x.unflatten(1, (n_parts, n_episodes)).transpose(0, 1).flatten(0, 1)[:horizon] for x in rebuilt)
-        )
 
     # -- the interface of SB3 ---------------------------------------------------------------------------------
 
@@ -390,8 +395,8 @@ class TRVPolicy(BasePolicy):
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
         """
-        if isinstance(observation, dict):
-            raise ValueError("the observation is a dict, but TRVPolicy takes arrays: flatten it (FlattenObservation)")
+        if isinstance(observation, dict) and not isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(f"the observation is a dict, but the policy was made for {self.observation_space}")
         if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
             raise ValueError(
                 "the observation is a tuple. You are probably mixing Gym API with SB3 VecEnv API: an environment's "
@@ -406,8 +411,9 @@ class TRVPolicy(BasePolicy):
             )
         self.set_training_mode(False)
         observation_tensor, is_vectorized = self.obs_to_tensor(observation)
-        assert isinstance(observation_tensor, th.Tensor)
-        n_envs = observation_tensor.shape[0]
+        n_envs = len(
+            next(iter(observation_tensor.values())) if isinstance(observation_tensor, dict) else observation_tensor
+        )
         if state is None:
             prev_trv, t = np.zeros((n_envs, self.trv_dim), np.float32), np.zeros(n_envs, np.int64)
         else:
@@ -421,10 +427,11 @@ class TRVPolicy(BasePolicy):
             start = np.asarray(episode_start, dtype=bool).reshape(-1)
             prev_trv = np.where(start[:, None], np.float32(0), prev_trv)
             t = np.where(start, 0, t)
-        if (t >= self.horizon).any():
+        if self.time_varying and (t >= self.horizon).any():
             raise ValueError(
-                f"predict() was called for step {int(t.max()) + 1} of an episode, but the policy's horizon is "
-                f"{self.horizon}: pass episode_start=True at the first step of an episode (or state=None)"
+                f"predict() was called for step {int(t.max()) + 1} of an episode, but the policy has weights for "
+                f"{self.horizon} steps: pass episode_start=True at the first step of an episode (or state=None), or "
+                "train a policy that goes on for any number of steps with policy_kwargs=dict(time_varying=False)"
             )
         with th.no_grad():
             step = self.step(observation_tensor, th.as_tensor(prev_trv, device=self.device), t, deterministic)
@@ -434,14 +441,5 @@ class TRVPolicy(BasePolicy):
         return (actions if is_vectorized else actions.squeeze(axis=0)), (step.trvs.cpu().numpy(), t + 1)
 
 
-def _default(value: float | None, default: float) -> float:
+def _default(value: Any, default: Any) -> Any:
     return default if value is None else value
-
-
-def _check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:
-    given = {} if given is None else given
-    if not isinstance(given, dict) or not set(given) <= set(default):
-        raise ValueError(
-            f"policy_kwargs: net_arch={given!r} must be a dict with the keys {sorted(default)}, for instance {default}"
-        )
-    return {key: list(given.get(key, sizes)) for key, sizes in default.items()}

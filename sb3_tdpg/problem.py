@@ -6,12 +6,14 @@ Dimension key: E environments, X state.
 
 from __future__ import annotations
 
+import math
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
@@ -57,7 +59,8 @@ class Problem:
 
     def _states(self, infos: list[dict[str, Any]], obs: np.ndarray) -> np.ndarray:
         if self.state_is_observation:
-            return obs.reshape(len(obs), -1).astype(np.float32)
+            parts = list(obs.values()) if isinstance(obs, dict) else [obs]
+            return np.concatenate([x.reshape(len(x), -1) for x in parts], axis=1, dtype=np.float32)
         try:
             states = np.stack([info["state"] for info in infos])
         except KeyError as e:
@@ -69,15 +72,11 @@ class Problem:
 
 def read_problem(env: VecEnv) -> Problem:
     """Read the horizon and the state of an environment without a step; a ``ValueError`` says what it lacks."""
-    if isinstance(env.observation_space, (spaces.Dict, spaces.Tuple)):
+    if isinstance(env.observation_space, spaces.Tuple):
         raise ValueError(
             f"the observation space {env.observation_space} is not supported: use gymnasium.wrappers.FlattenObservation"
         )
-    horizon = _attribute(env, "horizon")
-    if horizon is None:
-        spec = _attribute(env, "spec")
-        # A TimeLimit that the user wrapped around it is not in the spec.
-        horizon = _attribute(env, "_max_episode_steps") if spec is None else spec.max_episode_steps
+    horizon = horizon_of(env)
     if not isinstance(horizon, (int, np.integer)) or horizon < 1:
         raise ValueError(
             f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer "
@@ -85,20 +84,37 @@ def read_problem(env: VecEnv) -> Problem:
         )
     state_space = _attribute(env, "state_space")
     is_observation = state_space is None
-    shape = env.observation_space.shape if is_observation else state_space.shape
-    if shape is None or (is_observation and observation_kind(env.observation_space) != "vector"):
+    if is_observation and observation_kind(env.observation_space) != "vector":
         raise ValueError(
-            f"the mutual information needs the true state, and an image of shape {shape} cannot stand in for it: "
-            f"{BRING_THE_STATE}"
+            f"the mutual information needs the true state, and an image ({env.observation_space}) cannot stand in for "
+            f"it: {BRING_THE_STATE}"
         )
-    state_dim = int(np.prod(shape))
+    space = env.observation_space if is_observation else state_space
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    state_dim = sum(math.prod(part.shape or ()) for part in parts)
     return Problem(int(horizon), state_dim, is_observation, _state_names(env, state_dim))
 
 
-def reward_threshold(env: VecEnv) -> float | None:
-    """Get the return at which the environment counts as solved, if it was registered with one."""
-    spec = _attribute(env, "spec")
-    return None if spec is None else spec.reward_threshold
+def horizon_of(env: VecEnv | gym.Env) -> Any:
+    """Return the horizon that an environment declares, or its time limit; ``None`` if it has neither."""
+    horizon = _attribute(env, "horizon")
+    if horizon is None:
+        spec = _attribute(env, "spec")
+        # A TimeLimit that the user wrapped around it is not in the spec.
+        horizon = _attribute(env, "_max_episode_steps") if spec is None else spec.max_episode_steps
+    return horizon
+
+
+def reward_threshold(env: VecEnv | None) -> float:
+    """Get the return at which the environment counts as solved; a ``ValueError`` if it was registered without one."""
+    spec = None if env is None else _attribute(env, "spec")
+    if spec is None or spec.reward_threshold is None:
+        raise ValueError(
+            "beta='auto' minimises the information under a limit on the expected cost, but the environment is "
+            "registered without a reward_threshold: give cost_limit=..., or beta=1/75, or beta=float('inf') for plain "
+            "policy gradient"
+        )
+    return float(spec.reward_threshold)
 
 
 def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
@@ -114,8 +130,10 @@ def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
     return tuple(str(name) for name in names)
 
 
-def _attribute(env: VecEnv, name: str) -> Any:
+def _attribute(env: VecEnv | gym.Env, name: str) -> Any:
     """Return an attribute of the first environment, or None."""
+    if isinstance(env, gym.Env):
+        return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
     return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
 
 
@@ -141,6 +159,15 @@ def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, 
             f"environment {env} returned the {what} {values[index]:g} in component {component} at step "
             f"{t[env]} of its episode: it must be a finite number of at most {LARGEST:g}"
         )
+
+
+def check_observations(space: spaces.Space, observations: Any, t: np.ndarray) -> None:
+    """Check the observations of all environments, see :func:`check_numbers`."""
+    if isinstance(space, spaces.Dict):
+        for key, part in space.items():
+            check_numbers(f"observation[{key!r}]", observations[key], part.shape, t)
+    else:
+        check_numbers("observation", observations, space.shape, t)
 
 
 @contextmanager

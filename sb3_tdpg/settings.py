@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,12 +23,19 @@ ENCODER_GRADIENTS = ("score", "pathwise")
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
+# From this horizon on the problem is an ordinary one of reinforcement learning, and no longer one of the paper's kind.
+LONG_HORIZON = 50
+EPOCH_STEPS = 2000
+MIN_BATCH_STEPS = 32  # the information of a minibatch is that of as many samples
+
+
 class Defaults(NamedTuple):
-    """Arguments of :class:`~sb3_tdpg.tdpg.TDPG` that depend on the kind of observation, and the length of training."""
+    """Arguments of :class:`~sb3_tdpg.tdpg.TDPG` that depend on the kind of problem, and the length of training."""
 
     beta: float | str
     learning_rate: str
-    n_episodes: int
+    n_episodes: int | None
+    epoch_steps: int | None
     n_epochs: int
     batch_size: int | None
     clip_range: float
@@ -36,6 +44,11 @@ class Defaults(NamedTuple):
     mi_estimator: str
     n_threads: int | None
     total_epochs: int  # policy epochs
+    baseline: str = "regression"
+    bptt_steps: int | None = None
+    gamma: float = 1.0
+    gae_lambda: float = 0.95
+    max_grad_norm: float = float("inf")
 
 
 # One update per epoch, as in the paper; the falling learning rate improves the last epochs.
@@ -43,6 +56,7 @@ VECTOR = Defaults(
     beta=1 / 75,
     learning_rate="lin_2e-3_2e-5",
     n_episodes=500,
+    epoch_steps=None,
     n_epochs=1,
     batch_size=None,
     clip_range=float("inf"),
@@ -58,6 +72,7 @@ IMAGE = Defaults(
     beta="auto",
     learning_rate="lin_1e-3_5e-5",
     n_episodes=160,
+    epoch_steps=None,
     n_epochs=4,
     batch_size=80,
     clip_range=0.2,
@@ -72,6 +87,29 @@ IMAGE = Defaults(
 DEPTH = IMAGE._replace(n_episodes=400, batch_size=200, total_epochs=100)
 
 
+# Ordinary environments: PPO's update, with minibatches of short segments and a value network.
+LONG = Defaults(
+    beta=float("inf"),
+    learning_rate="lin_1e-3_1e-4",
+    n_episodes=None,
+    epoch_steps=EPOCH_STEPS,
+    n_epochs=10,
+    batch_size=250,
+    clip_range=0.2,
+    normalize_advantage=True,
+    encoder_gradient="pathwise",
+    mi_estimator="logdet",
+    n_threads=1,
+    total_epochs=100,
+    baseline="value",
+    bptt_steps=5,
+    gamma=0.97,
+    gae_lambda=0.9,
+    max_grad_norm=0.5,
+)
+DEFAULTS = dict(vector=VECTOR, image=IMAGE, depth=DEPTH, long=LONG)
+
+
 class PolicyDefaults(NamedTuple):
     """Arguments of :class:`~sb3_tdpg.TRVPolicy` that depend on the kind of observation; for images the paper's."""
 
@@ -84,34 +122,70 @@ class PolicyDefaults(NamedTuple):
     action_log_var_init: float
     features_extractor_class: type[BaseFeaturesExtractor]
     features_extractor_kwargs: dict[str, Any]
+    is_long: bool = False
 
 
 # Images start with narrow TRVs: training with wide ones takes twice as long.
 POLICY_DEFAULTS = dict(
     vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
     image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, {}),
+    # As many TRVs more than features.
+    long=PolicyDefaults(16, (64, 64), (64, 64), nn.Tanh, nn.Tanh, -6.0, -1.5, FlattenExtractor, {}, is_long=True),
     depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
 )
 
 
-def defaults_for(observation_space: spaces.Space | None) -> Defaults:
-    """Return the defaults for the kind of an observation space (:func:`~sb3_tdpg.features.observation_kind`)."""
-    return dict(vector=VECTOR, image=IMAGE, depth=DEPTH)[observation_kind(observation_space)]
+def preset_of(observation_space: spaces.Space | None, horizon: int | None) -> str:
+    """
+    Name the defaults for a problem: ``"vector"``, ``"image"``, ``"depth"`` or ``"long"``.
+
+    :param observation_space: The environment's.
+    :param horizon: Its time limit T, if it is known.
+    """
+    kind = observation_kind(observation_space)
+    return "long" if kind == "vector" and horizon is not None and horizon >= LONG_HORIZON else kind
 
 
-def fill_in(given: Mapping[str, Any], observation_space: spaces.Space | None) -> dict[str, Any]:
+def fill_in(given: Mapping[str, Any], preset: str, cost_limit: float | None, n_envs: int) -> dict[str, Any]:
     """
     Replace ``None`` by the defaults.
 
     :param given: Arguments by name.
-    :param observation_space: The environment's.
+    :param preset: See :func:`preset_of`.
+    :param cost_limit: With a limit the default of beta is "auto".
+    :param n_envs: Number of environments, whose multiple the default of ``n_episodes`` is.
     """
-    defaults = defaults_for(observation_space)
+    defaults = DEFAULTS[preset]
     settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
-    if given["batch_size"] is None and defaults.batch_size is not None:
-        # The default must fit any number of episodes.
-        settings["batch_size"] = min(defaults.batch_size, settings["n_episodes"])
-    return settings
+    if given["beta"] is None and cost_limit is not None:
+        settings["beta"] = "auto"
+    for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
+        if given[one] is not None and given[other] is None:
+            settings[other] = None
+    if given["n_episodes"] is None and settings["n_episodes"] is not None:
+        settings["n_episodes"] = math.ceil(settings["n_episodes"] / n_envs) * n_envs
+    return {**settings, "cost_limit": cost_limit}
+
+
+# What users of PPO and RecurrentPPO look for, and what it is here.
+OF_PPO = dict(
+    n_steps="epoch_steps, which counts the steps of all environments together",
+    ent_coef="the noise at the start, policy_kwargs=dict(action_log_var_init=...); there is no entropy bonus",
+    vf_coef="nothing: the value network has an optimiser of its own",
+    clip_range_vf="nothing: the value network is not clipped",
+    use_sde="the noise of the TRVs, policy_kwargs=dict(encoder_log_var_init=...), which lasts from step to step",
+    sde_sample_freq="nothing: the noise is drawn at each step",
+    target_kl="clip_range; train/approx_kl logs the divergence",
+    rollout_buffer_class="nothing: rollouts are whole episodes",
+    rollout_buffer_kwargs="nothing: rollouts are whole episodes",
+)
+
+
+def refuse_others(others: Mapping[str, Any]) -> None:
+    """Raise a ``TypeError`` for arguments that TDPG does not have; it names the equivalent of PPO's."""
+    for name in others:
+        hint = f": use {OF_PPO[name]} (see 'Coming from PPO' in the docs)" if name in OF_PPO else ""
+        raise TypeError(f"TDPG has no argument {name!r}{hint}")
 
 
 def check_arguments(settings: Mapping[str, Any]) -> None:
@@ -126,20 +200,19 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
         check_learning_rate(rate)
     get_estimator_class(settings["mi_estimator"])
     get_baseline(settings["baseline"])
-    n_episodes, batch_size = settings["n_episodes"], settings["batch_size"]
-    for name in ("n_episodes", "n_epochs"):
-        check_count(name, settings[name])
-    for name in ("batch_size", "bptt_steps", "n_threads"):
+    n_episodes, epoch_steps = settings["n_episodes"], settings["epoch_steps"]
+    check_count("n_epochs", settings["n_epochs"])
+    for name in ("n_episodes", "epoch_steps", "batch_size", "bptt_steps", "n_threads"):
         if settings[name] is not None:
             check_count(name, settings[name])
-    if n_episodes < 2:
+    if (n_episodes is None) == (epoch_steps is None):
+        raise ValueError(
+            f"n_episodes={n_episodes} and epoch_steps={epoch_steps}: give one of them, the length of an epoch in "
+            "episodes or in steps"
+        )
+    if n_episodes is not None and n_episodes < 2:
         raise ValueError(
             f"n_episodes={n_episodes} must be at least 2: the baseline and the information are estimated from a batch"
-        )
-    if batch_size is not None and not 2 <= batch_size <= n_episodes:
-        raise ValueError(
-            f"batch_size={batch_size} must be between 2 and n_episodes={n_episodes}: it counts episodes, "
-            "because the memory of an episode cannot be cut"
         )
     clip_ranges = _values(settings["clip_range"])
     # A schedule may fall to 0; rl-zoo3 loads models for evaluation with one that is always 0.
@@ -151,12 +224,6 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
                 f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
                 "returns one; float('inf') turns the clipping off"
             )
-    n_updates = settings["n_epochs"] * (1 if batch_size is None else math.ceil(n_episodes / batch_size))
-    if n_updates > 1 and math.isinf(clip_ranges[0]):
-        raise ValueError(
-            f"n_epochs={settings['n_epochs']} and batch_size={batch_size} make {n_updates} updates on the same "
-            "rollouts, which needs clipping: give clip_range=0.2, as in PPO, or make one update"
-        )
     encoder_gradient = settings["encoder_gradient"]
     if encoder_gradient not in ENCODER_GRADIENTS:
         raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
@@ -166,6 +233,44 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
         raise ValueError(f"gae_lambda={settings['gae_lambda']} must be in [0, 1]; 1 leaves the gradient unbiased")
     if not settings["max_grad_norm"] > 0:
         raise ValueError(f"max_grad_norm={settings['max_grad_norm']} must be positive, or None for no clipping")
+
+
+def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) -> None:
+    """
+    Check the size of a minibatch, and that several updates on the same rollouts are clipped.
+
+    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name.
+    :param epoch_size: Size of an epoch.
+    :param unit: What both sizes count, "episodes" or "steps".
+    """
+    batch_size, n_epochs, clip_range = settings["batch_size"], settings["n_epochs"], settings["clip_range"]
+    least = 2 if unit == "episodes" else MIN_BATCH_STEPS
+    if batch_size is not None and not min(least, epoch_size) <= batch_size <= epoch_size:
+        raise ValueError(
+            f"batch_size={batch_size} must be between {least} and {epoch_size}, the {unit} of an epoch: it counts "
+            f"{unit}, because "
+            + (
+                "each time step has weights of its own (policy_kwargs: time_varying)"
+                if unit == "episodes"
+                else "all time steps share their weights"
+            )
+        )
+    n_updates = n_epochs * (1 if batch_size is None else math.ceil(epoch_size / batch_size))
+    if n_updates > 1 and math.isinf(_values(clip_range)[0]):
+        raise ValueError(
+            f"n_epochs={n_epochs} and batch_size={batch_size} make {n_updates} updates on the same rollouts, which "
+            "needs clipping: give clip_range=0.2, as in PPO, or make one update"
+        )
+
+
+def warn_if_short(total_timesteps: int, epoch_size: int) -> None:
+    """Warn about a training that is shorter than one policy epoch, and say which number to change."""
+    if total_timesteps < epoch_size:
+        warnings.warn(
+            f"learn({total_timesteps}) makes a single update, since a policy epoch has {epoch_size} steps: give "
+            f"total_timesteps={50 * epoch_size} or more, or a smaller n_episodes or epoch_steps",
+            stacklevel=3,
+        )
 
 
 def rate_schedule(rate: Any) -> Schedule | Any:
@@ -261,3 +366,13 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
         return make(**kwargs)
     except TypeError as e:
         raise ValueError(f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}: {e}") from e
+
+
+def check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:
+    """Fill in the missing layers, or raise a ``ValueError`` for other keys than the default's."""
+    given = {} if given is None else given
+    if not isinstance(given, dict) or not set(given) <= set(default):
+        raise ValueError(
+            f"policy_kwargs: net_arch={given!r} must be a dict with the keys {sorted(default)}, for instance {default}"
+        )
+    return {key: list(given.get(key, sizes)) for key, sizes in default.items()}

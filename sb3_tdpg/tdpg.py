@@ -6,12 +6,9 @@ Dimension key: T horizon, N episodes of an epoch, X state, Z task-relevant varia
 
 from __future__ import annotations
 
-import io
 import math
-import pickle
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch as th
@@ -21,23 +18,28 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_tdpg import losses
-from sb3_tdpg.advantages import get_baseline
+from sb3_tdpg.advantages import ValueFunction, generalised_advantages, get_baseline
 from sb3_tdpg.auto_weight import AutoWeight
-from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
+from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer, RebuiltTRVs
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
-from sb3_tdpg.policies import RebuiltTRVs, TRVPolicy
-from sb3_tdpg.problem import reward_threshold
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.problem import horizon_of, reward_threshold
 from sb3_tdpg.settings import (
+    DEFAULTS,
+    Defaults,
     check_action_space,
     check_arguments,
+    check_batch_size,
     check_beta,
     check_count,
-    defaults_for,
     fill_in,
+    preset_of,
     rate_schedule,
+    refuse_others,
+    warn_if_short,
     with_keywords,
 )  # fmt: skip
 from sb3_tdpg.vec_env import make_episodes_env
@@ -64,38 +66,42 @@ class TDPG(EpisodicAlgorithm):
     the true state as ``info["state"]`` in ``reset`` and ``step`` and describes it by an attribute ``state_space``.
     Without these, a vector observation stands in for the state.
 
-    Where two defaults are given, the first is for vector observations and the second for images. Depth images (floats)
-    differ in a few more; :mod:`sb3_tdpg.settings` has all defaults.
+    Three defaults are for vectors, images, and vectors over a horizon of 50 or more. Depth images (floats) differ in a
+    few more; :mod:`sb3_tdpg.settings` has all defaults.
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``.
     :param beta: Weight of the cost against the information: a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
-        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: 1/75; ``"auto"`` for images or with a ``cost_limit``.
+        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, "auto", inf.
     :param cost_limit: Limit for ``beta="auto"``; default: minus the environment's registered ``reward_threshold``.
     :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
-        linearly; default: ``"lin_2e-3_2e-5"``; ``"lin_1e-3_5e-5"``. The critics have their own (``mi_kwargs``).
-    :param n_episodes: Episodes N of a policy epoch; default: 500; 160.
+        linearly; default: ``"lin_2e-3_2e-5"``, ``"lin_1e-3_5e-5"``, ``"lin_1e-3_1e-4"``.
+    :param n_episodes: Episodes N of a policy epoch; default: 500, 160, none.
+    :param epoch_steps: Steps of a policy epoch instead: no episode begins after that many; default: none, none, 2000.
     :param n_envs: Number of environments to make from an id; default: see :func:`~sb3_tdpg.make_episodes_env`.
     :param mi_estimator: A name in :data:`sb3_tdpg.information.ESTIMATORS` or a subclass of
-        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"``; ``"logdet"``.
+        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"``, ``"logdet"``, ``"logdet"``.
     :param mi_kwargs: Keywords of the estimator.
-    :param baseline: Variance reduction of the gradient. ``"value"``: subtract a regression of the cost-to-go on the
-        true state at each step; ``"mean"``: subtract the batch mean of the episode cost, as in the paper.
+    :param baseline: Variance reduction of the gradient. ``"regression"``: subtract a regression of the cost-to-go on
+        the true state at each step; ``"value"``: a network of the true state and the time left
+        (:class:`~sb3_tdpg.advantages.ValueFunction`); ``"mean"``: the batch mean of the episode cost, as in the paper.
+        Default: regression, regression, value.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper;
         ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both are unbiased; the second
-        has less variance. Default: ``"score"``; ``"pathwise"``.
-    :param bptt_steps: Truncate back-propagation through time to this many steps, for long horizons; ``None``: no
-        truncation. The time steps must share their weights (``time_varying=False``).
-    :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO; default: 1; 4.
-    :param batch_size: Minibatch size in *episodes*; default: all; 80.
-    :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping. Default: ``inf``; 0.2.
+        has less variance. Default: score, pathwise, pathwise.
+    :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons; the time
+        steps must share their weights (``time_varying=False``). Default: none (whole episodes), none, 5.
+    :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO; default: 1, 4, 10.
+    :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own; default:
+        all, 80 episodes, 250 steps.
+    :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping. Default: inf, 0.2, 0.2.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
-        deviation, so that ``beta`` keeps its meaning. Default: no; yes.
-    :param gamma: Discount factor; the paper has none.
-    :param gae_lambda: Bias-variance trade-off of the advantages with ``baseline="value"``: 1 uses the observed costs, 0
-        the predicted value of the next state.
-    :param max_grad_norm: Maximum norm of the policy's gradient; ``None``: no clipping.
+        deviation, so that ``beta`` keeps its meaning. Default: no, yes, yes.
+    :param gamma: Discount factor; the paper has none. Default: 1, 1, 0.97.
+    :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
+        the next state; unused with ``baseline="mean"``. Default: 0.95, 0.95, 0.9.
+    :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping; default: inf, inf, 0.5.
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.
@@ -120,18 +126,19 @@ class TDPG(EpisodicAlgorithm):
         cost_limit: float | None = None,
         learning_rate: float | Schedule | str | None = None,
         n_episodes: int | None = None,
+        epoch_steps: int | None = None,
         n_envs: int | None = None,
         mi_estimator: str | type[InformationEstimator] | None = None,
         mi_kwargs: dict[str, Any] | None = None,
-        baseline: str = "value",
+        baseline: str | None = None,
         encoder_gradient: str | None = None,
         bptt_steps: int | None = None,
         n_epochs: int | None = None,
         batch_size: int | None = None,
         clip_range: float | Schedule | None = None,
         normalize_advantage: bool | None = None,
-        gamma: float = 1.0,
-        gae_lambda: float = 0.95,
+        gamma: float | None = None,
+        gae_lambda: float | None = None,
         max_grad_norm: float | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -141,12 +148,15 @@ class TDPG(EpisodicAlgorithm):
         device: th.device | str = "auto",
         n_threads: int | None = None,
         _init_setup_model: bool = True,
+        **others: Any,
     ) -> None:
-        for name, count in (("n_episodes", n_episodes), ("n_envs", n_envs)):
+        given = {name: value for name, value in locals().items() if name in Defaults._fields}
+        refuse_others(others)
+        for name, count in (("n_episodes", n_episodes), ("epoch_steps", epoch_steps), ("n_envs", n_envs)):
             if count is not None:
                 check_count(name, count)
         if isinstance(env, str):
-            env = make_episodes_env(env, n_envs, n_episodes=n_episodes)
+            env = make_episodes_env(env, n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps)
         elif n_envs is not None and getattr(env, "num_envs", 1) != n_envs:
             raise ValueError(
                 f"n_envs={n_envs} applies to an environment given by its id, but the environment given has "
@@ -154,27 +164,13 @@ class TDPG(EpisodicAlgorithm):
             )
         if env is not None:
             check_action_space(env.action_space)
-        given = dict(
-            beta="auto" if beta is None and cost_limit is not None else beta,
-            learning_rate=learning_rate,
-            n_episodes=n_episodes,
-            mi_estimator=mi_estimator,
-            encoder_gradient=encoder_gradient,
-            n_epochs=n_epochs,
-            batch_size=batch_size,
-            clip_range=clip_range,
-            normalize_advantage=normalize_advantage,
-            n_threads=n_threads,
-        )
-        settings = fill_in(given, None if env is None else env.observation_space)
-        settings.update(
-            cost_limit=cost_limit,
-            baseline=baseline,
-            bptt_steps=bptt_steps,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            max_grad_norm=math.inf if max_grad_norm is None else max_grad_norm,
-        )
+        # A model that is being loaded has its preset from the file; those of early versions have none.
+        is_new = env is not None and _init_setup_model
+        self.preset = preset_of(env.observation_space, horizon_of(env)) if env is not None and is_new else None
+        settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1))
+        self._has_default_batch_size = batch_size is None
+        # The defaults of the paper's problems, and models of early versions, count episodes always.
+        self._counts_episodes = not is_new or (batch_size is None and self.preset != "long")
         check_policy(policy, self.policy_aliases)
         check_arguments(settings)
         super().__init__(
@@ -182,8 +178,8 @@ class TDPG(EpisodicAlgorithm):
             env=env,
             learning_rate=settings["learning_rate"],
             n_steps=0,  # set once the horizon is known
-            gamma=gamma,
-            gae_lambda=gae_lambda,
+            gamma=settings["gamma"],
+            gae_lambda=settings["gae_lambda"],
             # Unused: these belong to algorithms with a value network.
             ent_coef=0.0,
             vf_coef=0.0,
@@ -200,17 +196,19 @@ class TDPG(EpisodicAlgorithm):
         )
         self.beta: float | Schedule | str = settings["beta"]
         self.cost_limit = cost_limit
-        self.n_episodes: int = settings["n_episodes"]
+        self.n_episodes: int | None = settings["n_episodes"]
+        self.epoch_steps: int | None = settings["epoch_steps"]
         self.mi_estimator: str | type[InformationEstimator] = settings["mi_estimator"]
         self.mi_kwargs = {} if mi_kwargs is None else mi_kwargs
-        self.baseline = baseline
+        self.baseline: str = settings["baseline"]
         self.encoder_gradient: str = settings["encoder_gradient"]
-        self.bptt_steps = bptt_steps
+        self.bptt_steps: int | None = settings["bptt_steps"]
         self.n_epochs: int = settings["n_epochs"]
         self.batch_size: int | None = settings["batch_size"]
         self.clip_range: Any = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.n_threads: int | None = settings["n_threads"]
+        self._limit_origin = ""
         self.auto_weight: AutoWeight | None = None
         """The weight of the information with ``beta="auto"``."""
         if _init_setup_model:
@@ -220,6 +218,8 @@ class TDPG(EpisodicAlgorithm):
 
     def _setup_model(self) -> None:
         # load() sets attributes without the constructor: check them again.
+        if self.preset is None and self.baseline == "value":  # a model of an early version
+            self.baseline = "regression"
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         check_policy(self.policy_class, self.policy_aliases)
         check_arguments(vars(self))
@@ -231,33 +231,44 @@ class TDPG(EpisodicAlgorithm):
             raise ValueError("TDPG needs an environment to learn the horizon and the spaces from: pass env=...")
         self._setup_beta()
         self.clip_range = FloatSchedule(self.clip_range)  # as in PPO
-        policy = with_keywords(
-            "policy_kwargs",
-            self.policy_kwargs,
-            partial(
-                self.policy_class, self.observation_space, self.action_space, self.lr_schedule, horizon=self.horizon
-            ),
-        )
+        make_policy = partial(
+            self.policy_class, self.observation_space, self.action_space, self.lr_schedule,
+            horizon=self.horizon, preset=self.preset,
+        )  # fmt: skip
+        policy = with_keywords("policy_kwargs", self.policy_kwargs, make_policy)
         self.policy = cast(TRVPolicy, policy).to(self.device)
         if self.bptt_steps is not None and self.bptt_steps < self.horizon and self.policy.time_varying:
             raise ValueError(
                 f"bptt_steps={self.bptt_steps} cuts the horizon of {self.horizon} steps into parts, and all steps "
                 "must share their weights: give policy_kwargs=dict(time_varying=False), or leave bptt_steps out"
             )
+        if self.policy.time_varying:
+            unit, size = "episodes", self.epoch_size // self.horizon
+        else:
+            unit, size = "steps", self.epoch_size
+            if self._counts_episodes and self.batch_size is not None:
+                self.batch_size *= self.horizon
+        self._counts_episodes = False
+        if self._has_default_batch_size and self.batch_size is not None:
+            self.batch_size = min(self.batch_size, size)  # a default must fit any number of episodes
+        check_batch_size(vars(self), size, unit)
+        if self.baseline == "value":
+            self.value_function = ValueFunction(self.state_dim, self.horizon).to(self.device)
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
-        estimator = partial(estimator_class, self.horizon, self.state_dim, self.policy.trv_dim)
+        n_critics = 1 if self.pools_information else self.horizon
+        estimator = partial(estimator_class, n_critics, self.state_dim, self.policy.trv_dim)
         self.estimator = with_keywords("mi_kwargs", self.mi_kwargs, estimator).to(self.device)
+        n_columns = self.n_episodes or math.ceil(self.epoch_size / self.horizon)
         self.rollout_buffer = EpisodeBuffer(
-            self.horizon,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            gamma=self.gamma,
-            n_envs=self.n_episodes,
-            state_dim=self.state_dim,
-            trv_dim=self.policy.trv_dim,
-        )
+            self.horizon, self.observation_space, self.action_space, device=self.device, gamma=self.gamma,
+            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim,
+        )  # fmt: skip
+
+    @property
+    def pools_information(self) -> bool:
+        """Whether one estimate is made of the living steps of all times, which then share their weights."""
+        return not self.policy.time_varying and self.preset is not None
 
     def _setup_beta(self) -> None:
         """Make the schedule of beta, or the weight that is adapted to the cost limit."""
@@ -266,14 +277,10 @@ class TDPG(EpisodicAlgorithm):
             self.beta_schedule = FloatSchedule(cast("float | Schedule", self.beta))
             return
         if self.cost_limit is None:
-            threshold = None if self.env is None else reward_threshold(self.env)
-            if threshold is None:
-                raise ValueError(
-                    "beta='auto' minimises the information under a limit on the expected cost, but the environment is "
-                    "registered without a reward_threshold: give cost_limit=..., or beta=1/75, or beta=float('inf') "
-                    "for plain policy gradient"
-                )
-            self.cost_limit = -threshold
+            self.cost_limit = -reward_threshold(self.env)
+            self._limit_origin = " (minus the reward_threshold of the environment)"
+            if self.verbose >= 1:
+                print(f"Minimising the information under cost_limit={self.cost_limit:g}{self._limit_origin}")
         if self.auto_weight is None or self.auto_weight.cost_limit != self.cost_limit:
             self.auto_weight = AutoWeight(self.cost_limit)
 
@@ -300,7 +307,8 @@ class TDPG(EpisodicAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        batch = self.rollout_buffer.episode_batch()
+        shares_weights = not self.policy.time_varying
+        batch = self.rollout_buffer.episode_batch(whole_horizon=not shares_weights)
         mean_cost = batch.costs.sum(0).mean().item()
         information = 0.0 if self.information is None else float(self.information.sum())
         self._check_finite("costs", batch.costs)
@@ -310,37 +318,40 @@ class TDPG(EpisodicAlgorithm):
         mi_coef = self.mi_coef
         clip_range = self.clip_range(self._current_progress_remaining)
 
-        advantages = get_baseline(self.baseline)(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
+        advantages = self._advantages(batch)
         cost_scale = th.ones(())  # what the advantages, and with them the penalty, are divided by
         if self.normalize_advantage:
             negligible = 1e-5 * batch.costs.abs().max()
             advantages, cost_scale = losses.normalized(advantages, batch.alive, negligible)
+        batch = whole = batch._replace(advantages=advantages)
+        if shares_weights:
+            batch = batch.segments(self.bptt_steps or len(batch.costs))
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
                 old_log_prob = th.empty_like(batch.costs)
-                for episodes in self._minibatches():
-                    old_log_prob[:, episodes], _ = self._evaluate(batch.select(episodes))
+                for columns in self._minibatches(batch):
+                    old_log_prob[:, columns], _ = self._evaluate(batch.select(columns))
 
         for _ in range(self.n_epochs):
-            for episodes in self._minibatches():
-                part = batch.select(episodes)
+            for columns in self._minibatches(batch):
+                part = batch.select(columns)
                 log_prob, rebuilt = self._evaluate(part, rebuild=mi_coef > 0.0)
                 if old_log_prob is None:
-                    policy_loss = losses.policy_gradient_loss(log_prob, advantages[:, episodes], part.alive)
+                    policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
                 else:
-                    old = old_log_prob[:, episodes]
-                    policy_loss = losses.clipped_policy_loss(
-                        log_prob, old, advantages[:, episodes], part.alive, clip_range
-                    )
+                    old = old_log_prob[:, columns]
+                    policy_loss = losses.clipped_policy_loss(log_prob, old, part.advantages, part.alive, clip_range)
                     kl, clip_fraction = losses.policy_distance(log_prob.detach(), old, part.alive, clip_range)
                     self.logger.record_mean("train/approx_kl", kl.item())
                     self.logger.record_mean("train/clip_fraction", clip_fraction.item())
+                if shares_weights:  # the loss of a step: segments are of no fixed number
+                    policy_loss = policy_loss * len(part.costs[0]) / part.alive.sum()
                 loss = policy_loss
                 if rebuilt is not None and mi_coef > 0.0:
                     # Equation 15: the critics are frozen, and the gradient flows through the rebuilt TRVs.
-                    estimate = self.estimator(part.information_batch()._replace(**rebuilt._asdict()))
-                    mi_loss = mi_coef * losses.information_loss(estimate)
+                    samples = part._replace(**rebuilt._asdict()).information_batch(self.pools_information)
+                    mi_loss = mi_coef * losses.information_loss(self.estimator(samples))
                     loss = loss + mi_loss / cost_scale
                     self.logger.record_mean("train/mi_loss", mi_loss.item())
                 self._check_finite("policy loss", policy_loss)
@@ -354,23 +365,43 @@ class TDPG(EpisodicAlgorithm):
                 self.logger.record_mean("train/policy_loss", policy_loss.item())
                 self.logger.record_mean("train/loss", loss.item())
                 self.logger.record_mean("train/grad_norm", grad_norm.item())
+        # Last: the rollouts and all of their gradients saw the same inputs.
+        if self.policy.norm is not None:
+            self.policy.norm.update(whole.observations, whole.alive)
 
         self.epoch += 1
         self._n_updates += self.n_epochs
         self.logger.record("train/objective", mean_cost + mi_coef * information)
         self.logger.record("train/mi_coef", mi_coef)
-        self.logger.record("train/trv_std", batch.stds.mean().item())
+        if self.auto_weight is not None:
+            self.logger.record("train/cost_limit", self.auto_weight.cost_limit)
+        self.logger.record("train/trv_std", whole.stds.mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _evaluate(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
-        return self.policy.evaluate_episodes(batch, self.encoder_gradient, self.bptt_steps, rebuild)
+    def _advantages(self, batch: EpisodeBatch) -> th.Tensor:
+        """Compute the advantages, ``(T, N)``; a value network is fitted to the rollouts afterwards."""
+        baseline = get_baseline(self.baseline)
+        if baseline is not None:
+            return baseline(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
+        assert self.value_function is not None
+        with th.no_grad():
+            values = batch.alive * self.value_function(batch.states, self.gamma)
+        advantages = generalised_advantages(batch.costs, values, self.gamma, self.gae_lambda)
+        explained = self.value_function.fit(batch.states, advantages + values, batch.alive, self.gamma)
+        self.logger.record("train/explained_variance", explained)
+        return advantages
 
-    def _minibatches(self) -> Sequence[th.Tensor | slice]:
+    def _evaluate(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
+        return self.policy.evaluate_episodes(batch, self.encoder_gradient, rebuild)
+
+    def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
         """Return the columns of each minibatch: a random partition into nearly equal parts, or all in one."""
-        n_parts = 1 if self.batch_size is None else math.ceil(self.n_episodes / self.batch_size)
+        n_columns = batch.costs.shape[1]
+        size = n_columns if self.policy.time_varying else batch.alive.sum().item()
+        n_parts = 1 if self.batch_size is None else math.ceil(size / self.batch_size)
         if n_parts == 1:
             return [slice(None)]
-        return th.randperm(self.n_episodes, device=self.device).tensor_split(n_parts)
+        return th.randperm(n_columns, device=self.device).tensor_split(n_parts)
 
     # -- learn and load ---------------------------------------------------------------------------------------
 
@@ -393,7 +424,10 @@ class TDPG(EpisodicAlgorithm):
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:
-            total_timesteps = defaults_for(self.observation_space).total_epochs * self.n_episodes * self.horizon
+            total_timesteps = (
+                DEFAULTS[self.preset or preset_of(self.observation_space, None)].total_epochs * self.epoch_size
+            )
+        warn_if_short(total_timesteps, self.epoch_size)
         try:
             with threads(self.n_threads):
                 return super().learn(
@@ -401,6 +435,8 @@ class TDPG(EpisodicAlgorithm):
                 )
         finally:
             TDPGProgressBar.close()
+            if self.auto_weight is not None and self.epoch > 0:
+                self.auto_weight.warn_if_never_met(self._limit_origin)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]
@@ -410,36 +446,3 @@ class TDPG(EpisodicAlgorithm):
         if progress_bar:
             callbacks.append(TDPGProgressBar())
         return super()._init_callback(callbacks)
-
-    @classmethod
-    def load(
-        cls: type[SelfTDPG],
-        path: str | Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfTDPG:
-        """
-        Load a saved model; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.load`.
-
-        :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to continue from a policy-gradient model.
-        :raises ValueError: if the file is damaged or TDPG did not save it.
-        """
-        # As in the constructor: a limit alone implies beta="auto", and a number for beta needs no limit.
-        if kwargs.get("cost_limit") is not None:
-            kwargs.setdefault("beta", "auto")
-        elif kwargs.get("beta", "auto") != "auto":
-            kwargs.setdefault("cost_limit", None)
-        try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except (AssertionError, pickle.UnpicklingError) as e:
-            # "No data found in the saved file", "No params found ..."
-            if isinstance(e, AssertionError) and not str(e).startswith("No "):
-                raise
-            raise ValueError(
-                f"{path} is not a model of TDPG: the file is damaged, or another program made it "
-                f"({' '.join(str(e).split())[:200]})"
-            ) from e

@@ -23,7 +23,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_tdpg.common.processes import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
-from sb3_tdpg.settings import defaults_for
+from sb3_tdpg.problem import horizon_of
+from sb3_tdpg.settings import DEFAULTS, preset_of
 
 
 class BatchedVecEnv(VecEnv):
@@ -151,9 +152,22 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
     return cast(type[POMDPEnv], creator) if is_batched else None
 
 
-def default_n_envs(n_episodes: int) -> int:
-    """Return the number of environments for unbatched episodes: the largest divisor up to 50."""
-    return max(n for n in range(1, min(n_episodes, 50) + 1) if n_episodes % n == 0)
+def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | None, *, batched: bool) -> int:
+    """Return the number of environments, given the length of an epoch or else TDPG's default for the environment."""
+    horizon = horizon_of(env)
+    if not n_episodes and not epoch_steps:
+        defaults = DEFAULTS[preset_of(env.observation_space, horizon)]
+        n_episodes, epoch_steps = defaults.n_episodes, defaults.epoch_steps
+    if n_episodes is None:  # an epoch of full episodes has no more steps than asked for
+        assert epoch_steps is not None
+        return max(1, min(epoch_steps // (horizon or 1), epoch_steps if batched else 10))
+    # Each environment runs the same number of episodes.
+    return n_episodes if batched else largest_divisor(n_episodes)
+
+
+def largest_divisor(n_episodes: int, limit: int = 50) -> int:
+    """Return the largest divisor up to a limit: so many environments run the same number of episodes each."""
+    return max(n for n in range(1, min(n_episodes, limit) + 1) if n_episodes % n == 0)
 
 
 def make_episodes_env(
@@ -161,6 +175,7 @@ def make_episodes_env(
     n_envs: int | None = None,
     *,
     n_episodes: int | None = None,
+    epoch_steps: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     seed: int | None = None,
     use_processes: bool = True,
@@ -170,8 +185,9 @@ def make_episodes_env(
 
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, else its largest
-        divisor up to 50.
+        divisor up to 50; with ``epoch_steps`` as many as run a whole episode each in one epoch.
     :param n_episodes: Episodes per epoch; default: TDPG's default.
+    :param epoch_steps: Steps per epoch, instead; then at most 10 environments by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
     :param use_processes: Whether PandaGrasp uses one process per core, with the same numbers as without.
@@ -185,15 +201,13 @@ def make_episodes_env(
             env_kwargs.setdefault("n_processes", usable_cores())
         env = env_class(**{**spec.kwargs, **env_kwargs})
         env.spec = spec
-        n_envs = n_envs or n_episodes or defaults_for(env.observation_space).n_episodes
+        n_envs = n_envs or _default_n_envs(env, n_episodes, epoch_steps, batched=True)
         vec_env: VecEnv = BatchedVecEnv(env, n_envs)
         vec_env.seed(seed)
         return vec_env
     if n_envs is None:
-        if n_episodes is None:
-            with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
-                n_episodes = defaults_for(probe.observation_space).n_episodes
-        n_envs = default_n_envs(n_episodes)
+        with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
+            n_envs = _default_n_envs(probe, n_episodes, epoch_steps, batched=False)
     # make_vec_env requests rendering for an id, which warns where there is none, but not for a function.
     modes = getattr(_creator(spec), "metadata", {"render_modes": ["rgb_array"]}).get("render_modes", ())
     make = env_id if "rgb_array" in modes else functools.partial(gym.make, env_id)

@@ -83,8 +83,10 @@ class ToyEnv(gym.Env):
         self.n_resets = 0
         self.actions = []
 
-    def _observe(self):
-        space = self.observation_space
+    def _observe(self, space=None):
+        space = self.observation_space if space is None else space
+        if isinstance(space, spaces.Dict):
+            return {name: self._observe(part) for name, part in space.items()}
         if space.dtype == np.uint8:
             return np.full(space.shape, int(127 * (self.x + 1)), np.uint8)
         return np.full(space.shape, self.x, space.dtype)

@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_tdpg.advantages import BASELINES, episode_mean_advantages, get_baseline, value_advantages
+from sb3_tdpg.advantages import BASELINES, episode_mean_advantages, get_baseline, regression_advantages
 from sb3_tdpg.losses import cost_to_go
 
 T, N = 3, 400
@@ -26,31 +26,31 @@ def test_the_value_baseline_uses_the_cost_to_come_only(rollouts):
     costs, states, alive = rollouts
     expensive_start = costs.clone()
     expensive_start[0] += 1000 * th.rand(N)
-    first = value_advantages(costs, states, alive, 1.0)
-    second = value_advantages(expensive_start, states, alive, 1.0)
+    first = regression_advantages(costs, states, alive, 1.0)
+    second = regression_advantages(expensive_start, states, alive, 1.0)
     th.testing.assert_close(first[1:], second[1:])
     assert not th.allclose(first[0], second[0])
 
 
 def test_the_value_baseline_explains_what_the_state_tells_of_the_cost(rollouts):
     costs, states, alive = rollouts
-    last = value_advantages(costs, states, alive, 1.0)[-1]
+    last = regression_advantages(costs, states, alive, 1.0)[-1]
     assert last.var() < 0.35 * costs[-1].var()
     assert abs(last.mean()) < 0.3
 
 
 def test_the_value_baseline_lowers_the_variance_below_the_mean_baselines(rollouts):
-    value, mean = (BASELINES[name](*rollouts, 1.0) for name in ("value", "mean"))
+    value, mean = (BASELINES[name](*rollouts, 1.0) for name in ("regression", "mean"))
     assert value.var() < 0.8 * mean.var()
 
 
 def test_an_episodes_own_cost_never_enters_its_own_baseline(rollouts):
     costs, states, alive = rollouts
     targets = cost_to_go(costs)
-    baseline = targets - value_advantages(costs, states, alive, 1.0)
+    baseline = targets - regression_advantages(costs, states, alive, 1.0)
     changed = costs.clone()
     changed[:, 6] += 1e4
-    new_baseline = cost_to_go(changed) - value_advantages(changed, states, alive, 1.0)
+    new_baseline = cost_to_go(changed) - regression_advantages(changed, states, alive, 1.0)
     th.testing.assert_close(new_baseline[:, 6], baseline[:, 6], rtol=0, atol=0.02)
     assert (new_baseline[:, 7] - baseline[:, 7]).abs().max() > 1  # but it does enter those of the other half
 
@@ -67,26 +67,28 @@ def long_rollouts():
 def test_a_long_horizon_with_few_episodes_has_enough_for_one_regression_that_all_steps_share(long_rollouts):
     costs, states, alive = long_rollouts
     living = alive > 0
-    advantages = value_advantages(costs, states, alive, 0.5, 0.0)[living]
+    advantages = regression_advantages(costs, states, alive, 0.5, 0.0)[living]
     targets = cost_to_go(costs, 0.5)[living]
     assert advantages.var() < 0.3 * targets.var()
     # Step by step three episodes would have to tell what the other three cost.
-    per_step = [value_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(0, 198)]
+    per_step = [
+        regression_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(0, 198)
+    ]
     assert advantages.var() < 0.5 * th.stack(per_step)[living[:198]].var()
 
 
 def test_the_end_of_a_long_horizon_is_told_from_its_middle():
     costs, alive = th.ones(200, 6), th.ones(200, 6)
-    advantages = value_advantages(costs, th.randn(200, 6, 1), alive, 0.9)
+    advantages = regression_advantages(costs, th.randn(200, 6, 1), alive, 0.9)
     assert advantages.abs().max() < 1.0  # the cost to come falls from 10 to 1 over the last steps
 
 
 def test_also_over_a_long_horizon_an_episodes_own_cost_never_enters_its_own_baseline(long_rollouts):
     costs, states, alive = long_rollouts
-    baseline = cost_to_go(costs) - value_advantages(costs, states, alive)
+    baseline = cost_to_go(costs) - regression_advantages(costs, states, alive)
     changed = costs.clone()
     changed[:100, 2] += 50
-    new_baseline = cost_to_go(changed) - value_advantages(changed, states, alive)
+    new_baseline = cost_to_go(changed) - regression_advantages(changed, states, alive)
     th.testing.assert_close(new_baseline[:, 2], baseline[:, 2], rtol=0, atol=0.02)
     assert (new_baseline[:, 3] - baseline[:, 3]).abs().max() > 1
 
@@ -95,7 +97,7 @@ def test_a_smaller_lambda_keeps_the_noise_of_later_costs_out(rollouts):
     costs, states, alive = rollouts
     noisy_end = costs.clone()
     noisy_end[-1] += 100 * th.randn(N)
-    all_of_it, little = (value_advantages(noisy_end, states, alive, gae_lambda=x)[0].std() for x in (1.0, 0.0))
+    all_of_it, little = (regression_advantages(noisy_end, states, alive, gae_lambda=x)[0].std() for x in (1.0, 0.0))
     assert all_of_it > 90
     assert little < 60
 
@@ -105,12 +107,12 @@ def test_with_lambda_zero_the_advantage_is_the_residual_of_one_step():
     states = th.randn(2, N, 1)
     states[1] = states[0]
     costs = th.stack([th.zeros(N), 50 * states[1, :, 0]])
-    advantages = value_advantages(costs, states, th.ones(2, N), gae_lambda=0.0)
+    advantages = regression_advantages(costs, states, th.ones(2, N), gae_lambda=0.0)
     assert advantages.abs().median() < 1
     assert costs[1].abs().median() > 10
 
 
-@pytest.mark.parametrize("name", sorted(BASELINES))
+@pytest.mark.parametrize("name", ["mean", "regression"])
 def test_the_discount_weights_later_costs(name, rollouts):
     costs, states, alive = rollouts
     late = costs.clone()
@@ -129,14 +131,14 @@ def test_dead_episodes_do_not_enter_the_regression(rollouts):
     garbage = th.where(alive[..., None] > 0, states, 50 * th.randn_like(states))
     zeros = th.where(alive[..., None] > 0, states, th.zeros_like(states))
     living = alive > 0
-    first, second = (value_advantages(costs, x, alive, 1.0)[living] for x in (garbage, zeros))
+    first, second = (regression_advantages(costs, x, alive, 1.0)[living] for x in (garbage, zeros))
     assert th.isfinite(first).all()
     # Only the places of the bumps may depend on dead states: the quality of the fit must not.
     assert first.var().item() == pytest.approx(second.var().item(), rel=0.1)
 
 
 @pytest.mark.parametrize("n_episodes", [2, 3])
-@pytest.mark.parametrize("name", sorted(BASELINES))
+@pytest.mark.parametrize("name", ["mean", "regression"])
 def test_a_batch_of_few_episodes_with_a_constant_state_gives_finite_advantages(name, n_episodes):
     costs = th.rand(T, n_episodes)
     advantages = get_baseline(name)(costs, th.zeros(T, n_episodes, 2), th.ones(T, n_episodes), 1.0)
@@ -147,11 +149,11 @@ def test_a_batch_of_few_episodes_with_a_constant_state_gives_finite_advantages(n
 def test_a_step_at_which_nobody_lives_gives_finite_advantages(rollouts):
     costs, states, alive = rollouts
     alive[2] = 0.0
-    assert th.isfinite(value_advantages(costs * alive, states * alive[..., None], alive, 1.0)).all()
+    assert th.isfinite(regression_advantages(costs * alive, states * alive[..., None], alive, 1.0)).all()
 
 
 def test_an_unknown_baseline_is_refused_with_the_list():
-    with pytest.raises(ValueError, match=r"baseline='median' is unknown: use one of \['mean', 'value'\]"):
+    with pytest.raises(ValueError, match=r"baseline='median' is unknown: use one of \['mean', 'regression', 'value'\]"):
         get_baseline("median")
 
 
@@ -160,6 +162,6 @@ def test_the_value_of_a_state_far_from_all_others_is_not_extrapolated():
     states = th.linspace(-1, 1, n)[None, :, None].clone()
     costs = 10 * states[..., 0]
     states[0, 0] = 5.0  # predicted from the other fold, whose states are within [-1, 1]: a line through them gives 40
-    baseline = costs - value_advantages(costs, states, th.ones(1, n), 1.0, 1.0)
+    baseline = costs - regression_advantages(costs, states, th.ones(1, n), 1.0, 1.0)
     assert baseline[0, 0] == pytest.approx(10.0)
     assert baseline.abs().max() <= 10.0

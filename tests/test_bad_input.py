@@ -50,7 +50,7 @@ ARGUMENTS = {
         dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"
     ),
     "n_epochs zero": (dict(n_epochs=0), "n_epochs=0", "integer of at least 1"),
-    "batch_size above n_episodes": (dict(batch_size=21), "batch_size=21", "n_episodes=20", "episodes"),
+    "batch_size above n_episodes": (dict(batch_size=21), "batch_size=21", "between 2 and 20", "episodes"),
     "batch_size one": (dict(batch_size=1), "batch_size=1", "between 2 and"),
     "bptt_steps none": (dict(bptt_steps=0), "bptt_steps=0", "integer of at least 1"),
     "no threads": (dict(n_threads=0), "n_threads=0", "integer of at least 1"),
@@ -85,7 +85,7 @@ ARGUMENTS = {
     "n_episodes a float": (dict(n_episodes=20.0), "n_episodes=20.0", "integer"),
     "n_envs zero": (dict(n_envs=0), "n_envs=0", "integer of at least 1"),
     "n_envs for an environment": (dict(env=lava(20), n_envs=10), "n_envs=10", "leave n_envs out"),
-    "unknown baseline": (dict(baseline="median"), "baseline='median'", r"\['mean', 'value'\]"),
+    "unknown baseline": (dict(baseline="median"), "baseline='median'", r"\['mean', 'regression', 'value'\]"),
     "unknown encoder gradient": (
         dict(encoder_gradient="sore"), "encoder_gradient='sore'", r"\['score', 'pathwise'\]"
     ),
@@ -119,9 +119,10 @@ ARGUMENTS = {
     "action space that is not supported": (
         dict(env=toy_vec_env(action_space=spaces.Dict(a=spaces.Discrete(2)))), "action space", "Box", "Discrete"
     ),
-    "observations in a dict": (
-        dict(env=toy_vec_env(observation_space=spaces.Dict(a=spaces.Box(-1, 1, (2,))))), "FlattenObservation"
+    "observations in a tuple": (
+        dict(env=toy_vec_env(observation_space=spaces.Tuple([spaces.Box(-1, 1, (2,))]))), "FlattenObservation"
     ),
+    "both lengths": (dict(n_episodes=10, epoch_steps=100), "n_episodes=10 and epoch_steps=100", "give one of them"),
     "rewards normalised": (dict(env=VecNormalize(lava())), "norm_reward=False", "beta"),
     "unknown key of policy_kwargs": (dict(policy_kwargs=dict(trv_dims=2)), "policy_kwargs", "trv_dims"),
     "policy_kwargs of a wrong type": (dict(policy_kwargs="trv_dim=2"), "policy_kwargs", "dict"),
@@ -158,6 +159,23 @@ def test_a_foreign_policy_is_refused_with_the_mend(policy, fragments):
         TDPG(policy, "Lava-v0", n_episodes=20, device="cpu")
     for fragment in fragments:
         assert re.search(fragment, str(error.value)), error.value
+
+
+@pytest.mark.parametrize(("given", "equivalent"), [
+    (dict(n_steps=2048), "use epoch_steps"),
+    (dict(ent_coef=0.0), "action_log_var_init"),
+    (dict(use_sde=True), "encoder_log_var_init"),
+])  # fmt: skip
+def test_an_argument_of_ppo_is_refused_with_its_equivalent(given, equivalent):
+    (name,) = given
+    with pytest.raises(TypeError, match=f"no argument '{name}'.*{equivalent}"):
+        TDPG("TRVPolicy", **given)
+
+
+@pytest.mark.parametrize("name", ["MlpPolicy", "CnnPolicy", "MultiInputPolicy", "MlpLstmPolicy"])
+def test_a_policy_of_ppo_is_refused_with_ours(name):
+    with pytest.raises(ValueError, match=f"{name}.*TRVPolicy takes vectors, images and dicts"):
+        TDPG(name, "Lava-v0")
 
 
 def test_a_misspelt_argument_is_not_swallowed():

@@ -5,8 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
-from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.buffers import STORED, EpisodeBuffer
 
 T, N, X, Z, U = 3, 4, 5, 2, 1
 SHAPES = dict(observations=(2,), states=(X,), noise=(Z,), trvs=(Z,), means=(Z,), stds=(Z,), actions=(U,), costs=())
@@ -41,7 +40,7 @@ def test_the_batch_has_every_field_as_a_tensor_and_does_not_change_with_the_next
         buffer.add_step(np.full(N, t), np.arange(N), **rows(N, float(t)))
     buffer.full = True
     batch = buffer.episode_batch()
-    for name in EpisodeBatch._fields:
+    for name in STORED:
         np.testing.assert_array_equal(getattr(batch, name), getattr(buffer, name))
         assert isinstance(getattr(batch, name), th.Tensor)
     kept = batch.costs.clone()
@@ -70,7 +69,7 @@ def test_the_previous_trvs_are_those_of_the_step_before_and_zero_at_the_start(bu
         buffer.add_step(np.full(N, t), np.arange(N), **rows(N, t + 1.0))
     buffer.full = True
     batch = buffer.episode_batch()
-    assert TRVPolicy.prev_trvs(batch.trvs)[:, 0, 0].tolist() == [0, 1, 2]
+    assert batch.prev_trvs[:, 0, 0].tolist() == [0, 1, 2]
 
 
 def test_the_cost_of_an_episode_is_the_sum_of_its_steps(buffer):

@@ -57,7 +57,7 @@ def make_model(**kwargs):
         )
     buffer.full = True
     batch = type(buffer.episode_batch())(*(x.double() for x in buffer.episode_batch()))
-    buffer.episode_batch = lambda: batch
+    buffer.episode_batch = lambda **_: batch
     # Features are single precision by SB3's preprocessing: exact for these observations.
     model.policy.double()
     model.estimator.double()
@@ -235,7 +235,7 @@ def test_the_penalty_of_a_frozen_critic_is_followed_through_the_trvs():
 
 def without_costs(model, batch):
     batch = batch._replace(costs=th.zeros_like(batch.costs))
-    model.rollout_buffer.episode_batch = lambda: batch
+    model.rollout_buffer.episode_batch = lambda **_: batch
 
 
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])

@@ -94,5 +94,5 @@ def test_without_a_penalty_no_number_of_episodes_is_too_few(recwarn):
 
 def test_images_cannot_stand_in_for_the_state():
     space = spaces.Box(0, 255, (3, 16, 16), np.uint8)
-    with pytest.raises(ValueError, match=r"an image of shape \(3, 16, 16\) cannot stand in for it"):
+    with pytest.raises(ValueError, match=r"an image \(Box\(0, 255, \(3, 16, 16\), uint8\)\) cannot stand in for it"):
         TDPG("TRVPolicy", DummyVecEnv([lambda: ToyEnv(observation_space=space, gives_state=False)]), n_episodes=4)

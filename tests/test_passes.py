@@ -46,13 +46,13 @@ def test_an_epoch_makes_so_many_passes_over_minibatches_of_whole_episodes(encode
 def test_no_minibatch_is_left_with_a_single_episode():
     model = tiny_tdpg(n_episodes=17, batch_size=8, clip_range=0.2)
     train_epochs(model, 1)
-    assert sorted(len(part) for part in model._minibatches()) == [5, 6, 6]
+    assert sorted(len(part) for part in model._minibatches(model.rollout_buffer.episode_batch())) == [5, 6, 6]
 
 
 def test_every_episode_is_in_one_minibatch_of_a_pass():
     model = tiny_tdpg(**PASSES)
     train_epochs(model, 1)
-    columns = th.cat(list(model._minibatches()))
+    columns = th.cat(list(model._minibatches(model.rollout_buffer.episode_batch())))
     assert sorted(columns.tolist()) == list(range(20))
     assert columns.tolist() != list(range(20))
 
@@ -221,7 +221,7 @@ def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
     for n in (10, 40):
         model = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 10), n_episodes=n, device="cpu")
         train_epochs(model, 1)
-        assert model._minibatches() == [slice(None)]
+        assert model._minibatches(model.rollout_buffer.episode_batch()) == [slice(None)]
 
 
 def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():

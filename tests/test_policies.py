@@ -1,6 +1,7 @@
 """The policy step by step, as whole episodes, and with all sorts of spaces."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ from gymnasium import spaces
 from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs
 
 from sb3_tdpg import TDPG, TRVPolicy
+from sb3_tdpg.buffers import RebuiltTRVs
 from sb3_tdpg.features import observation_kind
-from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON, RebuiltTRVs
+from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
 
 T, N = 4, 6
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -65,7 +67,8 @@ def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
     assert (noise == 0).all() == deterministic
 
     features = policy.extract_features(th.as_tensor(observations).flatten(0, 1), policy.features_extractor)
-    rebuilt = policy.rebuild_trvs(features.unflatten(0, (T, N)), noise)
+    batch = SimpleNamespace(noise=noise, prev_trvs=th.zeros_like(noise))
+    rebuilt = policy.rebuild_trvs(features.unflatten(0, (T, N)), batch)
     np.testing.assert_allclose(rebuilt.trvs.detach(), trvs, rtol=1e-4, atol=1e-6)
     for name in ("means", "stds"):
         stepwise = th.stack([getattr(step, name) for step in steps])
@@ -76,21 +79,22 @@ def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 3])
-def test_parts_of_the_horizon_side_by_side_give_the_same_trvs_and_no_gradient_beyond_them(n_steps):
-    model = tiny_tdpg("Pendulum-v1", n_episodes=4, n_envs=2, bptt_steps=n_steps, beta=math.inf)
+def test_segments_side_by_side_give_the_trvs_of_whole_episodes(n_steps):
+    model = tiny_tdpg("Pendulum-v1", n_episodes=4, n_envs=2, beta=math.inf)
     train_epochs(model, 1)
     batch = model.rollout_buffer.episode_batch()
     batch = type(batch)(*(x[:5] for x in batch))
-    features = model.policy.episode_features(batch).detach().requires_grad_()
-    whole = model.policy.rebuild_trvs(features, batch.noise)
-    stored = batch._replace(trvs=whole.trvs.detach())
-    parts = model.policy.rebuild_trvs_in_parts(features, stored, n_steps)
+    whole = model.policy.rebuild_trvs(model.policy.episode_features(batch), batch)
+    trvs = whole.trvs.detach()
+    parts = batch._replace(trvs=trvs, prev_trvs=th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])).segments(n_steps)
+    features = model.policy.episode_features(parts).detach().requires_grad_()
+    rebuilt = model.policy.rebuild_trvs(features, parts)
     for name in RebuiltTRVs._fields:
-        th.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=1e-4, atol=1e-5)
-    (gradient,) = th.autograd.grad(parts.trvs[-1].sum(), features)
-    reached = gradient.abs().sum(dim=(1, 2)) > 0
-    start = 4 - 4 % n_steps  # of the last part
-    assert reached.tolist() == [t >= start for t in range(5)]
+        joined = getattr(rebuilt, name).unflatten(1, (-1, 4)).transpose(0, 1).flatten(0, 1)[:5]
+        th.testing.assert_close(joined, getattr(whole, name), rtol=1e-4, atol=1e-5)
+    # The gradient reaches the beginning of its segment.
+    (gradient,) = th.autograd.grad(rebuilt.trvs[-1].sum(), features)
+    assert (gradient.abs().sum(dim=(1, 2)) > 0).all()
 
 
 def test_the_log_probabilities_are_those_of_the_samples_that_were_drawn():
@@ -170,9 +174,19 @@ def test_an_episode_beyond_the_horizon_is_refused_with_the_mend():
     state = None
     for _ in range(T):
         _, state = policy.predict(np.zeros((N, 3), np.float32), state)
-    with pytest.raises(ValueError, match=rf"step {T + 1} of an episode.*horizon is {T}.*episode_start=True"):
+    with pytest.raises(
+        ValueError, match=rf"step {T + 1} of an episode.*{T} steps.*episode_start=True.*time_varying=Fa"
+    ):
         policy.predict(np.zeros((N, 3), np.float32), state)
     policy.predict(np.zeros((N, 3), np.float32), state, np.ones(N, bool))
+
+
+def test_a_policy_whose_steps_share_their_weights_goes_on_beyond_the_horizon():
+    policy = make_policy(time_varying=False)
+    state = None
+    for _ in range(3 * T):
+        _, state = policy.predict(np.zeros((N, 3), np.float32), state)
+    assert state[1].tolist() == [3 * T] * N
 
 
 def test_a_state_for_another_number_of_environments_is_refused():
@@ -303,9 +317,9 @@ def test_the_kind_of_an_observation_is_that_of_its_space(space, kind):
 def test_the_log_variance_of_the_trvs_may_be_squashed_as_in_the_paper():
     parameters = th.tensor([[0.0, 0.0, 50.0, -50.0]])
     policy = make_policy(trv_dim=2, squash_trv_log_var=True, encoder_var_floor=0.0)
-    _, std = policy._encoder_density(parameters)
+    _, std = policy._encoder_density(parameters, th.zeros(1, 3))
     assert std.tolist()[0] == pytest.approx([np.exp(0.5), np.exp(-0.5)], rel=0.03)
-    _, std = make_policy(trv_dim=2, encoder_var_floor=0.0)._encoder_density(parameters)
+    _, std = make_policy(trv_dim=2, encoder_var_floor=0.0)._encoder_density(parameters, th.zeros(1, 3))
     assert std[0, 1] < 1e-6
 
 

@@ -21,7 +21,7 @@ from gymnasium.utils import seeding
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.advantages import get_baseline
-from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
+from sb3_tdpg.buffers import STORED, EpisodeBatch, EpisodeBuffer
 from sb3_tdpg.networks import BatchedMLP
 from tests.reference_loop import Episode, LoopTDPG, Minibatch, Randomness, mean_baseline, unbatch
 
@@ -57,7 +57,7 @@ def float64(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     def reset_in_float64(buffer: EpisodeBuffer) -> None:
         reset(buffer)
-        for name in EpisodeBatch._fields:
+        for name in STORED:
             setattr(buffer, name, getattr(buffer, name).astype(np.float64))
 
     monkeypatch.setattr(EpisodeBuffer, "reset", reset_in_float64)
@@ -205,9 +205,9 @@ def test_batched_critics_equal_the_loop_after_the_fit() -> None:
     "case",
     [
         Case(beta=math.inf, baseline="mean"),
-        Case(beta=math.inf, baseline="value"),
+        Case(beta=math.inf, baseline="regression"),
         Case(baseline="mean"),
-        Case(baseline="value"),
+        Case(baseline="regression"),
         Case(gradient_steps=1),  # the critics know nothing, and some estimates are below zero
     ],
     ids=str,

@@ -125,11 +125,11 @@ def test_what_is_stored_is_what_the_environment_and_the_policy_produced():
     # The TRVs are those of the policy that acted.
     model.policy.load_state_dict(old_policy)
     batch = buffer.episode_batch()
-    rebuilt = model.policy.rebuild_trvs(model.policy.episode_features(batch), batch.noise)
+    rebuilt = model.policy.rebuild_trvs(model.policy.episode_features(batch), batch)
     np.testing.assert_allclose(rebuilt.trvs.detach(), buffer.trvs, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("baseline", ["value", "mean"])
+@pytest.mark.parametrize("baseline", ["value", "regression", "mean"])
 def test_every_environment_runs_its_quota_of_episodes_however_short_they_are(baseline):
     # Environment 0 has short episodes; were the first N to finish taken, it would fill the epoch.
     lengths = [[1, 1, 1], [4, 3, 4], [2, 4, 1]]
@@ -203,7 +203,7 @@ def test_more_episodes_than_environments_are_run_one_after_the_other():
     # The TRVs of every episode, and not only of an environment's first, start from zero.
     model.policy.load_state_dict(old_policy)
     batch = model.rollout_buffer.episode_batch()
-    rebuilt = model.policy.rebuild_trvs(model.policy.episode_features(batch), batch.noise)
+    rebuilt = model.policy.rebuild_trvs(model.policy.episode_features(batch), batch)
     np.testing.assert_allclose(rebuilt.trvs.detach(), model.rollout_buffer.trvs, rtol=1e-4, atol=1e-5)
     assert len(np.unique(model.rollout_buffer.states[0, :, 0])) == 20
     assert (model.rollout_buffer.states[0, :, 1] == 0).all()

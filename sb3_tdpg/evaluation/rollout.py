@@ -15,8 +15,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, is_vecenv_wrapped
 
+from sb3_tdpg.buffers import PolicyStep
 from sb3_tdpg.evaluation.randomness import EvaluationSeeds, isolated_randomness
-from sb3_tdpg.policies import PolicyStep
 from sb3_tdpg.problem import Problem
 
 

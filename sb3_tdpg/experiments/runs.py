@@ -87,7 +87,7 @@ class Run:
         seed = self.seed + SEEDS_BETWEEN_ATTEMPTS * attempt
         training = make_training(self.env_id, self.settings, seed=seed, device="cpu")
         model, n_timesteps, selection = training.model, training.n_timesteps, training.selection
-        n_epochs = n_timesteps // (model.n_episodes * model.horizon)
+        n_epochs = n_timesteps // model.epoch_size
         save_freq = max(1, min(MAX_CHECKPOINT_EPOCHS, n_epochs // 4))
         resumes = checkpoint.exists()
         if resumes:

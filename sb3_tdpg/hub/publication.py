@@ -168,8 +168,11 @@ def read_zoo_folder(
     records = evaluate_scenarios({"TDPG": model}, rows, n_eval_episodes, **options)
     progress = None
     if get_monitor_files(str(folder)):  # the mean cost of each epoch, from the log of episodes
-        costs = -load_results(str(folder))["r"].to_numpy()
-        means = costs[: len(costs) // model.n_episodes * model.n_episodes].reshape(-1, model.n_episodes).mean(axis=1)
+        log = load_results(str(folder))
+        counted, size = (
+            (log["l"], model.epoch_size) if model.n_episodes is None else (log["l"] * 0 + 1, model.n_episodes)
+        )
+        means = -log["r"].groupby((counted.cumsum() - 1) // size).mean()[: counted.sum() // size]
         progress = pd.DataFrame({"time/iterations": np.arange(1, len(means) + 1), "rollout/ep_cost_mean": means})
     # Our `train` saves the selected policy when it is finished, the zoo's the last one.
     is_ours = (folder / "run.json").exists()

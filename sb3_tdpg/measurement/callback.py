@@ -33,7 +33,8 @@ class InformationCallback(TDPGCallback):
         self.interval: InformationInterval | None = None  # the latest
 
     def _on_training_start(self) -> None:
-        n_episodes, trv_dim = self.tdpg.n_episodes, self.tdpg.policy.trv_dim
+        model, trv_dim = self.tdpg, self.tdpg.policy.trv_dim
+        n_episodes = model.epoch_size // (1 if model.pools_information else model.horizon)
         if n_episodes < min_episodes(trv_dim):  # it would log 0 and 0, the sums over no time step
             raise ValueError(
                 f"n_episodes={n_episodes} is too small for an interval of the information in {trv_dim} TRVs: use at "
@@ -44,7 +45,7 @@ class InformationCallback(TDPGCallback):
         model = self.tdpg
         if model.epoch % self.eval_freq != 0:
             return
-        batch = model.rollout_buffer.episode_batch().information_batch()
+        batch = model.rollout_buffer.episode_batch().information_batch(model.pools_information)
         self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
         for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
             self.logger.record(f"mi/{limit}", total)

@@ -25,7 +25,7 @@ from sb3_tdpg import hyperparams as yaml_files
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.common.provenance import write_run_config
 from sb3_tdpg.tdpg import TDPG
-from sb3_tdpg.vec_env import batched_class, default_n_envs, make_episodes_env
+from sb3_tdpg.vec_env import batched_class, largest_divisor, make_episodes_env
 
 CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
 # A checkpoint resets the environments: rare enough not to matter, frequent enough to lose little.
@@ -146,8 +146,9 @@ class TDPGExperimentManager(ExperimentManager):
         if self.algo == "tdpg" and "n_envs" not in hyperparams:
             # The keywords of the command line replace those of the block.
             env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs")
-            env = self._make_env(env_kwargs, n_episodes=hyperparams.get("n_episodes"), use_processes=False)
-            hyperparams["n_envs"] = env.num_envs if self.is_batch else default_n_envs(env.num_envs)
+            length = {name: hyperparams.get(name) for name in ("n_episodes", "epoch_steps")}
+            env = self._make_env(env_kwargs, **length, use_processes=False)
+            hyperparams["n_envs"] = env.num_envs if self.is_batch else largest_divisor(env.num_envs)
             env.close()
         processed, wrap, *others = super()._preprocess_hyperparams(hyperparams)
         self.env_wrapper = None if wrap is None else lambda env: _TaskHorizon(wrap(env), env)

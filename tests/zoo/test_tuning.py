@@ -221,7 +221,7 @@ def test_two_workers_share_a_study(here):  # noqa: F811
 def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):  # noqa: F811
     """As the zoo's own tests try them."""
     arguments = ["--env", "CartPole-v1", "-n", "100", "-params", 'policy_kwargs:"dict(trv_dim=3)"', "n_envs:1"]
-    arguments += ["n_episodes:2", "batch_size:2", "--seed", "14", "--log-folder", "elsewhere", "--n-trials", "2"]
+    arguments += ["n_episodes:2", "batch_size:100", "--seed", "14", "--log-folder", "elsewhere", "--n-trials", "2"]
     arguments += ["--n-jobs", "1", "--sampler", sampler, "--pruner", pruner, "--n-evaluations", "2"]
     arguments += ["--n-startup-trials", "1", "--optimization-log-path", "kept", "--eval-episodes", "40"]
     assert main(["tune", *arguments]) == 0

@@ -27,7 +27,7 @@ SHORT = [*LAVA, "-params", "n_episodes:20", "-n", "2000"]
 FILES = sorted(Path(hyperparams.__file__).parent.glob("*.yml"))
 
 
-CARTPOLE = ["-params", "n_episodes:4", "batch_size:4", "-n", "100", "--eval-freq", "-1"]
+CARTPOLE = ["-params", "n_episodes:4", "batch_size:100", "-n", "100", "--eval-freq", "-1"]
 
 
 @pytest.fixture

@@ -55,14 +55,14 @@ def test_environments_get_the_keywords_of_the_command_line(here, monkeypatch):  
         return env
 
     monkeypatch.setattr(TDPGExperimentManager, "create_envs", spy)
-    command = ["train", "--env", "Pendulum-v1", "-n", "100", "-params", "n_episodes:2", "batch_size:2"]
+    command = ["train", "--env", "Pendulum-v1", "-n", "100", "-params", "n_episodes:2", "batch_size:100"]
     assert main([*command, "--env-kwargs", "g:8.0", "--eval-env-kwargs", "g:5.0"]) == 0
     assert gravities == dict(training=8.0, evaluation=5.0)
 
 
 def test_the_monitor_writes_the_keywords_of_the_block(here):  # noqa: F811
     keywords = "monitor_kwargs:dict(info_keywords=('TimeLimit.truncated',))"
-    command = ["train", "--env", "Pendulum-v1", "-n", "400", "-params", "n_episodes:2", "batch_size:2", keywords]
+    command = ["train", "--env", "Pendulum-v1", "-n", "400", "-params", "n_episodes:2", "batch_size:100", keywords]
     assert main([*command, *NO_EVALUATION]) == 0
     assert load_results(str(folder_of(here, env="Pendulum-v1")))["TimeLimit.truncated"].all()
 
@@ -108,7 +108,7 @@ def test_wrappers_of_the_zoo(env, wrappers, here):  # noqa: F811
 
 def test_the_raw_statistics_of_episodes_go_to_tensorboard(here):  # noqa: F811
     callback = "callback:'rl_zoo3.callbacks.RawStatisticsCallback'"
-    command = ["train", "--env", "Pendulum-v1", "-n", "800", "-params", "n_episodes:2", "batch_size:2", callback]
+    command = ["train", "--env", "Pendulum-v1", "-n", "800", "-params", "n_episodes:2", "batch_size:100", callback]
     assert main([*command, "--tensorboard-log", "tensorboard", *NO_EVALUATION]) == 0
     (folder,) = {path.parent for path in here.glob("tensorboard/**/events.*")}
     events = EventAccumulator(str(folder)).Reload()
@@ -118,7 +118,7 @@ def test_the_raw_statistics_of_episodes_go_to_tensorboard(here):  # noqa: F811
 
 
 def test_enjoy_takes_the_best_model_and_the_checkpoints(here, capsys):  # noqa: F811
-    command = ["train", "--env", "CartPole-v1", "-params", "n_envs:1", "n_episodes:2", "batch_size:2", "-P"]
+    command = ["train", "--env", "CartPole-v1", "-params", "n_envs:1", "n_episodes:2", "batch_size:100", "-P"]
     assert main([*command, "-n", "1000", "-f", "elsewhere", "--eval-freq", "500", "--save-freq", "500"]) == 0
     enjoy = ["enjoy", "--env", "CartPole-v1", "-f", "elsewhere", "--no-render", "-n", "100"]
     for flags, name in (
@@ -152,7 +152,7 @@ def test_the_zoos_benchmark_evaluates_tdpg(here):  # noqa: F811
 
 
 def test_workers_one_after_the_other_stop_at_the_total_of_trials(here):  # noqa: F811
-    command = ["tune", "--env", "Pendulum-v1", "-n", "400", "-params", "n_envs:1", "n_episodes:2", "batch_size:2"]
+    command = ["tune", "--env", "Pendulum-v1", "-n", "400", "-params", "n_envs:1", "n_episodes:2", "batch_size:100"]
     command += ["--n-evaluations", "1", "--seed", "12", "--eval-episodes", "40", "--max-total-trials", "3"]
     for n_trials in ("2", "2"):
         assert main([*command, "--n-trials", n_trials, "--storage", "study.log", "--study-name", "a"]) == 0

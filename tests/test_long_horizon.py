@@ -1,0 +1,317 @@
+"""Ordinary environments: epochs of steps, segments, a value network, pooled information, dicts, and their defaults."""
+
+import math
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_problems import CountdownEnv, ToyEnv, assert_same_parameters, parameters
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.advantages import ValueFunction, generalised_advantages
+from sb3_tdpg.features import RunningNorm
+from sb3_tdpg.information import LogDet
+from sb3_tdpg.settings import DEFAULTS, preset_of
+
+OLD_MODEL = Path(__file__).parent / "data" / "cartpole_before_segments.zip"
+
+
+def tiny(env="CartPole-v1", **kwargs):
+    """Build a model with the defaults of ordinary environments and few, small updates."""
+    small = dict(epoch_steps=400, batch_size=100, n_epochs=2, seed=0, device="cpu")
+    if "n_episodes" in kwargs:
+        del small["epoch_steps"]
+    return TDPG("TRVPolicy", env, **{**small, **kwargs})
+
+
+# -- it learns -------------------------------------------------------------------------------------------------
+
+
+def test_the_line_of_a_new_user_learns_cartpole():
+    model = TDPG("TRVPolicy", "CartPole-v1", seed=0, device="cpu").learn(24_000)
+    assert model.rollout_buffer.episode_costs.mean() < -150  # from -20
+
+
+def test_a_cost_limit_takes_information_out_and_keeps_the_return():
+    reached = {}
+    for limit in (None, -60.0):
+        model = TDPG("TRVPolicy", "CartPole-v1", cost_limit=limit, seed=0, device="cpu").learn(30_000)
+        batch = model.rollout_buffer.episode_batch().information_batch(pooled=True)
+        estimator = LogDet(1, model.state_dim, model.policy.trv_dim)
+        reached[limit] = float(estimator(batch)), model.rollout_buffer.episode_costs.mean()
+    assert reached[-60.0][0] < 0.7 * reached[None][0]
+    assert reached[-60.0][1] < -40
+
+
+# -- epochs of steps -------------------------------------------------------------------------------------------
+
+
+def test_an_epoch_of_steps_has_whole_episodes_and_stops_as_soon_as_there_are_enough():
+    model = tiny(epoch_steps=300, n_envs=3)
+    model.learn(300)
+    batch = model.rollout_buffer.episode_batch(whole_horizon=False)
+    lengths = batch.alive.sum(0)
+    assert lengths.sum() == model.num_timesteps - _idle_steps(model)
+    assert lengths.sum() >= 300
+    # Without the last episode of each environment there were too few.
+    assert lengths.sum() - lengths.sort().values[-3:].sum() < 300
+    assert len(lengths) > 3  # the buffer has made room
+    assert len(batch.alive) == lengths.max()
+    assert (batch.alive[0] == 1).all()
+    assert not batch.prev_trvs[0].any()
+
+
+def _idle_steps(model):
+    """Steps of environments that had finished while others had not."""
+    return model.num_timesteps - int(model.rollout_buffer.alive.sum())
+
+
+def test_the_length_of_an_epoch_does_not_depend_on_that_of_the_episodes():
+    model = TDPG(
+        "TRVPolicy", DummyVecEnv([lambda: CountdownEnv(0, [4, 2, 1]) for _ in range(2)]), epoch_steps=100, seed=0
+    )
+    model.learn(100)
+    assert 100 <= model.rollout_buffer.alive.sum() < 100 + 2 * model.horizon
+
+
+@pytest.mark.parametrize("n_envs", [3, 8])
+def test_any_number_of_environments_fits_the_defaults(n_envs):
+    assert TDPG("TRVPolicy", make_vec_env("CartPole-v1", n_envs)).n_episodes is None
+    short = make_vec_env(ToyEnv, n_envs)
+    n_episodes = TDPG("TRVPolicy", short).n_episodes
+    assert n_episodes % n_envs == 0
+    assert 500 <= n_episodes < 500 + n_envs
+
+
+def test_a_training_shorter_than_an_epoch_warns_with_the_number_to_change():
+    with pytest.warns(UserWarning, match=r"learn\(50\) makes a single update.*400 steps.*total_timesteps=20000"):
+        tiny().learn(50)
+
+
+# -- segments --------------------------------------------------------------------------------------------------
+
+
+def test_segments_leave_out_what_comes_after_the_end():
+    model = tiny(epoch_steps=300)
+    model.learn(300)
+    batch = model.rollout_buffer.episode_batch(whole_horizon=False)
+    parts = batch.segments(5)
+    assert parts.alive.shape[0] == 5
+    assert parts.alive.sum() == batch.alive.sum()
+    assert parts.alive.shape[1] == sum(math.ceil(n / 5) for n in batch.alive.sum(0).tolist())
+    assert (parts.alive[0] == 1).all()
+    first = parts.prev_trvs[0]
+    assert (first == 0).all(dim=1).sum() == batch.alive.shape[1]  # one for each episode
+    living = parts.alive.bool()
+    assert sorted(parts.costs[living].tolist()) == sorted(batch.costs[batch.alive.bool()].tolist())
+
+
+def test_minibatches_count_steps(monkeypatch):
+    model = tiny(epoch_steps=400, batch_size=100)
+    sizes = []
+    evaluate = model.policy.evaluate_episodes
+    monkeypatch.setattr(
+        model.policy,
+        "evaluate_episodes",
+        lambda batch, *rest: (sizes.append(int(batch.alive.sum())), evaluate(batch, *rest))[1],
+    )
+    model.learn(400)
+    assert 60 < min(sizes) <= max(sizes) < 140
+
+
+def test_the_first_ratio_of_an_epoch_is_one(monkeypatch):
+    """Statistics of the observations must not change between the rollouts and their gradients."""
+    model = tiny(n_epochs=1, batch_size=400, normalize_advantage=False)
+    model.learn(800)
+    assert model.logger.name_to_value["train/approx_kl"] == pytest.approx(0.0, abs=1e-4)
+    assert model.epoch >= 2
+
+
+# -- the value network -----------------------------------------------------------------------------------------
+
+
+def test_generalised_advantages_are_the_discounted_sum_of_residuals():
+    costs, values = th.tensor([[1.0], [2.0], [3.0]]), th.tensor([[0.5], [1.0], [1.5]])
+    residuals = [1 + 0.9 * 1.0 - 0.5, 2 + 0.9 * 1.5 - 1.0, 3 - 1.5]
+    expected = [
+        residuals[0] + 0.45 * residuals[1] + 0.45**2 * residuals[2],
+        residuals[1] + 0.45 * residuals[2],
+        residuals[2],
+    ]
+    assert generalised_advantages(costs, values, 0.9, 0.5)[:, 0].tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e4])
+def test_the_value_network_learns_the_cost_to_come_on_any_scale(scale):
+    th.manual_seed(0)
+    value = ValueFunction(2, 20)
+    explained = []
+    for _ in range(15):
+        states = th.randn(20, 50, 2)
+        left = (20 - th.arange(20.0))[:, None]
+        targets = scale * (3 * states[..., 0] + left + 7)
+        explained.append(value.fit(states, targets, th.ones(20, 50), 1.0))
+    assert explained[0] < 0.1
+    assert explained[-1] > 0.95
+
+
+def test_a_new_scale_of_the_targets_does_not_move_the_values():
+    value = ValueFunction(2, 10, n_epochs=0)
+    states = th.randn(10, 30, 2)
+    before = value(states, 0.9)
+    value._rescale(1000 + 100 * th.randn(300))
+    th.testing.assert_close(value(states, 0.9), before, rtol=1e-4, atol=1e-3)
+
+
+def test_running_statistics_are_those_of_all_batches_together():
+    rng = np.random.default_rng(0)
+    batches = [rng.normal(3, 5, (n, 2)).astype(np.float32) for n in (1, 40, 300)]
+    norm = RunningNorm(2)
+    for batch in batches:
+        norm.update(th.as_tensor(batch))
+    x = np.concatenate(batches)
+    expected = (x - x.mean(0)) / x.std(0)
+    np.testing.assert_allclose(norm(th.as_tensor(x)), expected.clip(-10, 10), rtol=1e-2, atol=1e-2)
+
+
+def test_observations_are_standardised_by_what_the_training_has_seen():
+    model = tiny()
+    model.learn(400)
+    norm = model.policy.norm.norms["observation"]
+    seen = model.rollout_buffer.observations[model.rollout_buffer.alive > 0]
+    np.testing.assert_allclose(norm.mean, seen.mean(0), atol=1e-3)
+
+
+# -- information -----------------------------------------------------------------------------------------------
+
+
+def test_the_information_is_pooled_over_the_steps_of_all_times():
+    model = tiny(beta=1e6)
+    model.learn(400)
+    batch = model.rollout_buffer.episode_batch()
+    pooled = batch.information_batch(pooled=True)
+    assert pooled.trvs.shape[:2] == (1, int(batch.alive.sum()))
+    per_step = float(LogDet(1, model.state_dim, model.policy.trv_dim)(pooled))
+    mean_length = float(batch.alive.sum(0).mean())
+    assert model.information.tolist() == pytest.approx([per_step * mean_length], rel=1e-5)
+
+
+@pytest.mark.parametrize("mi_estimator", ["mine", "infonce", "loo", "vib"])
+def test_every_estimator_penalises_pooled_steps(mi_estimator):
+    model = tiny(beta=100.0, mi_estimator=mi_estimator, encoder_gradient="score")
+    model.learn(400)
+    assert model.estimator.horizon == 1
+    assert np.isfinite(model.logger.name_to_value["train/mi_loss"])
+
+
+# -- the policy ------------------------------------------------------------------------------------------------
+
+
+def test_the_observation_is_in_the_first_trvs_from_the_start():
+    policy = tiny("Pendulum-v1").policy
+    observation = th.tensor([[0.3, -0.9, 0.2]])
+    means = [
+        policy.encoder_density(x, th.zeros(1, policy.trv_dim), np.zeros(1, int))[0]
+        for x in (observation, 2 * observation)
+    ]
+    # The encoder's own output changes, too, but by less.
+    np.testing.assert_allclose((means[1] - means[0])[0, :3].detach(), observation[0], atol=0.35)
+    with pytest.raises(ValueError, match=r"skip=True adds the 3 features.*trv_dim=2.*trv_dim=3 or more"):
+        tiny("Pendulum-v1", policy_kwargs=dict(trv_dim=2, skip=True))
+
+
+def test_the_noise_of_the_actions_is_a_share_of_their_range():
+    low, high = np.array([-2.0, 10.0], np.float32), np.array([2.0, 30.0], np.float32)
+    env = ToyEnv(action_space=spaces.Box(low, high, dtype=np.float32), horizon=60)
+    policy = tiny(env, policy_kwargs=dict(action_log_var_init=-2.0)).policy
+    distribution = policy.action_density(th.zeros(4, policy.trv_dim), np.zeros(4, int)).distribution
+    share = distribution.stddev / th.tensor([2.0, 10.0])
+    assert share.detach().numpy() == pytest.approx(np.full((4, 2), np.exp(-1)), rel=0.4)
+    assert ((distribution.mean - th.tensor([0.0, 20.0])).abs() < th.tensor([1.0, 5.0])).all()
+
+
+def test_a_saved_model_predicts_and_continues_the_same(tmp_path):
+    model = tiny()
+    model.learn(400)
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=gym.make("CartPole-v1"), device="cpu")
+    assert_same_parameters(parameters(model.policy), parameters(loaded.policy))
+    assert_same_parameters(parameters(model.value_function), parameters(loaded.value_function))
+    assert (loaded.preset, loaded.batch_size, loaded.epoch_steps) == ("long", 100, 400)
+    loaded.learn(400, reset_num_timesteps=False)
+
+
+def test_a_model_from_before_the_segments_loads_and_trains_as_it_did():
+    model = TDPG.load(OLD_MODEL, env=make_vec_env("CartPole-v1", 2), device="cpu")
+    action, (trvs, _) = model.predict(np.array([0.1, 0.2, 0.03, 0.4], np.float32), deterministic=True)
+    assert action == 0
+    np.testing.assert_allclose(trvs, [[0.05216565, -0.0425191]], rtol=1e-4)
+    assert (model.baseline, model.pools_information, model.n_episodes) == ("regression", False, 10)
+    assert model.batch_size == 5 * model.horizon  # it was in episodes
+    model.learn(200)
+    assert model.epoch == 1
+
+
+# -- dicts -----------------------------------------------------------------------------------------------------
+
+CAMERA_AND_JOINTS = spaces.Dict(
+    camera=spaces.Box(0, 255, (3, 36, 36), np.uint8), joints=spaces.Box(-1, 1, (2,), np.float32)
+)
+
+
+@pytest.mark.parametrize("horizon", [4, 60])
+def test_a_camera_beside_joints_is_learnt_from(horizon, tmp_path):
+    env = ToyEnv(observation_space=CAMERA_AND_JOINTS, horizon=horizon)
+    model = TDPG("TRVPolicy", env, n_episodes=4, beta=10.0, seed=0)
+    model.learn(2 * 4 * horizon)
+    assert model.epoch == 2
+    assert model.state_dim == 1  # what the environment says, and not the joints
+    model.save(tmp_path / "model")
+    observation, _ = env.reset(seed=0)
+    predictions = []
+    for each in (model, TDPG.load(tmp_path / "model")):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            predictions.append(each.predict(observation, deterministic=True)[0])
+    np.testing.assert_array_equal(*predictions)
+
+
+def test_a_dict_of_vectors_is_its_own_state_and_one_with_an_image_is_not():
+    joints = spaces.Dict(angles=spaces.Box(-1, 1, (2,), np.float32), speed=spaces.Box(-1, 1, (1,), np.float32))
+    env = ToyEnv(observation_space=joints, gives_state=False, horizon=60)
+    model = tiny(env)
+    model.learn(400)
+    assert model.state_dim == 3
+    assert set(model.policy.norm.norms) == {"angles", "speed"}
+    camera = ToyEnv(observation_space=CAMERA_AND_JOINTS, gives_state=False, horizon=60)
+    with pytest.raises(ValueError, match="needs the true state"):
+        tiny(camera)
+
+
+# -- words -----------------------------------------------------------------------------------------------------
+
+
+def test_the_kind_of_problem_decides_the_defaults():
+    vector, image = spaces.Box(-1, 1, (3,)), spaces.Box(0, 255, (3, 64, 64), np.uint8)
+    assert [preset_of(vector, t) for t in (None, 49, 50)] == ["vector", "vector", "long"]
+    assert preset_of(image, 1000) == "image"
+    model = TDPG("TRVPolicy", "Pendulum-v1")
+    for name in ("epoch_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "baseline", "bptt_steps"):
+        assert getattr(model, name) == getattr(DEFAULTS["long"], name), name
+    assert model.beta == math.inf
+
+
+def test_a_limit_that_no_epoch_meets_is_told_at_the_end():
+    with pytest.warns(UserWarning, match=r"no epoch met cost_limit=-475 \(minus the reward_threshold .*no penalty"):
+        tiny(beta="auto").learn(400)
+
+
+def test_a_limit_that_comes_from_the_environment_is_told(capsys):
+    tiny(beta="auto", verbose=1)
+    assert "cost_limit=-475 (minus the reward_threshold" in capsys.readouterr().out
