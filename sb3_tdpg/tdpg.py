@@ -268,7 +268,7 @@ class TDPG(EpisodicAlgorithm):
     @property
     def pools_information(self) -> bool:
         """Whether one estimate is made of the living steps of all times, which then share their weights."""
-        return not self.policy.time_varying and self.preset is not None
+        return not self.policy.time_varying
 
     def _setup_beta(self) -> None:
         """Make the schedule of beta, or the weight that is adapted to the cost limit."""
@@ -307,8 +307,8 @@ class TDPG(EpisodicAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        shares_weights = not self.policy.time_varying
-        batch = self.rollout_buffer.episode_batch(whole_horizon=not shares_weights)
+        in_segments = not self.policy.time_varying
+        batch = self.rollout_buffer.episode_batch(whole_horizon=not in_segments)
         mean_cost = batch.costs.sum(0).mean().item()
         information = 0.0 if self.information is None else float(self.information.sum())
         self._check_finite("costs", batch.costs)
@@ -324,7 +324,7 @@ class TDPG(EpisodicAlgorithm):
             negligible = 1e-5 * batch.costs.abs().max()
             advantages, cost_scale = losses.normalized(advantages, batch.alive, negligible)
         batch = whole = batch._replace(advantages=advantages)
-        if shares_weights:
+        if in_segments:
             batch = batch.segments(self.bptt_steps or len(batch.costs))
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
@@ -345,7 +345,7 @@ class TDPG(EpisodicAlgorithm):
                     kl, clip_fraction = losses.policy_distance(log_prob.detach(), old, part.alive, clip_range)
                     self.logger.record_mean("train/approx_kl", kl.item())
                     self.logger.record_mean("train/clip_fraction", clip_fraction.item())
-                if shares_weights:  # the loss of a step: segments are of no fixed number
+                if in_segments:  # the loss of a step: segments are of no fixed number
                     policy_loss = policy_loss * len(part.costs[0]) / part.alive.sum()
                 loss = policy_loss
                 if rebuilt is not None and mi_coef > 0.0:

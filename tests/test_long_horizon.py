@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdpg import TDPG
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
 from sb3_tdpg.features import RunningNorm
-from sb3_tdpg.information import LogDet
+from sb3_tdpg.information import LogDet, get_estimator_class
 from sb3_tdpg.settings import DEFAULTS, preset_of
 
 OLD_MODEL = Path(__file__).parent / "data" / "cartpole_before_segments.zip"
@@ -252,10 +252,24 @@ def test_a_model_from_before_the_segments_loads_and_trains_as_it_did():
     action, (trvs, _) = model.predict(np.array([0.1, 0.2, 0.03, 0.4], np.float32), deterministic=True)
     assert action == 0
     np.testing.assert_allclose(trvs, [[0.05216565, -0.0425191]], rtol=1e-4)
-    assert (model.baseline, model.pools_information, model.n_episodes) == ("regression", False, 10)
+    assert (model.baseline, model.n_episodes) == ("regression", 10)
     assert model.batch_size == 5 * model.horizon  # it was in episodes
+    model.beta, model.cost_limit = 100.0, None
+    model._setup_beta()
     model.learn(200)
     assert model.epoch == 1
+    assert np.isfinite(model.logger.name_to_value["train/mi_loss"])
+
+
+def test_the_critics_of_a_model_with_one_for_each_step_start_afresh():
+    old, new = (get_estimator_class("mine")(horizon, 2, 3) for horizon in (60, 1))
+    before = parameters(new)
+    new.load_state_dict(old.state_dict())
+    after = parameters(new)
+    assert before["critic.layers.0.weight"].shape == after["critic.layers.0.weight"].shape
+    assert_same_parameters(before, after)
+    with pytest.raises(RuntimeError, match="size mismatch"):  # these do not fit in any version
+        get_estimator_class("mine")(60, 2, 4).load_state_dict(old.state_dict())
 
 
 # -- dicts -----------------------------------------------------------------------------------------------------

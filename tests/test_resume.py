@@ -52,7 +52,12 @@ SETTINGS = {
 
 
 def make_model(env, settings):
-    return tiny_tdpg(ENVIRONMENTS[env](), n_episodes=8 if env == "cartpole" else 20, **SETTINGS[settings])
+    given = dict(n_episodes=20, **SETTINGS[settings])
+    if env == "cartpole":
+        given["n_episodes"] = 8
+        if "batch_size" in given:
+            given["batch_size"] = 200  # steps, of which all share their weights
+    return tiny_tdpg(ENVIRONMENTS[env](), **given)
 
 
 def train(model, total_timesteps, path, callbacks=(), **kwargs):

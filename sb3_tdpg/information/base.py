@@ -7,7 +7,7 @@ Dimension key: T time steps, N episodes, X state, Z task-relevant variables (TRV
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch as th
 from torch import nn
@@ -83,6 +83,15 @@ class InformationEstimator(nn.Module):
     def recommended_episodes(self) -> int:
         """Number of episodes of an epoch below which the estimate is misleading."""
         return self.trv_dim + 2
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        own = self.state_dict()
+        for name, value in own.items():
+            saved = state_dict.get(f"{prefix}{name}")
+            # Early versions had a network for each step also where one for all is fitted now: it starts afresh.
+            if self.horizon == 1 and saved is not None and saved.shape != value.shape:
+                state_dict[f"{prefix}{name}"] = value
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
