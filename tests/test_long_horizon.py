@@ -247,6 +247,8 @@ def test_a_saved_model_predicts_and_continues_the_same(tmp_path):
     loaded.learn(400, reset_num_timesteps=False)
 
 
+# The file was written with NumPy 1, so that NumPy 1 can read it, too.
+@pytest.mark.filterwarnings("ignore:numpy.core:DeprecationWarning")
 def test_a_model_from_before_the_segments_loads_and_trains_as_it_did():
     model = TDPG.load(OLD_MODEL, env=make_vec_env("CartPole-v1", 2), device="cpu")
     action, (trvs, _) = model.predict(np.array([0.1, 0.2, 0.03, 0.4], np.float32), deterministic=True)

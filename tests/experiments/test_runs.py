@@ -270,14 +270,14 @@ def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
 
 
 def test_the_progress_bar_counts_runs_and_moves_with_their_epochs(tmp_path, capsys):
-    run = Run("PG", "Lava-v0", "Lava-v0-pg", 0, dict(n_timesteps=15_050, n_episodes=20))
+    run = Run("PG", "Lava-v0", "Lava-v0-pg", 0, dict(n_timesteps=300_050, n_episodes=20))
     complete_runs([(run, tmp_path / "run", LAVA[:1])], jobs=1)
     bars = [
         (runs, int(epochs.replace(",", "")))
         for runs, epochs in re.findall(r"(\d)/1 \[[^\]]*, ([\d,]+) epochs", capsys.readouterr().err)
     ]
-    assert bars[-1] == ("1", 151)
-    assert any(runs == "0" and 0 < epochs < 151 for runs, epochs in bars)
+    assert bars[-1] == ("1", 3001)
+    assert any(runs == "0" and 0 < epochs < 3001 for runs, epochs in bars)
     assert bars == sorted(bars)
 
 
