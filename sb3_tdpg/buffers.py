@@ -199,3 +199,8 @@ class EpisodeBuffer(RolloutBuffer):
     def episode_costs(self) -> np.ndarray:
         """Undiscounted cost of each episode, ``(N,)``."""
         return self.costs[:, self.alive[0] > 0].sum(axis=0)
+
+    @property
+    def mean_length(self) -> float:
+        """Mean number of steps of an episode."""
+        return float(self.alive.sum() / self.alive[0].sum())

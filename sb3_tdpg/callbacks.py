@@ -66,7 +66,7 @@ class MINECallback(TDPGCallback):
         with th.no_grad():
             information = model.estimator(batch).cpu().numpy()  # (T,), nats
         if model.pools_information:  # one estimate for a step of any time
-            information = information * model.rollout_buffer.alive.sum(0)[model.rollout_buffer.alive[0] > 0].mean()
+            information = information * model.rollout_buffer.mean_length
         model.information = information
         self.logger.record("mi/total", float(information.sum()))
         for name, value in diagnostics.items():

@@ -77,7 +77,6 @@ class RunningNorm(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """``(..., dim) -> (..., dim)``, clipped to [-10, 10]."""
-        # A component that never changes carries nothing: its rounding must not be magnified.
         return ((x - self.mean) / th.sqrt(self.var + 1e-8)).clamp(-10.0, 10.0)
 
 

@@ -244,16 +244,13 @@ def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) ->
     :param unit: What both sizes count, "episodes" or "steps".
     """
     batch_size, n_epochs, clip_range = settings["batch_size"], settings["n_epochs"], settings["clip_range"]
-    least = 2 if unit == "episodes" else MIN_BATCH_STEPS
+    why, least = "all time steps share their weights", MIN_BATCH_STEPS
+    if unit == "episodes":
+        why, least = "each time step has weights of its own (policy_kwargs: time_varying)", 2
     if batch_size is not None and not min(least, epoch_size) <= batch_size <= epoch_size:
         raise ValueError(
             f"batch_size={batch_size} must be between {least} and {epoch_size}, the {unit} of an epoch: it counts "
-            f"{unit}, because "
-            + (
-                "each time step has weights of its own (policy_kwargs: time_varying)"
-                if unit == "episodes"
-                else "all time steps share their weights"
-            )
+            f"{unit}, because {why}"
         )
     n_updates = n_epochs * (1 if batch_size is None else math.ceil(epoch_size / batch_size))
     if n_updates > 1 and math.isinf(_values(clip_range)[0]):

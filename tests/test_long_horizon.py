@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import CountdownEnv, ToyEnv, assert_same_parameters, parameters
+from small_problems import AtEveryEpoch, CountdownEnv, ToyEnv, assert_same_parameters, parameters
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tdpg import TDPG
+from sb3_tdpg import TDPG, InformationCallback
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
 from sb3_tdpg.features import RunningNorm
 from sb3_tdpg.information import LogDet, get_estimator_class
@@ -202,6 +202,16 @@ def test_the_information_is_pooled_over_the_steps_of_all_times():
     assert model.information.tolist() == pytest.approx([per_step * mean_length], rel=1e-5)
 
 
+def test_the_interval_of_pooled_information_is_that_of_an_episode():
+    model = tiny("Pendulum-v1", epoch_steps=2000, beta=1e6)
+    logged = {}
+    interval = InformationCallback(eval_freq=1)
+    model.learn(2000, callback=[interval, AtEveryEpoch(lambda m: logged.update(m.logger.name_to_value))])
+    for limit, of_a_step in zip(("lower", "upper"), interval.interval.total, strict=True):
+        assert logged[f"mi/{limit}"] == pytest.approx(200 * of_a_step)
+    assert logged["mi/lower"] < logged["mi/total"] < 2 * logged["mi/upper"]
+
+
 @pytest.mark.parametrize("mi_estimator", ["mine", "infonce", "loo", "vib"])
 def test_every_estimator_penalises_pooled_steps(mi_estimator):
     model = tiny(beta=100.0, mi_estimator=mi_estimator, encoder_gradient="score")
@@ -272,6 +282,8 @@ def test_the_critics_of_a_model_with_one_for_each_step_start_afresh():
     assert_same_parameters(before, after)
     with pytest.raises(RuntimeError, match="size mismatch"):  # these do not fit in any version
         get_estimator_class("mine")(60, 2, 4).load_state_dict(old.state_dict())
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        get_estimator_class("mine")(1, 2, 4).load_state_dict(new.state_dict())
 
 
 # -- dicts -----------------------------------------------------------------------------------------------------

@@ -169,10 +169,10 @@ def read_zoo_folder(
     progress = None
     if get_monitor_files(str(folder)):  # the mean cost of each epoch, from the log of episodes
         log = load_results(str(folder))
-        counted, size = (
-            (log["l"], model.epoch_size) if model.n_episodes is None else (log["l"] * 0 + 1, model.n_episodes)
-        )
-        means = -log["r"].groupby((counted.cumsum() - 1) // size).mean()[: counted.sum() // size]
+        # The length of an epoch is one in episodes, or in steps.
+        done = log["l"].cumsum().to_numpy() if model.n_episodes is None else np.arange(1, len(log) + 1)
+        size = model.n_episodes or model.epoch_size
+        means = -log["r"].groupby((done - 1) // size).mean()[: done[-1] // size]
         progress = pd.DataFrame({"time/iterations": np.arange(1, len(means) + 1), "rollout/ep_cost_mean": means})
     # Our `train` saves the selected policy when it is finished, the zoo's the last one.
     is_ours = (folder / "run.json").exists()

@@ -85,11 +85,10 @@ class InformationEstimator(nn.Module):
         return self.trv_dim + 2
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        own = self.state_dict()
-        for name, value in own.items():
-            saved = state_dict.get(f"{prefix}{name}")
-            # Early versions had a network for each step also where one for all is fitted now: it starts afresh.
-            if self.horizon == 1 and saved is not None and saved.shape != value.shape:
+        # Early versions had a network for each step also where one for all is fitted now: it starts afresh.
+        for name, value in self.state_dict().items() if self.horizon == 1 else ():
+            saved = state_dict.get(f"{prefix}{name}", value)
+            if saved.shape[1:] == value.shape[1:] and saved.shape != value.shape:
                 state_dict[f"{prefix}{name}"] = value
         super()._load_from_state_dict(state_dict, prefix, *args)
 

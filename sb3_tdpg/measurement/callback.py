@@ -34,10 +34,12 @@ class InformationCallback(TDPGCallback):
 
     def _on_training_start(self) -> None:
         model, trv_dim = self.tdpg, self.tdpg.policy.trv_dim
-        n_episodes = model.epoch_size // (1 if model.pools_information else model.horizon)
-        if n_episodes < min_episodes(trv_dim):  # it would log 0 and 0, the sums over no time step
+        # Where the steps share their weights, each step is a sample; elsewhere each episode is one.
+        name, size = ("epoch_steps", 1) if model.pools_information else ("n_episodes", model.horizon)
+        n_samples = model.epoch_size // size
+        if n_samples < min_episodes(trv_dim):  # it would log 0 and 0, the sums over no time step
             raise ValueError(
-                f"n_episodes={n_episodes} is too small for an interval of the information in {trv_dim} TRVs: use at "
+                f"{name}={n_samples} is too small for an interval of the information in {trv_dim} TRVs: use at "
                 f"least {min_episodes(trv_dim)}"
             )
 
@@ -47,8 +49,10 @@ class InformationCallback(TDPGCallback):
             return
         batch = model.rollout_buffer.episode_batch().information_batch(model.pools_information)
         self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
+        # As mi/total: of an episode, also where one estimate is made for its steps.
+        n_steps = model.rollout_buffer.mean_length if model.pools_information else 1.0
         for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
-            self.logger.record(f"mi/{limit}", total)
+            self.logger.record(f"mi/{limit}", total * n_steps)
             for t, value in enumerate(getattr(self.interval, limit).tolist()):
                 if np.isfinite(value):
                     self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))
