@@ -3,13 +3,13 @@ PYTHON ?= python3
 VENV ?= .venv
 OLDEST ?= .venv-oldest
 JOBS ?= 2
-EXTRAS ?= zoo,postgres,ray,hub,tests,plots,docs,dev
+EXTRAS ?= zoo,postgres,ray,hub,tests,plots,public,docs,dev
 
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines wheel clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines reproduce-public wheel clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -95,6 +95,9 @@ reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a
 
 reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay, VIB and augmented images beside TDPG, on all three environments
 	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines
+
+reproduce-public: $(STAMP) ## our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO on public tasks
+	$(PY) tests/benchmarks/public/run.py
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

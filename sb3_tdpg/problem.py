@@ -100,9 +100,9 @@ def horizon_of(env: VecEnv | gym.Env) -> Any:
     horizon = _attribute(env, "horizon")
     if horizon is None:
         spec = _attribute(env, "spec")
-        # A TimeLimit that the user wrapped around it is not in the spec.
-        horizon = _attribute(env, "_max_episode_steps") if spec is None else spec.max_episode_steps
-    return horizon
+        horizon = None if spec is None else spec.max_episode_steps
+    # A TimeLimit that the user, or the function behind the id, has wrapped around it is not in the spec.
+    return _attribute(env, "_max_episode_steps") if horizon is None else horizon
 
 
 def reward_threshold(env: VecEnv | None) -> float:
