@@ -13,7 +13,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
-from sb3_tdpg.features import RunningNorm
+from sb3_tdpg.features import Changes, RunningNorm
 from sb3_tdpg.losses import cost_to_go
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON
 
@@ -99,6 +99,8 @@ class ValueFunction(nn.Module):
     :param learning_rate: Of Adam.
     :param n_epochs: Passes over the steps of an epoch.
     :param batch_size: Steps of a minibatch.
+    :param with_changes: Whether the network also sees the changes of the state since the last step, as far as they are
+        news (:class:`~sb3_tdpg.features.Changes`): for observations that stand in for the state.
     """
 
     def __init__(
@@ -109,13 +111,16 @@ class ValueFunction(nn.Module):
         learning_rate: float = 1e-3,
         n_epochs: int = 10,
         batch_size: int = 256,
+        with_changes: bool = False,
     ) -> None:
         super().__init__()
         self.horizon = horizon
         self.n_epochs = n_epochs
         self.batch_size = batch_size
         self.norm = RunningNorm(state_dim)
-        self.network = nn.Sequential(*create_mlp(state_dim + 1, 1, list(hidden_sizes), nn.Tanh))
+        self.changes = Changes(state_dim) if with_changes else None
+        n_inputs = state_dim * (1 + with_changes) + 1
+        self.network = nn.Sequential(*create_mlp(n_inputs, 1, list(hidden_sizes), nn.Tanh))
         self.register_buffer("offset", th.zeros(()))
         self.register_buffer("scale", th.ones(()))
         self.optimizer = th.optim.Adam(self.network.parameters(), lr=learning_rate, fused=True)
@@ -136,7 +141,11 @@ class ValueFunction(nn.Module):
         left = self.horizon - th.arange(len(states), device=states.device)
         # The discounted number of steps that are left, as a share of that at the start.
         share = left / self.horizon if gamma == 1 else (1 - gamma**left) / (1 - gamma**self.horizon)
-        return th.cat([self.norm(states), share[:, None, None].expand(*states.shape[:2], 1)], dim=-1)
+        states = self.norm(states)
+        inputs = [states, share[:, None, None].expand(*states.shape[:2], 1)]
+        if self.changes is not None:
+            inputs.append(self.changes(states, th.cat([th.zeros_like(states[:1]), states[:-1]])))
+        return th.cat(inputs, dim=-1)
 
     def fit(self, states: th.Tensor, targets: th.Tensor, alive: th.Tensor, gamma: float) -> float:
         """
@@ -153,6 +162,8 @@ class ValueFunction(nn.Module):
             residual = y - self(states, gamma)[living]
             explained = 1 - (residual.var() / y.var().clamp(min=1e-12)).item()
             self.norm.update(states[living])
+            if self.changes is not None:
+                self.changes.update(self.norm(states), alive)
             self._rescale(y)
         x, z = self._inputs(states, gamma)[living], (y - self.offset) / self.scale
         for _ in range(self.n_epochs):

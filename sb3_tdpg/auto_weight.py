@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 
+LEAST_SLACK = 0.01  # of the limit
+
 
 class AutoWeight:
     """
@@ -13,19 +15,31 @@ class AutoWeight:
     The weight is 0 until the cost first meets the limit. It then starts where the penalty equals the limit, grows while
     the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"`` does for the entropy:
 
-        log w += rate * clip((C - cost) / abs(C), -2, 1)
+        log w += rate * clip((C - cost) / scale, -2, 1)
+
+    The scale is abs(C). With ``by_slack`` it is how far the lowest cost so far is below the limit: a limit of 95 % of
+    the attainable return then has as strong an effect as one of 50 %.
 
     :param cost_limit: C
-    :param rate: Largest increase of log w per epoch, reached at a cost of abs(C) below the limit.
+    :param by_slack: See above.
+    :param rate: Largest increase of log w per epoch, reached at a cost of one scale below the limit.
     :param max_growth: Largest multiple of the starting weight. Without it the weight would grow forever where the task
         needs no information.
     """
 
-    def __init__(self, cost_limit: float, rate: float = 0.3, max_growth: float = 1000.0) -> None:
+    # Those of models that early versions saved.
+    by_slack = False
+    _lowest = math.inf
+
+    def __init__(
+        self, cost_limit: float, by_slack: bool = False, rate: float = 0.3, max_growth: float = 1000.0
+    ) -> None:
         self.cost_limit = cost_limit
+        self.by_slack = by_slack
         self.rate = rate
         self.max_growth = max_growth
         self._start = 0.0
+        self._lowest = math.inf
         self.value = 0.0
         """w = 1 / beta, in units of cost per nat."""
 
@@ -36,7 +50,10 @@ class AutoWeight:
         :param cost: Mean cost of the epoch's episodes.
         :param information: Estimated information in nats, summed over time.
         """
+        self._lowest = min(self._lowest, cost)
         scale = abs(self.cost_limit)
+        if self.by_slack:
+            scale = max(self.cost_limit - self._lowest, LEAST_SLACK * scale)
         if self.value > 0.0:
             self.value *= math.exp(self.rate * min(max((self.cost_limit - cost) / scale, -2.0), 1.0))
             self.value = min(self.value, self.max_growth * self._start)

@@ -7,6 +7,8 @@ Dimension key: T horizon, N episodes or environments, Z TRVs, U action, F featur
 from __future__ import annotations
 
 import math
+
+# Standard deviations of at most 7.4 for a TRV and 55 for an action.
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -22,11 +24,10 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
-from sb3_tdpg.features import ObservationNorm, flat_action_space, observation_kind
+from sb3_tdpg.features import Changes, ObservationNorm, flat_action_space, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
 from sb3_tdpg.settings import POLICY_DEFAULTS, check_net_arch
 
-# Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
 
@@ -49,14 +50,17 @@ class TRVPolicy(BasePolicy):
     :param lr_schedule: Learning rate schedule.
     :param horizon: Number of time steps T; the algorithm passes the environment's.
     :param preset: Which defaults to use; the algorithm passes that of the problem. ``None``: by the observation alone.
-    :param trv_dim: Number of TRVs Z; default: 2, 8, 16, and 16 more than the features.
+    :param trv_dim: Number of TRVs Z; default: 2, 8, 16, and as many more than the features as
+        there are, but at least 16.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
         ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``, ``[64, 64]`` and ``[64, 64]``.
     :param activation_fn: Nonlinearity of the hidden layers; default: ELU, tanh, tanh (encoder) and ELU (head), tanh.
     :param time_varying: Whether each time step has its own weights; default: up to a horizon of 50, but not with the
         preset "long". The feature extractor is always shared.
     :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
-        store an observation before the action head can use it; default: no, no, no, yes (if they are as many or more).
+        store an observation before the action head can use it; default: no, no, no, yes if there are enough TRVs.
+    :param skip_changes: Whether the next TRVs get the change of the features since the last step, as far as it says
+        what the features do not (:class:`~sb3_tdpg.features.Changes`): hidden velocities. Default: as for ``skip``.
     :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all that
         were seen in training, as by SB3's ``VecNormalize``; default: no, no, no, yes.
     :param scale_actions: Whether the head's outputs are in units of the bounds of the action space: 0 is their middle,
@@ -67,9 +71,10 @@ class TRVPolicy(BasePolicy):
     :param squash_trv_log_var: Whether a tanh also keeps the log-variance in [-1, 1], before ``encoder_log_var_init`` is
         added, as in the paper's policies for images. The standard deviation is then at least 0.6, which hurts.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3,
-        -4.
-    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -1.
-    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
+        -10.
+    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -1.5.
+    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above; default:
+        1e-3, 1e-3, 1e-3, 1e-5.
     :param action_var_floor: Smallest variance of an action, likewise.
     :param features_extractor_class: Network in front of the encoder; default: flatten for vectors, the paper's two
         convolutional layers for images (:class:`~sb3_tdpg.features.TRVCnn`).
@@ -98,13 +103,14 @@ class TRVPolicy(BasePolicy):
         activation_fn: type[nn.Module] | None = None,
         time_varying: bool | None = None,
         skip: bool | None = None,
+        skip_changes: bool | None = None,
         normalize_observations: bool | None = None,
         scale_actions: bool | None = None,
         squash_trv_mean: bool | None = None,
         squash_trv_log_var: bool = False,
         encoder_log_var_init: float | None = None,
         action_log_var_init: float | None = None,
-        encoder_var_floor: float = 1e-3,
+        encoder_var_floor: float | None = None,
         action_var_floor: float = 1e-5,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -141,7 +147,7 @@ class TRVPolicy(BasePolicy):
         self.activation_fn = activation_fn
         self.encoder_log_var_init = _default(encoder_log_var_init, defaults.encoder_log_var_init)
         self.action_log_var_init = _default(action_log_var_init, defaults.action_log_var_init)
-        self.encoder_var_floor = encoder_var_floor
+        self.encoder_var_floor = encoder_var_floor = _default(encoder_var_floor, defaults.encoder_var_floor)
         self.action_var_floor = action_var_floor
         default_arch = dict(encoder=list(defaults.encoder), action_head=list(defaults.action_head))
         self.net_arch = check_net_arch(net_arch, default_arch)
@@ -149,7 +155,12 @@ class TRVPolicy(BasePolicy):
         self.norm = ObservationNorm(observation_space) if self.normalize_observations else None
         self.features_extractor = self.make_features_extractor()
         self.features_dim = self.features_extractor.features_dim
-        self.trv_dim = _default(trv_dim, defaults.trv_dim + (self.features_dim if defaults.is_long else 0))
+        has_room = [trv_dim is None or trv_dim >= n * self.features_dim for n in (1, 2)]
+        self.skip = _default(skip, defaults.is_long and has_room[0])
+        self.skip_changes = _default(skip_changes, self.skip and defaults.is_long and has_room[1])
+        n_skipped = self.features_dim * (self.skip + self.skip_changes)
+        n_more = max(defaults.trv_dim, n_skipped - self.features_dim)
+        self.trv_dim = _default(trv_dim, self.features_dim + n_more if self.skip else defaults.trv_dim)
         for name, value in (("horizon", horizon), ("policy_kwargs: trv_dim", self.trv_dim)):
             if not (isinstance(value, (int, np.integer)) and value >= 1):
                 raise ValueError(f"{name}={value!r} must be an integer of at least 1")
@@ -157,12 +168,14 @@ class TRVPolicy(BasePolicy):
             if not floor >= 0:
                 raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
 
-        self.skip = _default(skip, defaults.is_long and self.trv_dim >= self.features_dim)
-        if self.skip and self.trv_dim < self.features_dim:
+        if self.skip_changes and not self.skip:
+            raise ValueError("policy_kwargs: skip_changes=True needs skip=True: changes are those of the kept features")
+        if n_skipped > self.trv_dim:
             raise ValueError(
-                f"policy_kwargs: skip=True adds the {self.features_dim} features to as many TRVs, but trv_dim="
-                f"{self.trv_dim}: give trv_dim={self.features_dim} or more, or skip=False"
+                f"policy_kwargs: skip={self.skip} and skip_changes={self.skip_changes} add {n_skipped} features to as "
+                f"many TRVs, but trv_dim={self.trv_dim}: give trv_dim={n_skipped} or more, or turn them off"
             )
+        self.changes = Changes(self.features_dim) if self.skip_changes else None
         self.action_dist = make_proba_distribution(flat_action_space(action_space))
         self.encoder = TimeMLP(
             horizon,
@@ -199,7 +212,7 @@ class TRVPolicy(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         names = (
-            "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip",
+            "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip", "skip_changes",
             "normalize_observations", "scale_actions", "squash_trv_mean", "squash_trv_log_var", "encoder_log_var_init",
             "action_log_var_init", "encoder_var_floor", "action_var_floor", "features_extractor_class",
             "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
@@ -209,11 +222,17 @@ class TRVPolicy(BasePolicy):
 
     # -- the two conditional distributions --------------------------------------------------------------------
 
-    def _encoder_density(self, parameters: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return mean and standard deviation of q: ``(..., 2 Z)`` and ``(..., F)`` -> 2 x ``(..., Z)``."""
+    def _encoder_density(
+        self, parameters: th.Tensor, features: th.Tensor, prev_trv: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Return mean and standard deviation of q: ``(..., 2 Z)``, ``(..., F)``, ``(..., Z)`` -> 2 x ``(..., Z)``."""
         mean, log_var = parameters.chunk(2, dim=-1)
         if self.skip:
-            mean = mean + F.pad(features, (0, self.trv_dim - self.features_dim))
+            skipped = [features]
+            if self.changes is not None:
+                skipped.append(self.changes(features, prev_trv[..., : self.features_dim]))
+            known = th.cat(skipped, dim=-1)
+            mean = mean + F.pad(known, (0, self.trv_dim - known.shape[-1]))
         if self.squash_trv_mean:
             mean = th.tanh(mean)
         if self.squash_trv_log_var:
@@ -267,7 +286,8 @@ class TRVPolicy(BasePolicy):
         :param t: time step of each episode, ``(N,)``
         """
         features = self._features(observation)
-        return self._encoder_density(self._at_times(self.encoder, th.cat([prev_trv, features], dim=1), t), features)
+        parameters = self._at_times(self.encoder, th.cat([prev_trv, features], dim=1), t)
+        return self._encoder_density(parameters, features, prev_trv)
 
     def _features(self, observation: PyTorchObs) -> th.Tensor:
         """Standardise vectors, if asked for, and extract the features: ``(n, *obs) -> (n, F)``."""
@@ -293,6 +313,14 @@ class TRVPolicy(BasePolicy):
         outputs = [network.at(inputs[r], int(t[r[0]])) for r in rows]
         return th.cat(outputs)[np.argsort(np.concatenate(rows))]
 
+    def update_statistics(self, batch: EpisodeBatch) -> None:
+        """Include an epoch in the statistics that standardise observations and changes, if there are any."""
+        if self.norm is not None:
+            self.norm.update(batch.observations, batch.alive)
+        if self.changes is not None:
+            with th.no_grad():
+                self.changes.update(self.episode_features(batch), batch.alive)
+
     # -- whole episodes, for training -------------------------------------------------------------------------
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
@@ -313,7 +341,8 @@ class TRVPolicy(BasePolicy):
 
         :return: ``(T, N)``
         """
-        mean, std = self._encoder_density(self.encoder(th.cat([batch.prev_trvs, features], dim=-1)), features)
+        parameters = self.encoder(th.cat([batch.prev_trvs, features], dim=-1))
+        mean, std = self._encoder_density(parameters, features, batch.prev_trvs)
         return th.distributions.Normal(mean, std, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
@@ -342,7 +371,8 @@ class TRVPolicy(BasePolicy):
         steps = []
         # unbind, not features[t]: the gradient of each features[t] would be as large as all features.
         for t, (features_t, noise_t) in enumerate(zip(features.unbind(), noise.unbind(), strict=True)):
-            mean, std = self._encoder_density(self.encoder.at(th.cat([trv, features_t], dim=-1), t), features_t)
+            parameters = self.encoder.at(th.cat([trv, features_t], dim=-1), t)
+            mean, std = self._encoder_density(parameters, features_t, trv)
             trv = mean + std * noise_t
             steps.append((trv, mean, std))
         return RebuiltTRVs(*(th.stack(x) for x in zip(*steps, strict=True)))

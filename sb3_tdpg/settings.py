@@ -46,7 +46,7 @@ class Defaults(NamedTuple):
     total_epochs: int  # policy epochs
     baseline: str = "regression"
     bptt_steps: int | None = None
-    gamma: float = 1.0
+    gamma: float | None = 1.0  # None: by the horizon
     gae_lambda: float = 0.95
     max_grad_norm: float = float("inf")
 
@@ -103,8 +103,7 @@ LONG = Defaults(
     total_epochs=100,
     baseline="value",
     bptt_steps=5,
-    gamma=0.97,
-    gae_lambda=0.9,
+    gamma=None,
     max_grad_norm=0.5,
 )
 DEFAULTS = dict(vector=VECTOR, image=IMAGE, depth=DEPTH, long=LONG)
@@ -122,6 +121,7 @@ class PolicyDefaults(NamedTuple):
     action_log_var_init: float
     features_extractor_class: type[BaseFeaturesExtractor]
     features_extractor_kwargs: dict[str, Any]
+    encoder_var_floor: float = 1e-3
     is_long: bool = False
 
 
@@ -129,8 +129,11 @@ class PolicyDefaults(NamedTuple):
 POLICY_DEFAULTS = dict(
     vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
     image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, {}),
-    # As many TRVs more than features.
-    long=PolicyDefaults(16, (64, 64), (64, 64), nn.Tanh, nn.Tanh, -6.0, -1.5, FlattenExtractor, {}, is_long=True),
+    # The number of TRVs beside those that keep the observation. These are nearly free of noise at the start: a velocity
+    # is a small difference of them.
+    long=PolicyDefaults(
+        16, (64, 64), (64, 64), nn.Tanh, nn.Tanh, -10.0, -1.5, FlattenExtractor, {}, 1e-5, is_long=True
+    ),
     depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
 )
 
@@ -146,7 +149,14 @@ def preset_of(observation_space: spaces.Space | None, horizon: int | None) -> st
     return "long" if kind == "vector" and horizon is not None and horizon >= LONG_HORIZON else kind
 
 
-def fill_in(given: Mapping[str, Any], preset: str, cost_limit: float | None, n_envs: int) -> dict[str, Any]:
+def discount_of(horizon: int) -> float:
+    """Return the default discount of a long horizon T: it looks ahead for an eighth of it, and 10 to 200 steps."""
+    return min(max(1 - 8 / horizon, 0.9), 0.995)
+
+
+def fill_in(
+    given: Mapping[str, Any], preset: str, cost_limit: float | None, n_envs: int, horizon: int
+) -> dict[str, Any]:
     """
     Replace ``None`` by the defaults.
 
@@ -154,9 +164,12 @@ def fill_in(given: Mapping[str, Any], preset: str, cost_limit: float | None, n_e
     :param preset: See :func:`preset_of`.
     :param cost_limit: With a limit the default of beta is "auto".
     :param n_envs: Number of environments, whose multiple the default of ``n_episodes`` is.
+    :param horizon: T, which the default of ``gamma`` depends on.
     """
     defaults = DEFAULTS[preset]
     settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
+    if settings["gamma"] is None:
+        settings["gamma"] = discount_of(horizon)
     if given["beta"] is None and cost_limit is not None:
         settings["beta"] = "auto"
     for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):

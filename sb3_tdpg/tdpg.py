@@ -26,7 +26,7 @@ from sb3_tdpg.common.threads import threads
 from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import horizon_of, reward_threshold
+from sb3_tdpg.problem import Problem, horizon_of, reward_threshold
 from sb3_tdpg.settings import (
     DEFAULTS,
     Defaults,
@@ -98,9 +98,9 @@ class TDPG(EpisodicAlgorithm):
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping. Default: inf, 0.2, 0.2.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning. Default: no, yes, yes.
-    :param gamma: Discount factor; the paper has none. Default: 1, 1, 0.97.
+    :param gamma: Discount factor; the paper has none. Default: 1, 1, and 1 - 8 / T between 0.9 and 0.995.
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
-        the next state; unused with ``baseline="mean"``. Default: 0.95, 0.95, 0.9.
+        the next state; unused with ``baseline="mean"``. Default: 0.95.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping; default: inf, inf, 0.5.
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
@@ -116,6 +116,7 @@ class TDPG(EpisodicAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TRVPolicy": TRVPolicy}
+    values_see_changes = False
 
     def __init__(
         self,
@@ -166,8 +167,9 @@ class TDPG(EpisodicAlgorithm):
             check_action_space(env.action_space)
         # A model that is being loaded has its preset from the file; those of early versions have none.
         is_new = env is not None and _init_setup_model
-        self.preset = preset_of(env.observation_space, horizon_of(env)) if env is not None and is_new else None
-        settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1))
+        horizon = None if env is None else horizon_of(env)
+        self.preset = preset_of(env.observation_space, horizon) if env is not None and is_new else None
+        settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1), horizon or 1)
         self._has_default_batch_size = batch_size is None
         # The defaults of the paper's problems, and models of early versions, count episodes always.
         self._counts_episodes = not is_new or (batch_size is None and self.preset != "long")
@@ -253,7 +255,10 @@ class TDPG(EpisodicAlgorithm):
             self.batch_size = min(self.batch_size, size)  # a default must fit any number of episodes
         check_batch_size(vars(self), size, unit)
         if self.baseline == "value":
-            self.value_function = ValueFunction(self.state_dim, self.horizon).to(self.device)
+            if self.env is not None:
+                self.values_see_changes = cast(Problem, self._problem).state_is_observation
+            value_function = ValueFunction(self.state_dim, self.horizon, with_changes=self.values_see_changes)
+            self.value_function = value_function.to(self.device)
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         n_critics = 1 if self.pools_information else self.horizon
@@ -282,7 +287,7 @@ class TDPG(EpisodicAlgorithm):
             if self.verbose >= 1:
                 print(f"Minimising the information under cost_limit={self.cost_limit:g}{self._limit_origin}")
         if self.auto_weight is None or self.auto_weight.cost_limit != self.cost_limit:
-            self.auto_weight = AutoWeight(self.cost_limit)
+            self.auto_weight = AutoWeight(self.cost_limit, by_slack=self.preset == "long")
 
     @property
     def mi_coef(self) -> float:
@@ -366,8 +371,7 @@ class TDPG(EpisodicAlgorithm):
                 self.logger.record_mean("train/loss", loss.item())
                 self.logger.record_mean("train/grad_norm", grad_norm.item())
         # Last: the rollouts and all of their gradients saw the same inputs.
-        if self.policy.norm is not None:
-            self.policy.norm.update(whole.observations, whole.alive)
+        self.policy.update_statistics(whole)
 
         self.epoch += 1
         self._n_updates += self.n_epochs

@@ -15,9 +15,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import TDPG, InformationCallback
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
-from sb3_tdpg.features import RunningNorm
+from sb3_tdpg.features import Changes, RunningNorm
 from sb3_tdpg.information import LogDet, get_estimator_class
-from sb3_tdpg.settings import DEFAULTS, preset_of
+from sb3_tdpg.settings import DEFAULTS, discount_of, preset_of
 
 OLD_MODEL = Path(__file__).parent / "data" / "cartpole_before_segments.zip"
 
@@ -92,6 +92,14 @@ def test_any_number_of_environments_fits_the_defaults(n_envs):
 def test_a_training_shorter_than_an_epoch_warns_with_the_number_to_change():
     with pytest.warns(UserWarning, match=r"learn\(50\) makes a single update.*400 steps.*total_timesteps=20000"):
         tiny().learn(50)
+
+
+def test_a_time_limit_inside_the_function_behind_an_id_is_found():
+    gym.register("HiddenLimit-v0", lambda: gym.wrappers.TimeLimit(gym.make("Pendulum-v1").unwrapped, 70))
+    try:
+        assert TDPG("TRVPolicy", "HiddenLimit-v0").horizon == 70
+    finally:
+        del gym.registry["HiddenLimit-v0"]
 
 
 # -- segments --------------------------------------------------------------------------------------------------
@@ -223,17 +231,74 @@ def test_every_estimator_penalises_pooled_steps(mi_estimator):
 # -- the policy ------------------------------------------------------------------------------------------------
 
 
-def test_the_observation_is_in_the_first_trvs_from_the_start():
+def test_the_observation_and_its_change_are_in_the_first_trvs_from_the_start():
     policy = tiny("Pendulum-v1").policy
-    observation = th.tensor([[0.3, -0.9, 0.2]])
-    means = [
-        policy.encoder_density(x, th.zeros(1, policy.trv_dim), np.zeros(1, int))[0]
-        for x in (observation, 2 * observation)
-    ]
-    # The encoder's own output changes, too, but by less.
-    np.testing.assert_allclose((means[1] - means[0])[0, :3].detach(), observation[0], atol=0.35)
-    with pytest.raises(ValueError, match=r"skip=True adds the 3 features.*trv_dim=2.*trv_dim=3 or more"):
-        tiny("Pendulum-v1", policy_kwargs=dict(trv_dim=2, skip=True))
+    policy.changes.share.copy_(th.tensor([1.0, 0.5, 0.0]))
+    policy.changes.norm.var.copy_(th.tensor([0.04, 0.04, 0.04]))
+    with th.no_grad():
+        for parameter in policy.encoder.parameters():  # all that is left is what skips the encoder
+            parameter.zero_()
+    shown, before = th.tensor([[0.3, -0.9, 0.2]]), th.zeros(1, policy.trv_dim)
+    before[0, :3] = th.tensor([0.2, -0.8, 0.5])
+    mean, _ = policy.encoder_density(shown, before, np.zeros(1, int))
+    mean = mean.detach()
+    np.testing.assert_allclose(mean[0, :3], shown[0], rtol=1e-6)
+    np.testing.assert_allclose(mean[0, 3:6], [0.1 / 0.2, 0.5 * -0.1 / 0.2, 0.0], rtol=1e-4, atol=1e-6)
+    assert not mean[0, 6:].any()
+
+
+def test_what_skips_the_encoder_needs_as_many_trvs():
+    with pytest.raises(ValueError, match=r"skip=True and skip_changes=True add 6 features.*trv_dim=4.*trv_dim=6 or"):
+        tiny("Pendulum-v1", policy_kwargs=dict(trv_dim=4, skip_changes=True))
+    for trv_dim, skip, skip_changes in ((2, False, False), (5, True, False), (6, True, True)):
+        policy = tiny("Pendulum-v1", policy_kwargs=dict(trv_dim=trv_dim)).policy
+        assert (policy.skip, policy.skip_changes) == (skip, skip_changes)
+    with pytest.raises(ValueError, match="skip_changes=True needs skip=True"):
+        tiny("Pendulum-v1", policy_kwargs=dict(skip=False, skip_changes=True))
+
+
+@pytest.mark.parametrize("shows_velocity", [True, False])
+def test_changes_count_where_they_say_what_the_observation_does_not(shows_velocity):
+    """A mass on a spring, pushed at random: its last displacement tells the next one unless its velocity is seen."""
+    generator = np.random.default_rng(0)
+    state, seen = generator.normal(size=(40, 2)), []
+    for _ in range(50):
+        seen.append(state if shows_velocity else state[:, :1])
+        push = 0.05 * generator.normal(size=40)
+        velocity = state[:, 1] - 0.1 * state[:, 0] + push
+        state = np.stack([state[:, 0] + 0.3 * velocity, velocity], axis=1)
+    x = th.as_tensor(np.array(seen), dtype=th.float32)
+    changes = Changes(x.shape[-1])
+    changes.update(x, th.ones(50, 40))
+    assert changes.share[0] < 0.05 if shows_velocity else changes.share[0] > 0.8
+    after_the_end = x.clone()
+    after_the_end[25:] = th.randn_like(x[25:])
+    shorter, alive = Changes(x.shape[-1]), th.zeros(50, 40)
+    alive[:25] = 1
+    shorter.update(after_the_end, alive)
+    alone = Changes(x.shape[-1])
+    alone.update(x[:25], th.ones(25, 40))
+    np.testing.assert_allclose(shorter.share, alone.share)
+    np.testing.assert_allclose(shorter.norm.var, alone.norm.var)
+
+
+def test_too_few_steps_do_not_turn_the_changes_on():
+    changes = Changes(30)
+    changes.update(th.randn(20, 4, 30), th.ones(20, 4))
+    changes.update(th.randn(20, 4, 30), th.zeros(20, 4))
+    assert not changes.share.any()
+
+
+def test_the_value_network_sees_changes_where_observations_stand_in_for_the_state():
+    shown = spaces.Box(-1, 1, (2,), np.float32)
+    partial = tiny(
+        DummyVecEnv([lambda: gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda y: y[:2], shown)])
+    )
+    with_state = TDPG("TRVPolicy", DummyVecEnv([lambda: CountdownEnv(0, [4, 2, 1])]), baseline="value")
+    assert with_state.value_function.changes is None
+    partial.learn(1000)
+    for changes in (partial.value_function.changes, partial.policy.changes):
+        assert (changes.share > 0.5).all()
 
 
 def test_the_noise_of_the_actions_is_a_share_of_their_range():
@@ -325,12 +390,18 @@ def test_a_dict_of_vectors_is_its_own_state_and_one_with_an_image_is_not():
 # -- words -----------------------------------------------------------------------------------------------------
 
 
+def test_the_default_discount_looks_ahead_for_a_share_of_the_horizon():
+    assert [discount_of(horizon) for horizon in (50, 200, 500, 1000, 27_000)] == [0.9, 0.96, 0.984, 0.992, 0.995]
+    assert tiny("Pendulum-v1").gamma == 0.96
+    assert tiny("Pendulum-v1", gamma=0.8).gamma == 0.8
+
+
 def test_the_kind_of_problem_decides_the_defaults():
     vector, image = spaces.Box(-1, 1, (3,)), spaces.Box(0, 255, (3, 64, 64), np.uint8)
     assert [preset_of(vector, t) for t in (None, 49, 50)] == ["vector", "vector", "long"]
     assert preset_of(image, 1000) == "image"
     model = TDPG("TRVPolicy", "Pendulum-v1")
-    for name in ("epoch_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "baseline", "bptt_steps"):
+    for name in ("epoch_steps", "batch_size", "n_epochs", "gae_lambda", "baseline", "bptt_steps"):
         assert getattr(model, name) == getattr(DEFAULTS["long"], name), name
     assert model.beta == math.inf
 

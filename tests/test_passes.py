@@ -138,6 +138,18 @@ def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
     assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
 
 
+def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_one():
+    for limit, best, above in ((-475.0, -500.0, -450.0), (-200.0, -500.0, 100.0)):
+        weight = AutoWeight(cost_limit=limit, by_slack=True)
+        weight.update(cost=best, information=4.0)
+        start = weight.value
+        assert start * 4.0 == pytest.approx(limit - best)
+        weight.update(cost=best, information=4.0)
+        assert weight.value == pytest.approx(start * math.exp(0.3))
+        weight.update(cost=above, information=4.0)
+        assert weight.value == pytest.approx(start)
+
+
 def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
     weight = AutoWeight(cost_limit=10.0)
     for _ in range(500):

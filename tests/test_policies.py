@@ -317,9 +317,10 @@ def test_the_kind_of_an_observation_is_that_of_its_space(space, kind):
 def test_the_log_variance_of_the_trvs_may_be_squashed_as_in_the_paper():
     parameters = th.tensor([[0.0, 0.0, 50.0, -50.0]])
     policy = make_policy(trv_dim=2, squash_trv_log_var=True, encoder_var_floor=0.0)
-    _, std = policy._encoder_density(parameters, th.zeros(1, 3))
+    _, std = policy._encoder_density(parameters, th.zeros(1, 3), th.zeros(1, 2))
     assert std.tolist()[0] == pytest.approx([np.exp(0.5), np.exp(-0.5)], rel=0.03)
-    _, std = make_policy(trv_dim=2, encoder_var_floor=0.0)._encoder_density(parameters, th.zeros(1, 3))
+    policy = make_policy(trv_dim=2, encoder_var_floor=0.0)
+    _, std = policy._encoder_density(parameters, th.zeros(1, 3), th.zeros(1, 2))
     assert std[0, 1] < 1e-6
 
 

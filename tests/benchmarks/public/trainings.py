@@ -20,15 +20,21 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
+from sb3_tdpg import TDPG
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, jsonable, write_frame_atomically, write_run_config
 from sb3_tdpg.experiments.training import make_training
+from sb3_tdpg.information import LogDet
 from tests.benchmarks.public.tasks import PublicTask
 
 N_EVAL_EPISODES = 100  # of each mode, deterministic and stochastic
 N_EVAL_ENVS = 10
 EVAL_SEED = 10_000  # its environments are seeded alike for all methods
 N_CURVE_POINTS = 50
+
+LABEL = ["env_id", "method", "train_seed"]
+PRESET, TUNED, LIMIT = "TDPG, one preset", "TDPG, tuned", "TDPG, cost limit"
+"""Methods: without any setting, with the block of ``hyperparams/tdpg.yml``, with a limit of 95 % of the return."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +58,14 @@ class Training:
         return {**asdict(self), "settings": settings, "n_eval_episodes": N_EVAL_EPISODES}
 
     @property
+    def label(self) -> tuple[str, str, int]:
+        """The values of the columns ``LABEL`` in all records."""
+        return self.task.env_id, self.method, self.seed
+
+    @property
     def folder_name(self) -> str:
         """A name made from task, method and seed."""
-        return f"{self.task.env_id}/{self.method.replace(' ', '_')}/seed{self.seed}"
+        return f"{self.task.env_id}/{self.method.replace(', ', '-').replace(' ', '_')}/seed{self.seed}"
 
 
 class EpisodeLog(BaseCallback):
@@ -85,6 +96,7 @@ def complete_training(training: Training, root: Path) -> Path:
     log, start = EpisodeLog(), time.perf_counter()
     model, cpu_s = train_ours(training, log) if training.settings is not None else train_rival(training, log, folder)
     record = dict(cpu_s=cpu_s, wall_s=time.perf_counter() - start, timesteps=model.num_timesteps)
+    record["nats"] = nats_per_step(model) if isinstance(model, TDPG) else None
     write_atomically(folder / "time.json", json.dumps(jsonable(record)))
     model.save(folder / "model.zip")
     write_frame_atomically(log.frame(), folder / "training.csv")
@@ -131,6 +143,12 @@ def train_rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[Base
     return model, time.process_time() - start
 
 
+def nats_per_step(model: TDPG) -> float:
+    """Measure the information that the TRVs have about the state in the last rollouts: the log-det bound."""
+    batch = model.rollout_buffer.episode_batch(whole_horizon=False).information_batch(pooled=True)
+    return float(LogDet(1, model.state_dim, model.policy.trv_dim)(batch).sum())
+
+
 def evaluate(training: Training, model: BaseAlgorithm) -> pd.DataFrame:
     """Return the returns of evaluation episodes, with and without noise in the policy: one row for each."""
     env = make_vec_env(training.task.env_id, n_envs=N_EVAL_ENVS)
@@ -144,8 +162,7 @@ def evaluate(training: Training, model: BaseAlgorithm) -> pd.DataFrame:
         returns, lengths = evaluate_policy(model, env, N_EVAL_EPISODES, deterministic, return_episode_rewards=True)
         frames.append(pd.DataFrame({"episode": range(len(returns)), "return": returns, "length": lengths}))
         frames[-1]["deterministic"] = deterministic
-    labels = dict(env_id=training.task.env_id, method=training.method, train_seed=training.seed)
-    return pd.concat(frames, ignore_index=True).assign(**labels)
+    return pd.concat(frames, ignore_index=True).assign(**dict(zip(LABEL, training.label, strict=True)))
 
 
 def learning_curve(folder: Path, n_timesteps: int) -> pd.DataFrame:

@@ -1,0 +1,103 @@
+"""The benchmark on public tasks: what it trains, how it goes on, and what its tables say."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+
+pytest.importorskip("popgym")
+pytest.importorskip("mujoco")
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("rliable")
+
+from tests.benchmarks.public import trainings
+from tests.benchmarks.public.page import Records, published_labels
+from tests.benchmarks.public.run import make_trainings
+from tests.benchmarks.public.tasks import TASKS
+from tests.benchmarks.public.trainings import LABEL, PRESET, Training, complete_training
+
+CARTPOLE = TASKS[0]
+
+
+@pytest.fixture(autouse=True)
+def _few_episodes(monkeypatch):
+    monkeypatch.setattr(trainings, "N_EVAL_EPISODES", 3)
+    monkeypatch.setattr(trainings, "N_EVAL_ENVS", 3)
+
+
+def trained(root, method=PRESET, seed=200):
+    task = dataclasses.replace(CARTPOLE, n_timesteps=400)
+    settings = None if method == "PPO" else dict(epoch_steps=200, batch_size=100, n_epochs=1)
+    training = Training(task, method, seed, settings)
+    return training, complete_training(training, root)
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.env_id)
+def test_every_task_declares_its_horizon_and_has_settings_of_the_zoo(task):
+    env = gym.make(task.env_id)
+    assert env.get_wrapper_attr("_max_episode_steps") >= 50
+    assert task.zoo_block()["policy"] == ("MlpLstmPolicy" if task.hidden else "MlpPolicy")
+
+
+def test_hopper_without_velocities_shows_the_positions_only():
+    hidden, full = gym.make("HopperNoVel-v5"), gym.make("Hopper-v5")
+    shown, everything = hidden.reset(seed=3)[0], full.reset(seed=3)[0]
+    np.testing.assert_array_equal(shown, everything[:5])
+    assert hidden.observation_space.contains(shown)
+    assert full.unwrapped.model.nq - 1 == 5  # all but the position along the track
+
+
+@pytest.mark.parametrize("method", [PRESET, "PPO"])
+def test_a_finished_training_is_kept_and_has_all_records(method, tmp_path):
+    training, folder = trained(tmp_path, method)
+    records = Records([training], tmp_path)
+    assert set(records.times[LABEL].itertuples(index=False, name=None)) == {training.label}
+    assert records.times["timesteps"][0] >= 400
+    assert records.times["nats"].notna()[0] == (method == PRESET)
+    assert records.episodes.groupby("deterministic").size().to_dict() == {True: 3, False: 3}
+    assert records.curves["return"].between(1, 500).all()
+    before = (folder / "time.json").read_text()
+    assert trained(tmp_path, method)[1] == folder
+    assert (folder / "time.json").read_text() == before
+    with pytest.raises(ValueError, match="other settings"):
+        complete_training(dataclasses.replace(training, settings=dict(epoch_steps=300)), tmp_path)
+
+
+def test_published_records_take_the_place_of_trainings(tmp_path):
+    first, _ = trained(tmp_path, "PPO")
+    Records([first], tmp_path).write(tmp_path / "published", "make")
+    assert not (tmp_path / "published" / "summary.md").exists()  # there is nothing to compare yet
+    labels = published_labels(tmp_path / "published", ["PPO"])
+    assert labels == {first.label}
+    assert published_labels(tmp_path / "published", ["RecurrentPPO"]) == set()
+    second, _ = trained(tmp_path)
+    records = Records([second], tmp_path)
+    records.add_published(tmp_path / "published", labels)
+    for table in (records.episodes, records.times, records.curves):
+        assert set(table["method"]) == {PRESET, "PPO"}
+
+
+def test_a_return_is_judged_by_the_interval_of_the_rival(tmp_path):
+    training, _ = trained(tmp_path)
+    records = Records([training], tmp_path)
+    verdicts = {}
+    for ours in (10.0, 100.0, 300.0):
+        rows = [
+            dict(env_id="CartPole-v1", method=method, train_seed=seed, deterministic=True, **{"return": value})
+            for method, values in (("PPO", (80.0, 90.0, 100.0, 110.0, 120.0)), (PRESET, (ours,) * 5))
+            for seed, value in enumerate(values)
+        ]
+        records.episodes = pd.DataFrame(rows)
+        table = records.returns_table(deterministic=True)
+        verdicts[ours] = next(word for word in ("below", "within", "above") if word in table)
+    assert verdicts == {10.0: "below", 100.0: "within", 300.0: "above"}
+
+
+def test_trainings_have_the_final_seeds_and_the_rivals_the_same():
+    listed = make_trainings([200, 201])
+    assert len({training.folder_name for training in listed}) == len(listed)
+    for task in TASKS:
+        methods = [t.method for t in listed if t.task == task and t.seed == 201]
+        assert {PRESET, task.rival} <= set(methods)
