@@ -110,7 +110,7 @@ class ValueFunction(nn.Module):
         hidden_sizes: Sequence[int] = (64, 64),
         learning_rate: float = 1e-3,
         n_epochs: int = 10,
-        batch_size: int = 256,
+        batch_size: int = 64,
         with_changes: bool = False,
     ) -> None:
         super().__init__()
@@ -127,6 +127,31 @@ class ValueFunction(nn.Module):
 
     offset: th.Tensor
     scale: th.Tensor
+    explained = math.nan
+    """Share of the variance of the last targets that the values explained before the network was fitted to them."""
+
+    def advantages(
+        self, costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
+    ) -> th.Tensor:
+        """
+        Fit the network to an epoch, and estimate its advantages (GAE) with the new values.
+
+        Values of the last epoch would be those of another policy. The new ones have seen the costs that they are
+        compared with, but a thousand steps are too many for so small a network to remember.
+
+        :param costs: ``(T, N)``
+        :param states: x_t, ``(T, N, X)``
+        :param alive: ``(T, N)``
+        :param gamma: discount
+        :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
+        :return: ``(T, N)``
+        """
+        with th.no_grad():
+            values = alive * self(states, gamma)
+            targets = generalised_advantages(costs, values, gamma, gae_lambda) + values
+        self.explained = self.fit(states, targets, alive, gamma)
+        with th.no_grad():
+            return generalised_advantages(costs, alive * self(states, gamma), gamma, gae_lambda)
 
     def forward(self, states: th.Tensor, gamma: float) -> th.Tensor:
         """
@@ -144,7 +169,7 @@ class ValueFunction(nn.Module):
         states = self.norm(states)
         inputs = [states, share[:, None, None].expand(*states.shape[:2], 1)]
         if self.changes is not None:
-            inputs.append(self.changes(states, th.cat([th.zeros_like(states[:1]), states[:-1]])))
+            inputs.append(self.changes(states, th.cat([states[:1], states[:-1]])))
         return th.cat(inputs, dim=-1)
 
     def fit(self, states: th.Tensor, targets: th.Tensor, alive: th.Tensor, gamma: float) -> float:
@@ -165,7 +190,7 @@ class ValueFunction(nn.Module):
             if self.changes is not None:
                 self.changes.update(self.norm(states), alive)
             self._rescale(y)
-        x, z = self._inputs(states, gamma)[living], (y - self.offset) / self.scale
+            x, z = self._inputs(states, gamma)[living], (y - self.offset) / self.scale
         for _ in range(self.n_epochs):
             for part in th.randperm(len(x), device=x.device).split(self.batch_size):
                 loss = (self.network(x[part])[:, 0] - z[part]).square().mean()
@@ -247,7 +272,7 @@ def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENT
 BASELINES: dict[str, AdvantageFunction | None] = {
     "mean": episode_mean_advantages,
     "regression": regression_advantages,
-    "value": None,  # a ValueFunction, which the algorithm keeps
+    "value": None,  # that of a ValueFunction, which the algorithm keeps
 }
 
 

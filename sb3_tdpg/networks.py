@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch as th
 from torch import nn
 
@@ -136,3 +137,11 @@ class TimeMLP(nn.Module):
     def at(self, x: th.Tensor, t: int) -> th.Tensor:
         """One step, the same for all episodes: ``(N, I) -> (N, O)``."""
         return self.mlp.at(x, t if self.time_varying else 0)
+
+    def at_times(self, x: th.Tensor, t: np.ndarray) -> th.Tensor:
+        """Each episode at a step of its own: ``(N, I)`` and ``(N,) -> (N, O)``."""
+        if not self.time_varying or (t == t[0]).all():
+            return self.at(x, int(t[0]))
+        rows = [np.flatnonzero(t == step) for step in np.unique(t)]
+        outputs = [self.at(x[r], int(t[r[0]])) for r in rows]
+        return th.cat(outputs)[np.argsort(np.concatenate(rows))]

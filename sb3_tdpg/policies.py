@@ -7,8 +7,6 @@ Dimension key: T horizon, N episodes or environments, Z TRVs, U action, F featur
 from __future__ import annotations
 
 import math
-
-# Standard deviations of at most 7.4 for a TRV and 55 for an action.
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -26,8 +24,9 @@ from torch.nn import functional as F
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
 from sb3_tdpg.features import Changes, ObservationNorm, flat_action_space, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
-from sb3_tdpg.settings import POLICY_DEFAULTS, check_net_arch
+from sb3_tdpg.settings import POLICY_DEFAULTS, check_count, check_floors, check_net_arch, default, fill_in_trvs
 
+# Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
 
@@ -65,6 +64,8 @@ class TRVPolicy(BasePolicy):
         were seen in training, as by SB3's ``VecNormalize``; default: no, no, no, yes.
     :param scale_actions: Whether the head's outputs are in units of the bounds of the action space: 0 is their middle,
         1 the upper one, and a standard deviation of 1 half of their distance; default: no, no, no, yes.
+    :param shared_action_noise: Whether the variance of each action is one parameter, as in SB3's PPO, instead of an
+        output of the head, which depends on the TRVs (Box actions); default: no, no, no, yes.
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
         Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen. Default: yes,
         yes, yes, no.
@@ -72,7 +73,7 @@ class TRVPolicy(BasePolicy):
         added, as in the paper's policies for images. The standard deviation is then at least 0.6, which hurts.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3,
         -10.
-    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -1.5.
+    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -2.
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above; default:
         1e-3, 1e-3, 1e-3, 1e-5.
     :param action_var_floor: Smallest variance of an action, likewise.
@@ -106,6 +107,7 @@ class TRVPolicy(BasePolicy):
         skip_changes: bool | None = None,
         normalize_observations: bool | None = None,
         scale_actions: bool | None = None,
+        shared_action_noise: bool | None = None,
         squash_trv_mean: bool | None = None,
         squash_trv_log_var: bool = False,
         encoder_log_var_init: float | None = None,
@@ -118,8 +120,9 @@ class TRVPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        kind = observation_kind(observation_space, normalize_images=normalize_images)
-        defaults = POLICY_DEFAULTS[kind if preset is None else preset]
+        check_count("horizon", horizon)
+        check_floors(encoder_var_floor=encoder_var_floor, action_var_floor=action_var_floor)
+        defaults = POLICY_DEFAULTS[preset or observation_kind(observation_space, normalize_images=normalize_images)]
         if features_extractor_class is None and isinstance(observation_space, spaces.Dict):
             features_extractor_class = CombinedExtractor
         elif features_extractor_class is None:
@@ -137,17 +140,16 @@ class TRVPolicy(BasePolicy):
         )
         self.horizon = horizon
         self.preset = preset
-        self.time_varying = (
-            horizon <= MAX_TIME_VARYING_HORIZON and preset != "long" if time_varying is None else time_varying
-        )
-        self.normalize_observations = _default(normalize_observations, defaults.is_long)
-        self.scale_actions = _default(scale_actions, defaults.is_long)
-        self.squash_trv_mean = _default(squash_trv_mean, not defaults.is_long)
+        self.time_varying = default(time_varying, horizon <= MAX_TIME_VARYING_HORIZON and preset != "long")
+        self.normalize_observations = default(normalize_observations, defaults.is_long)
+        self.scale_actions = default(scale_actions, defaults.is_long)
+        self.shared_action_noise = default(shared_action_noise, defaults.is_long)
+        self.squash_trv_mean = default(squash_trv_mean, not defaults.is_long)
         self.squash_trv_log_var = squash_trv_log_var
         self.activation_fn = activation_fn
-        self.encoder_log_var_init = _default(encoder_log_var_init, defaults.encoder_log_var_init)
-        self.action_log_var_init = _default(action_log_var_init, defaults.action_log_var_init)
-        self.encoder_var_floor = encoder_var_floor = _default(encoder_var_floor, defaults.encoder_var_floor)
+        self.encoder_log_var_init = default(encoder_log_var_init, defaults.encoder_log_var_init)
+        self.action_log_var_init = default(action_log_var_init, defaults.action_log_var_init)
+        self.encoder_var_floor = default(encoder_var_floor, defaults.encoder_var_floor)
         self.action_var_floor = action_var_floor
         default_arch = dict(encoder=list(defaults.encoder), action_head=list(defaults.action_head))
         self.net_arch = check_net_arch(net_arch, default_arch)
@@ -155,26 +157,9 @@ class TRVPolicy(BasePolicy):
         self.norm = ObservationNorm(observation_space) if self.normalize_observations else None
         self.features_extractor = self.make_features_extractor()
         self.features_dim = self.features_extractor.features_dim
-        has_room = [trv_dim is None or trv_dim >= n * self.features_dim for n in (1, 2)]
-        self.skip = _default(skip, defaults.is_long and has_room[0])
-        self.skip_changes = _default(skip_changes, self.skip and defaults.is_long and has_room[1])
-        n_skipped = self.features_dim * (self.skip + self.skip_changes)
-        n_more = max(defaults.trv_dim, n_skipped - self.features_dim)
-        self.trv_dim = _default(trv_dim, self.features_dim + n_more if self.skip else defaults.trv_dim)
-        for name, value in (("horizon", horizon), ("policy_kwargs: trv_dim", self.trv_dim)):
-            if not (isinstance(value, (int, np.integer)) and value >= 1):
-                raise ValueError(f"{name}={value!r} must be an integer of at least 1")
-        for name, floor in (("encoder_var_floor", encoder_var_floor), ("action_var_floor", action_var_floor)):
-            if not floor >= 0:
-                raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
-
-        if self.skip_changes and not self.skip:
-            raise ValueError("policy_kwargs: skip_changes=True needs skip=True: changes are those of the kept features")
-        if n_skipped > self.trv_dim:
-            raise ValueError(
-                f"policy_kwargs: skip={self.skip} and skip_changes={self.skip_changes} add {n_skipped} features to as "
-                f"many TRVs, but trv_dim={self.trv_dim}: give trv_dim={n_skipped} or more, or turn them off"
-            )
+        self.trv_dim, self.skip, self.skip_changes = fill_in_trvs(
+            defaults, self.features_dim, trv_dim, skip, skip_changes
+        )
         self.changes = Changes(self.features_dim) if self.skip_changes else None
         self.action_dist = make_proba_distribution(flat_action_space(action_space))
         self.encoder = TimeMLP(
@@ -192,6 +177,8 @@ class TRVPolicy(BasePolicy):
         if defaults.is_long:  # begin near the middle of the actions, and with little else than the features in the TRVs
             self.encoder.scale_output(0.1)
             self.action_head.scale_output(0.1)
+        if self.shared_action_noise and isinstance(self.action_dist, DiagGaussianDistribution):
+            self.action_log_var = nn.Parameter(th.zeros(self.action_dist.action_dim))
         if self.scale_actions and isinstance(action_space, spaces.Box):
             bounds = th.as_tensor(np.stack([action_space.low, action_space.high]).reshape(2, -1))
             self.register_buffer("action_middle", bounds.mean(0), persistent=False)
@@ -206,16 +193,17 @@ class TRVPolicy(BasePolicy):
         """Return the number of outputs of the action head."""
         distribution: Any = self.action_dist
         if isinstance(distribution, DiagGaussianDistribution):
-            return 2 * distribution.action_dim  # mean and log-variance
+            # The mean, and the log-variance where it depends on the TRVs.
+            return distribution.action_dim * (1 if self.shared_action_noise else 2)
         return int(np.sum(getattr(distribution, "action_dims", None) or distribution.action_dim))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         names = (
             "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip", "skip_changes",
-            "normalize_observations", "scale_actions", "squash_trv_mean", "squash_trv_log_var", "encoder_log_var_init",
-            "action_log_var_init", "encoder_var_floor", "action_var_floor", "features_extractor_class",
-            "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
+            "normalize_observations", "scale_actions", "shared_action_noise", "squash_trv_mean", "squash_trv_log_var",
+            "encoder_log_var_init", "action_log_var_init", "encoder_var_floor", "action_var_floor",
+            "features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
         )  # fmt: skip
         data.update({name: getattr(self, name) for name in names}, lr_schedule=self._dummy_schedule)
         return data
@@ -230,7 +218,10 @@ class TRVPolicy(BasePolicy):
         if self.skip:
             skipped = [features]
             if self.changes is not None:
-                skipped.append(self.changes(features, prev_trv[..., : self.features_dim]))
+                # A memory of zeros is the start of an episode: nothing has changed yet.
+                is_start = (prev_trv == 0).all(dim=-1, keepdim=True)
+                before = th.where(is_start, features, prev_trv[..., : self.features_dim])
+                skipped.append(self.changes(features, before))
             known = th.cat(skipped, dim=-1)
             mean = mean + F.pad(known, (0, self.trv_dim - known.shape[-1]))
         if self.squash_trv_mean:
@@ -243,9 +234,10 @@ class TRVPolicy(BasePolicy):
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
         """Return the distribution of the action from the head's outputs, ``(n, ...)`` with one batch dimension."""
         if isinstance(self.action_dist, DiagGaussianDistribution):
-            mean, log_var = parameters.chunk(2, dim=-1)
+            shared = self.shared_action_noise
+            mean, log_var = (parameters, self.action_log_var) if shared else parameters.chunk(2, dim=-1)
             variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
-            log_std = 0.5 * th.log(variance)
+            log_std = 0.5 * th.log(variance).expand_as(mean)
             if self.scale_actions:
                 mean = self.action_middle + self.action_range * mean
                 log_std = log_std + self.action_range.log()
@@ -286,7 +278,7 @@ class TRVPolicy(BasePolicy):
         :param t: time step of each episode, ``(N,)``
         """
         features = self._features(observation)
-        parameters = self._at_times(self.encoder, th.cat([prev_trv, features], dim=1), t)
+        parameters = self.encoder.at_times(th.cat([prev_trv, features], dim=1), t)
         return self._encoder_density(parameters, features, prev_trv)
 
     def _features(self, observation: PyTorchObs) -> th.Tensor:
@@ -302,16 +294,7 @@ class TRVPolicy(BasePolicy):
         :param trv: x~_t, ``(N, Z)``
         :param t: time step of each episode, ``(N,)``
         """
-        return self._action_distribution(self._at_times(self.action_head, trv, t))
-
-    @staticmethod
-    def _at_times(network: TimeMLP, inputs: th.Tensor, t: np.ndarray) -> th.Tensor:
-        """Evaluate a network on rows at different time steps: ``(N, I) -> (N, O)``."""
-        if not network.time_varying or (t == t[0]).all():
-            return network.at(inputs, int(t[0]))
-        rows = [np.flatnonzero(t == step) for step in np.unique(t)]
-        outputs = [network.at(inputs[r], int(t[r[0]])) for r in rows]
-        return th.cat(outputs)[np.argsort(np.concatenate(rows))]
+        return self._action_distribution(self.action_head.at_times(trv, t))
 
     def update_statistics(self, batch: EpisodeBatch) -> None:
         """Include an epoch in the statistics that standardise observations and changes, if there are any."""
@@ -397,11 +380,7 @@ class TRVPolicy(BasePolicy):
 
     # -- the interface of SB3 ---------------------------------------------------------------------------------
 
-    def forward(
-        self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray, deterministic: bool = False
-    ) -> PolicyStep:
-        """See :meth:`step`."""
-        return self.step(observation, prev_trv, t, deterministic)
+    forward = step
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         raise NotImplementedError("the policy is recurrent: use predict() with its state")
@@ -469,7 +448,3 @@ class TRVPolicy(BasePolicy):
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
         return (actions if is_vectorized else actions.squeeze(axis=0)), (step.trvs.cpu().numpy(), t + 1)
-
-
-def _default(value: Any, default: Any) -> Any:
-    return default if value is None else value

@@ -83,7 +83,8 @@ def read_problem(env: VecEnv) -> Problem:
             "attribute `horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
     state_space = _attribute(env, "state_space")
-    is_observation = state_space is None
+    # POPGym's environments, which have this attribute, describe their state, too, but do not report it.
+    is_observation = state_space is None or env.has_attr("observability_level")
     if is_observation and observation_kind(env.observation_space) != "vector":
         raise ValueError(
             f"the mutual information needs the true state, and an image ({env.observation_space}) cannot stand in for "

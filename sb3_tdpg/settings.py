@@ -132,7 +132,7 @@ POLICY_DEFAULTS = dict(
     # The number of TRVs beside those that keep the observation. These are nearly free of noise at the start: a velocity
     # is a small difference of them.
     long=PolicyDefaults(
-        16, (64, 64), (64, 64), nn.Tanh, nn.Tanh, -10.0, -1.5, FlattenExtractor, {}, 1e-5, is_long=True
+        16, (64, 64), (64, 64), nn.Tanh, nn.Tanh, -10.0, -2.0, FlattenExtractor, {}, 1e-5, is_long=True
     ),
     depth=PolicyDefaults(16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(kernel_sizes=(6, 4))),
 )
@@ -376,6 +376,45 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
         return make(**kwargs)
     except TypeError as e:
         raise ValueError(f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}: {e}") from e
+
+
+def default(value: Any, otherwise: Any) -> Any:
+    """Return the value of an argument, or its default if there is none."""
+    return otherwise if value is None else value
+
+
+def fill_in_trvs(
+    defaults: PolicyDefaults, n_features: int, trv_dim: int | None, skip: bool | None, skip_changes: bool | None
+) -> tuple[int, bool, bool]:
+    """
+    Return ``trv_dim``, ``skip`` and ``skip_changes`` with their defaults.
+
+    :param defaults: Those of the preset.
+    :param n_features: Number of features of an observation.
+    :raises ValueError: if there are too few TRVs for what is to be added to them.
+    """
+    if trv_dim is not None:
+        check_count("policy_kwargs: trv_dim", trv_dim)
+    room = default(trv_dim, math.inf)
+    skip = default(skip, defaults.is_long and room >= n_features)
+    skip_changes = default(skip_changes, skip and defaults.is_long and room >= 2 * n_features)
+    if skip_changes and not skip:
+        raise ValueError("policy_kwargs: skip_changes=True needs skip=True: changes are those of the kept features")
+    n_skipped = n_features * (skip + skip_changes)
+    trv_dim = default(trv_dim, max(n_features + defaults.trv_dim, n_skipped) if skip else defaults.trv_dim)
+    if n_skipped > trv_dim:
+        raise ValueError(
+            f"policy_kwargs: skip={skip} and skip_changes={skip_changes} add {n_skipped} features to as many TRVs, but "
+            f"trv_dim={trv_dim}: give trv_dim={n_skipped} or more, or turn them off"
+        )
+    return trv_dim, skip, skip_changes
+
+
+def check_floors(**floors: float | None) -> None:
+    """Raise a ``ValueError`` if a smallest variance is negative."""
+    for name, floor in floors.items():
+        if floor is not None and not floor >= 0:
+            raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
 
 
 def check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:

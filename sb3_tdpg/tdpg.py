@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_tdpg import losses
-from sb3_tdpg.advantages import ValueFunction, generalised_advantages, get_baseline
+from sb3_tdpg.advantages import ValueFunction, get_baseline
 from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer, RebuiltTRVs
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
@@ -383,16 +383,11 @@ class TDPG(EpisodicAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _advantages(self, batch: EpisodeBatch) -> th.Tensor:
-        """Compute the advantages, ``(T, N)``; a value network is fitted to the rollouts afterwards."""
-        baseline = get_baseline(self.baseline)
-        if baseline is not None:
-            return baseline(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
-        assert self.value_function is not None
-        with th.no_grad():
-            values = batch.alive * self.value_function(batch.states, self.gamma)
-        advantages = generalised_advantages(batch.costs, values, self.gamma, self.gae_lambda)
-        explained = self.value_function.fit(batch.states, advantages + values, batch.alive, self.gamma)
-        self.logger.record("train/explained_variance", explained)
+        """Compute the advantages, ``(T, N)``; a value network is fitted to the rollouts first."""
+        baseline = get_baseline(self.baseline) or cast(ValueFunction, self.value_function).advantages
+        advantages = baseline(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
+        if self.value_function is not None:
+            self.logger.record("train/explained_variance", self.value_function.explained)
         return advantages
 
     def _evaluate(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:

@@ -12,11 +12,12 @@ pytest.importorskip("mujoco")
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
+from sb3_tdpg import TDPG
 from tests.benchmarks.public import trainings
 from tests.benchmarks.public.page import Records, published_labels
 from tests.benchmarks.public.run import make_trainings
 from tests.benchmarks.public.tasks import TASKS
-from tests.benchmarks.public.trainings import LABEL, PRESET, Training, complete_training
+from tests.benchmarks.public.trainings import LABEL, LIMIT, PRESET, Training, complete_training, with_limit
 
 CARTPOLE = TASKS[0]
 
@@ -49,6 +50,12 @@ def test_hopper_without_velocities_shows_the_positions_only():
     assert full.unwrapped.model.nq - 1 == 5  # all but the position along the track
 
 
+def test_a_task_of_popgym_which_keeps_its_state_to_itself_can_be_trained_on():
+    model = TDPG("TRVPolicy", "RepeatPreviousEasy-v0", epoch_steps=200, batch_size=100, n_epochs=1, seed=0)
+    assert "state_space" in vars(gym.make("RepeatPreviousEasy-v0").unwrapped)
+    assert model.learn(200).state_dim == 1  # the observation
+
+
 @pytest.mark.parametrize("method", [PRESET, "PPO"])
 def test_a_finished_training_is_kept_and_has_all_records(method, tmp_path):
     training, folder = trained(tmp_path, method)
@@ -77,6 +84,9 @@ def test_published_records_take_the_place_of_trainings(tmp_path):
     records.add_published(tmp_path / "published", labels)
     for table in (records.episodes, records.times, records.curves):
         assert set(table["method"]) == {PRESET, "PPO"}
+    all_published = Records([], tmp_path)
+    all_published.add_published(tmp_path / "published", labels)
+    assert set(all_published.episodes["method"]) == {"PPO"}
 
 
 def test_a_return_is_judged_by_the_interval_of_the_rival(tmp_path):
@@ -93,6 +103,31 @@ def test_a_return_is_judged_by_the_interval_of_the_rival(tmp_path):
         table = records.returns_table(deterministic=True)
         verdicts[ours] = next(word for word in ("below", "within", "above") if word in table)
     assert verdicts == {10.0: "below", 100.0: "within", 300.0: "above"}
+
+
+@pytest.mark.parametrize(("reached", "limit"), [(480.0, -456.0), (-200.0, 210.0)])
+def test_the_limit_is_a_twentieth_below_what_the_seed_has_reached(reached, limit, tmp_path):
+    training = Training(CARTPOLE, PRESET, 200, {})
+    episodes = pd.DataFrame({"return": [reached - 1, reached + 1, 7.0], "deterministic": [False, False, True]})
+    (tmp_path / training.folder_name).mkdir(parents=True)
+    episodes.to_csv(tmp_path / training.folder_name / "episodes.csv")
+    limited = with_limit(training, tmp_path)
+    assert (limited.method, limited.seed, limited.settings) == (LIMIT, 200, dict(cost_limit=limit))
+
+
+def test_a_seed_keeps_a_share_of_its_own_return(tmp_path):
+    training, _ = trained(tmp_path)
+    records = Records([training], tmp_path)
+    rows = [
+        dict(env_id="CartPole-v1", method=method, train_seed=seed, deterministic=False, **{"return": value})
+        for method, values in ((PRESET, (-100.0, -200.0)), (LIMIT, (-110.0, -204.0)))
+        for seed, value in enumerate(values)
+    ]
+    records.episodes = pd.DataFrame(rows)
+    records.times = pd.DataFrame([dict(env_id="CartPole-v1", method=method, nats=2.0) for method in (PRESET, LIMIT)])
+    table = records.limit_table()
+    assert "0.94 (0.90 to 0.98)" in table
+    assert "missed" in table
 
 
 def test_trainings_have_the_final_seeds_and_the_rivals_the_same():

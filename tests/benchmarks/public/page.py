@@ -17,7 +17,7 @@ from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.figures import PALETTE, WIDTH, new_panels
 from sb3_tdpg.evaluation.statistics import interquartile_means, probabilities_of_improvement
 from tests.benchmarks.public.tasks import TASKS, PublicTask
-from tests.benchmarks.public.trainings import LABEL, LIMIT, PRESET, TUNED, Training, learning_curve
+from tests.benchmarks.public.trainings import LABEL, LIMIT, PRESET, SHARE, TUNED, Training, learning_curve
 
 TABLES = ("episodes", "times", "curves")
 
@@ -39,23 +39,24 @@ class Records:
 
     def __init__(self, trainings: Sequence[Training], root: Path) -> None:
         folders = [root / each.folder_name for each in trainings]
-        self.episodes = pd.concat([pd.read_csv(folder / "episodes.csv") for folder in folders], ignore_index=True)
+        self.episodes = _joined([pd.read_csv(folder / "episodes.csv") for folder in folders])
         times, curves = [], []
         for each, folder in zip(trainings, folders, strict=True):
             label = dict(zip(LABEL, each.label, strict=True))
-            git = json.loads((folder / "config.json").read_text())["provenance"]["git"] or dict(commit="", dirty=False)
-            commit = git["commit"][:7] + "+" * git["dirty"]
-            times.append({**label, **json.loads((folder / "time.json").read_text()), "commit": commit})
+            made = json.loads((folder / "config.json").read_text())["provenance"]
+            git = made["git"] or dict(commit="", dirty=False)
+            origin = dict(commit=git["commit"][:7] + "+" * git["dirty"], date=made["utc_time"][:10])
+            times.append({**label, **json.loads((folder / "time.json").read_text()), **origin})
             curves.append(learning_curve(folder, each.task.n_timesteps).assign(**label))
         self.times = pd.DataFrame(times)
-        self.curves = pd.concat(curves, ignore_index=True)
+        self.curves = _joined(curves)
 
     def add_published(self, folder: Path, labels: Set[tuple[str, str, int]]) -> None:
         """Add the records of some trainings that an earlier call has published."""
         for name in TABLES if labels else ():
             table = pd.read_csv(folder / f"{name}.csv.xz")
             wanted = table.set_index(LABEL).index.isin(labels)
-            setattr(self, name, pd.concat([getattr(self, name), table[wanted]], ignore_index=True))
+            setattr(self, name, _joined([getattr(self, name), table[wanted]]))
 
     @property
     def tasks(self) -> list[PublicTask]:
@@ -114,29 +115,32 @@ class Records:
         return markdown_table(rows)
 
     def limit_table(self) -> str:
-        """Say how much of the return, and of the information, is left under the cost limit."""
+        """Say how much of the return, and of the information, each seed keeps under its cost limit."""
         rows = []
-        nats = self.times.set_index(["env_id", "method"])["nats"]
+        nats = self.times.groupby(["env_id", "method"])["nats"].median()
         for task in self.tasks:
-            if task.limit is None or not len(kept := self.means(task, LIMIT, False)):
+            without, kept = (self.means(task, method, deterministic=False) for method in (PRESET, LIMIT))
+            if len(kept) == 0:
                 continue
-            without = self.means(task, PRESET, False)
+            shares = 1 + (kept - without) / np.abs(without)
+            before, after = (nats[task.env_id, method] for method in (PRESET, LIMIT))
             rows.append(
                 {
                     "task": task.env_id,
                     "without a limit": _interval(without),
-                    "limit": f"{-task.limit:g}",
                     "with the limit": _interval(kept),
-                    "verdict": "kept" if _interquartile(kept) >= -task.limit else "**missed**",
-                    "nat a step, without": f"{nats[task.env_id, PRESET].median():.2f}",
-                    "nat a step, with": f"{nats[task.env_id, LIMIT].median():.2f}",
+                    "share kept": f"{_interquartile(shares):.2f} ({shares.min():.2f} to {shares.max():.2f})",
+                    "verdict": "kept" if _interquartile(shares) >= SHARE else "**missed**",
+                    "nat a step, without": f"{before:.2f}",
+                    "with": f"{after:.2f}",
                 }
             )
         return markdown_table(rows)
 
     def time_table(self) -> str:
-        """Compare CPU times of the same number of steps."""
-        medians = self.times.groupby(["env_id", "method"])["cpu_s"].median()
+        """Compare CPU times of the same number of steps, of trainings that ran on the last day."""
+        last_day = self.times[self.times["date"] == self.times["date"].max()]
+        medians = last_day.groupby(["env_id", "method"])["cpu_s"].median()
         rows, ratios = [], {"PPO": [], "RecurrentPPO": []}
         for task in self.tasks:
             rival, ours = (medians[task.env_id, method] for method in (task.rival, PRESET))
@@ -172,6 +176,11 @@ class Records:
         handles, names = panels.flat[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
         return figure
+
+
+def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    filled = [table for table in tables if len(table)]
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
 
 
 def _interquartile(scores: np.ndarray) -> float:

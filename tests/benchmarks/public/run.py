@@ -23,7 +23,7 @@ from sb3_tdpg.common.processes import process_pool, usable_cores
 from sb3_tdpg.hyperparams import load_hyperparams
 from tests.benchmarks.public.page import Records, published_labels
 from tests.benchmarks.public.tasks import TASKS
-from tests.benchmarks.public.trainings import LIMIT, PRESET, TUNED, Training, complete_training
+from tests.benchmarks.public.trainings import PRESET, TUNED, Training, complete_training, with_limit
 
 SEEDS = range(200, 205)  # those below 200 were used for tuning
 PUBLISHED = Path("docs", "results", "public_tasks")
@@ -35,13 +35,21 @@ def make_trainings(seeds: Sequence[int]) -> list[Training]:
     for seed in seeds:
         for task in TASKS:
             trainings.append(Training(task, PRESET, seed, {}))
-            if task.limit is not None:
-                trainings.append(Training(task, LIMIT, seed, dict(cost_limit=task.limit)))
             if task.tuned is not None:
                 block = load_hyperparams(task.tuned)
                 trainings.append(Training(task, TUNED, seed, {**block, "n_timesteps": task.n_timesteps}))
             trainings.append(Training(task, task.rival, seed))
     return trainings
+
+
+def complete(training: Training, root: Path) -> list[Training]:
+    """Complete a training, and after that of the preset the one with a limit; return what is finished."""
+    complete_training(training, root)
+    if training.method != PRESET:
+        return [training]
+    limited = with_limit(training, root)
+    complete_training(limited, root)
+    return [training, limited]
 
 
 def main() -> None:
@@ -57,10 +65,11 @@ def main() -> None:
     published = published_labels(options.publish, options.published_methods)
     trainings = [each for each in make_trainings(SEEDS) if each.label not in published]
     with tqdm(total=len(trainings), unit="training") as progress, process_pool(options.jobs) as pool:
-        for done in as_completed([pool.submit(complete_training, each, options.out) for each in trainings]):
-            progress.set_postfix_str(done.result().relative_to(options.out).as_posix())
+        tasks = [pool.submit(complete, each, options.out) for each in trainings]
+        for task in as_completed(tasks):
+            progress.set_postfix_str(task.result()[0].folder_name)
             progress.update()
-    records = Records(trainings, options.out)
+    records = Records([done for task in tasks for done in task.result()], options.out)
     records.add_published(options.publish, published)
     records.write(options.publish, "make reproduce-public")
     print(f"records and tables: {options.publish}")

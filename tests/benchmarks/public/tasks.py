@@ -24,7 +24,6 @@ class PublicTask:
     :param block: Block of rl-zoo3's settings, where it is of an older version of the environment or of a similar one.
     :param n_timesteps: Length of a training, the same for all methods.
     :param hidden: Whether a memory is needed: the rival is RecurrentPPO instead of PPO.
-    :param limit: Cost limit: 95 % of the return that our preset reached on the tuning seeds, with its noise.
     :param tuned: Block of ``hyperparams/tdpg.yml``.
     """
 
@@ -32,7 +31,6 @@ class PublicTask:
     block: str
     n_timesteps: int = 100_000
     hidden: bool = False
-    limit: float | None = None
     tuned: str | None = None
 
     @property

@@ -7,7 +7,7 @@ import io
 import json
 import time
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,8 @@ N_CURVE_POINTS = 50
 
 LABEL = ["env_id", "method", "train_seed"]
 PRESET, TUNED, LIMIT = "TDPG, one preset", "TDPG, tuned", "TDPG, cost limit"
-"""Methods: without any setting, with the block of ``hyperparams/tdpg.yml``, with a limit of 95 % of the return."""
+"""Methods: without any setting; with the block of ``hyperparams/tdpg.yml``; with a limit, see :func:`with_limit`."""
+SHARE = 0.95  # of the return
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class Training:
     def config(self) -> dict[str, Any]:
         """Everything that determines the result."""
         settings = self.task.zoo_block() if self.settings is None else self.settings
-        return {**asdict(self), "settings": settings, "n_eval_episodes": N_EVAL_EPISODES}
+        task = {name: value for name, value in asdict(self.task).items() if name != "tuned"}
+        return {**asdict(self), "task": task, "settings": settings, "n_eval_episodes": N_EVAL_EPISODES}
 
     @property
     def label(self) -> tuple[str, str, int]:
@@ -102,6 +104,14 @@ def complete_training(training: Training, root: Path) -> Path:
     write_frame_atomically(log.frame(), folder / "training.csv")
     write_frame_atomically(evaluate(training, model), folder / "episodes.csv")
     return folder
+
+
+def with_limit(training: Training, root: Path) -> Training:
+    """Add a cost limit: 95 % of the return, with the noise of the policy, that a finished training reached."""
+    episodes = pd.read_csv(root / training.folder_name / "episodes.csv")
+    reached = episodes.loc[~episodes["deterministic"], "return"].mean()
+    limit = (1 - SHARE) * abs(reached) - reached
+    return replace(training, method=LIMIT, settings=dict(cost_limit=float(f"{limit:.4g}")))
 
 
 def train_ours(training: Training, log: EpisodeLog) -> tuple[BaseAlgorithm, float]:
