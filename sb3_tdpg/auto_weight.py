@@ -18,7 +18,8 @@ class AutoWeight:
         log w += rate * clip((C - cost) / scale, -2, 1)
 
     The scale is abs(C). With ``by_slack`` it is how far the lowest cost so far is below the limit: a limit of 95 % of
-    the attainable return then has as strong an effect as one of 50 %. The weight then also grows more slowly than it
+    the attainable return then has as strong an effect as one of 50 %. The aim is then the middle of this slack instead
+    of C, since the few episodes of an epoch say little about the cost, and the weight grows more slowly than it
     shrinks, ``clip(., -3, 0.3)``: a policy loses the return within a few epochs, and takes many to find it again.
 
     :param cost_limit: C
@@ -52,12 +53,12 @@ class AutoWeight:
         :param information: Estimated information in nats, summed over time.
         """
         self._lowest = min(self._lowest, cost)
-        scale = abs(self.cost_limit)
+        scale, aim, low, high = abs(self.cost_limit), self.cost_limit, -2.0, 1.0
         if self.by_slack:
             scale = max(self.cost_limit - self._lowest, LEAST_SLACK * scale)
+            aim, low, high = self.cost_limit - scale / 2, -3.0, 0.3
         if self.value > 0.0:
-            low, high = (-3.0, 0.3) if self.by_slack else (-2.0, 1.0)
-            self.value *= math.exp(self.rate * min(max((self.cost_limit - cost) / scale, low), high))
+            self.value *= math.exp(self.rate * min(max((aim - cost) / scale, low), high))
             self.value = min(self.value, self.max_growth * self._start)
         elif cost <= self.cost_limit:
             self.value = self._start = scale / max(information, 1.0)

@@ -146,10 +146,12 @@ def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_on
         assert start * 4.0 == pytest.approx(limit - best)
         weight.update(cost=best, information=4.0)
         assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
+        weight.update(cost=(best + limit) / 2, information=4.0)  # the aim
+        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
         weight.update(cost=above, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1)))
+        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5)))
         weight.update(cost=1e9, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1 - 3)))
+        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5 - 3)))
 
 
 def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
