@@ -14,7 +14,7 @@ pytest.importorskip("rliable")
 
 from sb3_tdpg import TDPG
 from tests.benchmarks.public import trainings
-from tests.benchmarks.public.page import Records, published_labels
+from tests.benchmarks.public.page import TABLES, Records, published_labels
 from tests.benchmarks.public.run import make_trainings
 from tests.benchmarks.public.tasks import TASKS
 from tests.benchmarks.public.trainings import LABEL, LIMIT, PRESET, Training, complete_training, with_limit
@@ -87,6 +87,20 @@ def test_published_records_take_the_place_of_trainings(tmp_path):
     all_published = Records([], tmp_path)
     all_published.add_published(tmp_path / "published", labels)
     assert set(all_published.episodes["method"]) == {"PPO"}
+
+
+def test_the_page_is_written_once_all_methods_are_there(tmp_path):
+    records = Records([trained(tmp_path)[0], trained(tmp_path, "PPO")[0]], tmp_path)
+    for name in TABLES:
+        table = getattr(records, name)
+        hidden = table.replace({"method": {"PPO": "RecurrentPPO"}}).assign(env_id="CartPoleNoVel-v1")
+        limited = table[table["method"] == PRESET].assign(method=LIMIT)
+        setattr(records, name, pd.concat([table, hidden, limited], ignore_index=True))
+    records.write(tmp_path / "out", "make reproduce-public")
+    summary = (tmp_path / "out" / "summary.md").read_text()
+    for part in ("## Final returns", "## Cost limit", "| kept |", "## CPU time", "`make reproduce-public` at commit"):
+        assert part in summary
+    assert (tmp_path / "out" / "curves.png").stat().st_size > 10_000
 
 
 def test_a_return_is_judged_by_the_interval_of_the_rival(tmp_path):

@@ -74,7 +74,7 @@ class Records:
         """Write the records and, once there are both ours and the rivals', ``summary.md`` and ``curves.png``."""
         for name in TABLES:
             write_frame_atomically(getattr(self, name).round(3), out / f"{name}.csv.xz")
-        if not set(self.episodes["method"]) >= {PRESET, "PPO", "RecurrentPPO"}:
+        if not set(self.episodes["method"]) >= {PRESET, LIMIT, "PPO", "RecurrentPPO"}:
             return
         save_figure(self.figure(), out / "curves.png")
         how = provenance()
