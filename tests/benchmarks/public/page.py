@@ -138,9 +138,10 @@ class Records:
         return markdown_table(rows)
 
     def time_table(self) -> str:
-        """Compare CPU times of the same number of steps, of trainings that ran on the last day."""
-        last_day = self.times[self.times["date"] == self.times["date"].max()]
-        medians = last_day.groupby(["env_id", "method"])["cpu_s"].median()
+        """Compare CPU times of the same number of steps: the median of the trainings on the last day of each kind."""
+        kind, dates = ["env_id", "method"], self.times["date"].fillna("")
+        is_last = dates == dates.groupby([self.times[column] for column in kind]).transform("max")
+        medians = self.times[is_last].groupby(kind)["cpu_s"].median()
         rows, ratios = [], {"PPO": [], "RecurrentPPO": []}
         for task in self.tasks:
             rival, ours = (medians[task.env_id, method] for method in (task.rival, PRESET))

@@ -49,14 +49,14 @@ class PublicTask:
 
 TASKS = (
     PublicTask("CartPole-v1", "CartPole-v1"),
-    PublicTask("Acrobot-v1", "Acrobot-v1"),
+    PublicTask("Acrobot-v1", "Acrobot-v1", tuned="Acrobot-v1"),
     PublicTask("Pendulum-v1", "Pendulum-v1"),
     PublicTask("MountainCarContinuous-v0", "MountainCarContinuous-v0", 20_000),
     PublicTask("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v2"),
     PublicTask("Reacher-v5", "Reacher-v2"),
     PublicTask("Hopper-v5", "Hopper-v4"),
     PublicTask("HalfCheetah-v5", "HalfCheetah-v4"),
-    PublicTask("Swimmer-v5", "Swimmer-v4"),
+    PublicTask("Swimmer-v5", "Swimmer-v4", tuned="Swimmer-v5"),
     PublicTask("CartPoleNoVel-v1", "CartPoleNoVel-v1", hidden=True),
     PublicTask("PendulumNoVel-v1", "PendulumNoVel-v1", hidden=True),
     PublicTask("HopperNoVel-v5", "Hopper-v4", hidden=True),
