@@ -72,12 +72,12 @@ class Records:
 
     def write(self, out: Path, command: str) -> None:
         """Write the records and, once there are both ours and the rivals', ``summary.md`` and ``curves.png``."""
+        how = provenance()  # before the files below change the checkout
         for name in TABLES:
             write_frame_atomically(getattr(self, name).round(3), out / f"{name}.csv.xz")
         if not set(self.episodes["method"]) >= {PRESET, LIMIT, "PPO", "RecurrentPPO"}:
             return
         save_figure(self.figure(), out / "curves.png")
-        how = provenance()
         write_run_config(out / "config.json", dict(provenance=how))
         parts = [
             "# Public tasks",
@@ -174,8 +174,10 @@ class Records:
             axes.set_title(f"{task.env_id}\n(rival: {task.rival})", fontsize=8)
         for axes in panels[-1]:
             axes.set_xlabel("steps (thousands)", fontsize=8)
-        handles, names = panels.flat[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+        lines = {
+            name: line for axes in panels.flat for line, name in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)
         return figure
 
 
