@@ -136,8 +136,8 @@ class ValueFunction(nn.Module):
         """
         Fit the network to an epoch, and estimate its advantages (GAE) with the new values.
 
-        Values of the last epoch would be those of another policy. The new ones have seen the costs that they are
-        compared with, but a thousand steps are too many for so small a network to remember.
+        The values of the last epoch would be those of another policy. The new ones have seen the costs that they are
+        compared with: a bias that is small where an epoch has many episodes.
 
         :param costs: ``(T, N)``
         :param states: x_t, ``(T, N, X)``
