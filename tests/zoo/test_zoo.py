@@ -202,8 +202,8 @@ BAD = {
     "no such file": (["--env", "Lava-v0", "--conf-file", "none.yml"], "none.yml has no readable block .*No such file"),
     "no YAML": (["--env", "Lava-v0", "--conf-file", "broken.yml"], "broken.yml has no readable block .*while parsing"),
     "no such block": (
-        ["--env", "Acrobot-v1"],
-        "no readable block 'Acrobot-v1' for tdpg .* with --block",
+        ["--env", "MountainCar-v0"],
+        "no readable block 'MountainCar-v0' for tdpg .* with --block",
     ),
     "keyword": (["--env", "Lava-v0", "--env-kwargs", "bar:1"], "cannot be made with env_kwargs={'bar': 1}"),
     "unquoted text": (
