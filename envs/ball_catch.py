@@ -12,6 +12,7 @@ from . import checks
 from .ball_scene import IMAGE_SIZE, BallScene
 from .base import POMDPEnv
 from .noise import NOISE_MODES, noisy_pixels
+from .pool import WorkPool
 from .textures import TRAINING_TEXTURE, load_texture
 
 Range = tuple[float, float]  # lowest and highest
@@ -57,10 +58,12 @@ class BallCatchEnv(POMDPEnv):
     :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``.
     :param wall_stands_still: For diagnosis: only the ball shows where the robot is; the rest looks as from d = 0.
     :param renderer: ``"pybullet"``, the reference, or ``"fast"``, a batched ray caster that agrees in 99.8 % of pixels.
+    :param n_processes: Number of processes that share PyBullet's images of a batch; the results are the same.
     :param render_mode: ``None``, ``"rgb_array"`` (scene and camera image) or ``"human"`` (PyBullet's window).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
+    shares_work = True
     state_names = ("d (m)", "b_x (m)", "b_y (m)", "v_x (m/s)", "v_y (m/s)")
 
     def __init__(
@@ -84,6 +87,7 @@ class BallCatchEnv(POMDPEnv):
         noise_mode: str = "minmax",
         wall_stands_still: bool = False,
         renderer: str = "pybullet",
+        n_processes: int = 1,
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=horizon, render_mode=render_mode)
@@ -117,6 +121,8 @@ class BallCatchEnv(POMDPEnv):
         module, name = RENDERERS[renderer]
         renderer_class = getattr(import_module(f".{module}", __package__), name)
         self._renderer = renderer_class(self.scene)
+        self.n_processes = checks.count("n_processes", n_processes) if renderer == "pybullet" else 1
+        self._pool: WorkPool | None = None  # when it is needed
         self._view: Any = None  # a SideView, when it is needed
 
     def _initial_state(self, n: int) -> np.ndarray:
@@ -133,7 +139,14 @@ class BallCatchEnv(POMDPEnv):
         return np.stack([next_d, next_x, next_y, speed_x, speed_y - self.dt * self.gravity], axis=1)
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
-        return self._with_noise(self._renderer.images(self._seen_from(state)), self.np_random)
+        seen = self._seen_from(state)
+        if self.n_processes == 1 or len(state) == 1:
+            images = self._renderer.images(seen)
+        else:
+            if self._pool is None:
+                self._pool = WorkPool(self.n_processes, type(self._renderer), self.scene)
+            images = self._pool.call("images", seen)
+        return self._with_noise(images, self.np_random)
 
     def _seen_from(self, state: np.ndarray) -> np.ndarray:
         """Return the state that the camera image shows."""
@@ -180,5 +193,8 @@ class BallCatchEnv(POMDPEnv):
     def close(self) -> None:
         """Release renderer and window; closing twice is fine."""
         self._renderer.close()
+        if self._pool is not None:
+            self._pool.close()
+            self.n_processes = 1  # the renderer says that it is closed
         if self._view is not None:
             self._view.close()

@@ -12,9 +12,10 @@ from . import checks
 from .base import POMDPEnv
 from .panda_bullet import FINGER_OPEN, HOME, LIFTED, MOTIONS, Configuration, Motion
 from .panda_camera import IMAGE_SIZE
-from .panda_pool import GraspPool, GraspWorld
 from .panda_scene import PandaScene
 from .panda_view import PandaView
+from .panda_world import GraspWorld
+from .pool import WorkPool
 
 NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
 ACTION_SCALE = 0.1
@@ -112,8 +113,8 @@ class PandaGraspEnv(POMDPEnv):
         return GraspWorld(*self._world_arguments())
 
     @cached_property
-    def _pool(self) -> GraspPool:
-        return GraspPool(self.n_processes, *self._world_arguments())
+    def _pool(self) -> WorkPool:
+        return WorkPool(self.n_processes, GraspWorld, *self._world_arguments())
 
     @cached_property
     def _view(self) -> PandaView:
@@ -125,9 +126,11 @@ class PandaGraspEnv(POMDPEnv):
             raise RuntimeError("this environment has been closed: make a new one")
         return self.scene, MOTIONS[self.motion], self.solver_iterations
 
-    def _workers(self, n: int) -> GraspWorld | GraspPool:
-        """Return the processes for a batch of n mugs, or this process."""
-        return self._pool if self.n_processes > 1 and n > 1 else self._world
+    def _shared(self, method: str, *arrays: np.ndarray) -> Any:
+        """Call a method of the world with arrays of n mugs, in several processes or in this one."""
+        if self.n_processes > 1 and len(arrays[0]) > 1:
+            return self._pool.call(method, *arrays)
+        return getattr(self._world, method)(*arrays)
 
     def _initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, self.state_space.shape[0]))
@@ -144,7 +147,7 @@ class PandaGraspEnv(POMDPEnv):
             self._film = []
             outcomes = self._world.grasps(mugs, poses, self._film.append)
         else:
-            outcomes = self._workers(len(state)).grasps(mugs, poses)
+            outcomes = self._shared("grasps", mugs, poses)
         next_state = np.concatenate([np.array([state for state, _ in outcomes]), camera], axis=1)
         heights, success = next_state[:, 2].tolist(), (next_state[:, 2] > LIFTED).tolist()
         self._details = [
@@ -154,7 +157,7 @@ class PandaGraspEnv(POMDPEnv):
         return next_state
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:
-        return self._with_noise(self._workers(len(state)).images(self._seen(state)), self.np_random)
+        return self._with_noise(self._shared("images", self._seen(state)), self.np_random)
 
     def _seen(self, state: np.ndarray) -> np.ndarray:
         """Return the states for the depth camera: the mug's, with the height of a raised camera."""

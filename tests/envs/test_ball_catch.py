@@ -490,3 +490,21 @@ def test_with_a_wall_at_rest_only_the_ball_tells_where_the_robot_is(renderer):
     np.testing.assert_array_equal(info["state"], ordinary.reset(seed=0)[1]["state"])
     env.close()
     ordinary.close()
+
+
+def test_processes_draw_the_same_images_and_end_with_the_environment():
+    alone, shared = (make_episodes_env("BallCatch-v0", 5, env_kwargs=dict(n_processes=n), seed=0) for n in (1, 2))
+    np.testing.assert_array_equal(alone.reset(), shared.reset())
+    for _ in range(2):
+        np.testing.assert_array_equal(alone.step(np.ones((5, 1)))[0], shared.step(np.ones((5, 1)))[0])
+    for env in (alone, shared):
+        env.close()
+        env.close()
+        with pytest.raises(RuntimeError, match="closed"):
+            env.step(np.ones((5, 1)))
+
+
+def test_the_ray_caster_needs_no_processes():
+    assert BallCatchEnv(renderer="fast", n_processes=4).n_processes == 1
+    with pytest.raises(ValueError, match="n_processes=0 must be"):
+        BallCatchEnv(n_processes=0)

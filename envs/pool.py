@@ -1,0 +1,62 @@
+"""Work of a batch that several processes share: grasps, images."""
+
+import multiprocessing
+import signal
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from itertools import chain, repeat
+from typing import Any
+
+import numpy as np
+
+SHARES = 8  # parts of a batch for each process, so that all end at about the same time
+
+
+class WorkPool:
+    """
+    Several processes with a worker each, which share a batch; the results are the same bit for bit.
+
+    The processes ignore Ctrl-C and end with this one. If one dies, the next call raises
+    :class:`concurrent.futures.process.BrokenProcessPool`.
+
+    :param n_processes: Their number.
+    :param make_worker: Called once in each process, for instance a class.
+    :param arguments: Its arguments.
+    """
+
+    def __init__(self, n_processes: int, make_worker: Callable[..., Any], *arguments: Any) -> None:
+        # Other start methods import the user's script, which then needs a guard `if __name__ == "__main__"`.
+        method = "fork" if "fork" in multiprocessing.get_all_start_methods() else None
+        self._n_processes = n_processes
+        context = multiprocessing.get_context(method)
+        self._executor = ProcessPoolExecutor(
+            n_processes, context, initializer=_begin, initargs=(make_worker, *arguments)
+        )
+
+    def call(self, method: str, *arrays: np.ndarray) -> Any:
+        """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the arrays or lists."""
+        n_parts = min(len(arrays[0]), SHARES * self._n_processes)
+        parts = [np.array_split(array, n_parts) for array in arrays]
+        with warnings.catch_warnings():
+            # Python 3.12 warns of PyTorch's threads in a forked process; these processes do not call PyTorch.
+            warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
+            results = list(self._executor.map(_call, repeat(method), *parts))
+        return np.concatenate(results) if isinstance(results[0], np.ndarray) else list(chain(*results))
+
+    def close(self) -> None:
+        """End the processes."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+
+_worker: Any  # of a process of a pool
+
+
+def _begin(make_worker: Callable[..., Any], *arguments: Any) -> None:
+    global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _worker = make_worker(*arguments)
+
+
+def _call(method: str, *arrays: np.ndarray) -> Any:
+    return getattr(_worker, method)(*arrays)
