@@ -19,10 +19,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
+from torch.distributions import Normal
 from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
-from sb3_tdpg.features import Changes, ObservationNorm, flat_action_space, observation_kind
+from sb3_tdpg.features import Changes, ObservationNorm, TRVCnn, flat_action_space, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
 from sb3_tdpg.settings import POLICY_DEFAULTS, check_count, check_floors, check_net_arch, default, fill_in_trvs
 
@@ -122,7 +123,9 @@ class TRVPolicy(BasePolicy):
     ) -> None:
         check_count("horizon", horizon)
         check_floors(encoder_var_floor=encoder_var_floor, action_var_floor=action_var_floor)
-        defaults = POLICY_DEFAULTS[preset or observation_kind(observation_space, normalize_images=normalize_images)]
+        kind = observation_kind(observation_space, normalize_images=normalize_images)
+        # Models of early versions have no preset, and their encoders pool no pixels.
+        defaults = POLICY_DEFAULTS[preset or ("early image" if kind == "image" else kind)]
         if features_extractor_class is None and isinstance(observation_space, spaces.Dict):
             features_extractor_class = CombinedExtractor
         elif features_extractor_class is None:
@@ -285,6 +288,8 @@ class TRVPolicy(BasePolicy):
         """Standardise vectors, if asked for, and extract the features: ``(n, *obs) -> (n, F)``."""
         if self.norm is not None:
             observation = self.norm(observation)
+        if isinstance(self.features_extractor, TRVCnn) and isinstance(observation, th.Tensor):
+            observation = self.features_extractor.pooled(observation)  # as bytes, which is faster
         return self.extract_features(observation, self.features_extractor)
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
@@ -312,9 +317,19 @@ class TRVPolicy(BasePolicy):
         def flat(x: th.Tensor) -> th.Tensor:
             x = x.flatten(0, 1)
             # Change the layout while the pixels are still bytes: it is cheaper.
-            return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 else x
+            is_pooled = isinstance(self.features_extractor, TRVCnn) and self.features_extractor.pool > 1
+            return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and not is_pooled else x
 
         return self._features(each(batch.observations, flat)).unflatten(0, batch.alive.shape)
+
+    def episode_encoder_density(self, features: th.Tensor, batch: EpisodeBatch) -> Normal:
+        """Return q(x~_t | x~_{t-1}, y_t) given the *stored* TRVs x~_{t-1}, ``(T, N, Z)``."""
+        parameters = self.encoder(th.cat([batch.prev_trvs, features], dim=-1))
+        return Normal(*self._encoder_density(parameters, features, batch.prev_trvs), validate_args=False)
+
+    def episode_action_density(self, trvs: th.Tensor) -> Distribution:
+        """Return pi(u_t | x~_t), ``(T * N, U)``, given the TRVs, ``(T, N, Z)``; the next call overwrites it."""
+        return self._action_distribution(self.action_head(trvs).flatten(0, 1))
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
@@ -324,9 +339,7 @@ class TRVPolicy(BasePolicy):
 
         :return: ``(T, N)``
         """
-        parameters = self.encoder(th.cat([batch.prev_trvs, features], dim=-1))
-        mean, std = self._encoder_density(parameters, features, batch.prev_trvs)
-        return th.distributions.Normal(mean, std, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
+        return self.episode_encoder_density(features, batch).log_prob(batch.trvs).sum(dim=-1)
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
@@ -335,11 +348,10 @@ class TRVPolicy(BasePolicy):
         :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
         :return: ``(T, N)``
         """
-        parameters = self.action_head(trvs).flatten(0, 1)  # (T * N, .)
         actions = batch.actions.flatten(0, 1)
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions[:, 0]
-        return self._action_distribution(parameters).log_prob(actions).unflatten(0, trvs.shape[:2])
+        return self.episode_action_density(trvs).log_prob(actions).unflatten(0, trvs.shape[:2])
 
     def rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> RebuiltTRVs:
         """
