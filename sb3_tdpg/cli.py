@@ -108,9 +108,25 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
     print(f"\n{text}\n\nresults are in {out}")
 
 
-def _certify(models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, **options: Any) -> None:
+def _certify(
+    models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, nuisance: str | None, n_members: int,
+    **options: Any,
+) -> None:  # fmt: skip
     from sb3_tdpg.certificates.lava import certify_lava
+    from sb3_tdpg.certificates.nuisance import certify_nuisance
 
+    if nuisance is not None:
+        if options.pop("n_random_shifts"):
+            raise ValueError("--random-shifts are those of Lava's sensor and start: leave them or --nuisance out")
+        try:
+            declared = yaml.safe_load(nuisance)
+        except yaml.YAMLError as e:
+            raise ValueError(f"--nuisance {nuisance!r} is not YAML, such as '{{vector_noise: [1, 3]}}'") from e
+        with kept_by_this_process(out):
+            keywords = parse_keywords(env_kwargs)
+            text = certify_nuisance(models, env, declared, out, env_kwargs=keywords, n_members=n_members, **options)
+        print(f"\n{text}\n\nresults are in {out}")
+        return
     if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
             f"certify has declared shifts for Lava-v0 only, not for {env}: declare your own in Python, see "
@@ -279,6 +295,9 @@ def _make_parser() -> argparse.ArgumentParser:
     add = command(_certify, text, "--env", "--env-kwargs", "--seed")
     add("models", nargs="+", type=Path, help="the .zip files from model.save()")
     add("--random-shifts", type=_positive, default=0, dest="n_random_shifts", help="in addition to the paper's shifts")
+    text = "certify a declared nuisance instead: 'auto', a name, or '{vector_noise: [1, 3], vector_bias: 2}'"
+    add("--nuisance", metavar="YAML", help=text)
+    add("--members", type=_positive, default=1000, dest="n_members", help="random members of the nuisance")
     add("--n-episodes", type=_positive, default=1_000_000, help="training episodes to record")
     add("--n-test-episodes", type=_positive, default=2000, help="episodes per random shift")
     add("--confidence", type=float, default=0.95)

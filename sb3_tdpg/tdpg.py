@@ -25,8 +25,10 @@ from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
+from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, horizon_of, reward_threshold
+from sb3_tdpg.robustness.nuisance import declaration
 from sb3_tdpg.settings import (
     DEFAULTS,
     Defaults,
@@ -73,7 +75,7 @@ class TDPG(EpisodicAlgorithm):
     :param env: A registered id, an environment or a ``VecEnv``.
     :param beta: Weight of the cost against the information: a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
-        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, "auto", inf.
+        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, inf, inf.
     :param cost_limit: Limit for ``beta="auto"``; default: minus the environment's registered ``reward_threshold``.
     :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
         linearly; default: ``"lin_2e-3_2e-5"``, ``"lin_1e-3_5e-5"``, ``"lin_1e-3_1e-4"``.
@@ -102,6 +104,14 @@ class TDPG(EpisodicAlgorithm):
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
         the next state; unused with ``baseline="mean"``. Default: 0.95.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping; default: inf, inf, 0.5.
+    :param nuisance: A declared family of changes of the sensor; what the policy knows of them is removed in a phase of
+        its own after the passes of an epoch. ``"auto"``: random colours, patterns, contrasts and noise for images,
+        nothing for vectors. ``None``: nothing. A dict of perturbations and severities, a function, ...: see
+        :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`.
+    :param nuisance_steps: Gradient steps of this phase.
+    :param nuisance_level: ``"action"``: roll out plainly and make the actions the same under the nuisance; ``"trv"``:
+        roll out under the nuisance, and minimise an upper bound on what the TRVs know of it
+        (:class:`~sb3_tdpg.information.nuisance.NuisancePhase`).
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.
@@ -141,6 +151,9 @@ class TDPG(EpisodicAlgorithm):
         gamma: float | None = None,
         gae_lambda: float | None = None,
         max_grad_norm: float | None = None,
+        nuisance: Any = "auto",
+        nuisance_steps: int = 24,
+        nuisance_level: str = "action",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -210,6 +223,8 @@ class TDPG(EpisodicAlgorithm):
         self.clip_range: Any = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.n_threads: int | None = settings["n_threads"]
+        self.nuisance = nuisance if is_new else None  # models of early versions have none
+        self.nuisance_steps, self.nuisance_level = nuisance_steps, nuisance_level
         self._limit_origin = ""
         self.auto_weight: AutoWeight | None = None
         """The weight of the information with ``beta="auto"``."""
@@ -259,6 +274,10 @@ class TDPG(EpisodicAlgorithm):
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
             value_function = ValueFunction(self.state_dim, self.horizon, with_changes=self.values_see_changes)
             self.value_function = value_function.to(self.device)
+        self.nuisance, self.nuisance_phase = declaration(self.nuisance, self.observation_space), None
+        if self.nuisance is not None:
+            self.nuisance_phase = NuisancePhase(self.policy, self.nuisance_steps, self.nuisance_level)
+            self._make_nuisance()
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         n_critics = 1 if self.pools_information else self.horizon
@@ -267,7 +286,7 @@ class TDPG(EpisodicAlgorithm):
         n_columns = self.n_episodes or math.ceil(self.epoch_size / self.horizon)
         self.rollout_buffer = EpisodeBuffer(
             self.horizon, self.observation_space, self.action_space, device=self.device, gamma=self.gamma,
-            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim,
+            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim, keeps_plain=self.perturbs_rollouts,
         )  # fmt: skip
 
     @property
@@ -311,7 +330,7 @@ class TDPG(EpisodicAlgorithm):
             were before that step.
         """
         self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
+        self._update_learning_rate([self.policy.optimizer, *(p.optimizer for p in [self.nuisance_phase] if p)])
         in_segments = not self.policy.time_varying
         batch = self.rollout_buffer.episode_batch(whole_horizon=not in_segments)
         mean_cost = batch.costs.sum(0).mean().item()
@@ -370,6 +389,10 @@ class TDPG(EpisodicAlgorithm):
                 self.logger.record_mean("train/policy_loss", policy_loss.item())
                 self.logger.record_mean("train/loss", loss.item())
                 self.logger.record_mean("train/grad_norm", grad_norm.item())
+        if self.nuisance_phase is not None:
+            known = self.nuisance_phase.remove(batch, self.rollout_buffer.mean_length, self._check_finite)
+            for name, value in known.items():
+                self.logger.record(f"nuisance/{name}", value)
         # Last: the rollouts and all of their gradients saw the same inputs.
         self.policy.update_statistics(whole)
 

@@ -7,6 +7,7 @@ Dimension key: N environments side by side, X state, U action.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import time
 from collections.abc import Mapping, Sequence
@@ -199,8 +200,9 @@ def make_episodes_env(
     if env_class is not None:
         if use_processes and env_class.shares_work:
             env_kwargs.setdefault("n_processes", usable_cores())
-        env = env_class(**{**spec.kwargs, **env_kwargs})
-        env.spec = spec
+        own = {**spec.kwargs, **env_kwargs}
+        env = env_class(**own)
+        env.spec = dataclasses.replace(spec, kwargs=own)  # as gym.make does
         n_envs = n_envs or _default_n_envs(env, n_episodes, epoch_steps, batched=True)
         vec_env: VecEnv = BatchedVecEnv(env, n_envs)
         vec_env.seed(seed)

@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import Logger
 from torch.nn.functional import elu
 
 from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg.buffers import each
 from sb3_tdpg.envs.lava import LavaEnv
 
 T, N, Z = 3, 6, 2
@@ -56,7 +57,8 @@ def make_model(**kwargs):
             costs=rng.normal(size=n),
         )
     buffer.full = True
-    batch = type(buffer.episode_batch())(*(x.double() for x in buffer.episode_batch()))
+    batch = buffer.episode_batch()
+    batch = type(batch)(*(each(x, lambda v: v.double()) for x in batch))
     buffer.episode_batch = lambda **_: batch
     # Features are single precision by SB3's preprocessing: exact for these observations.
     model.policy.double()

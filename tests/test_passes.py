@@ -268,9 +268,9 @@ def test_vectors_are_learnt_from_as_in_the_paper():
     assert model.env.num_envs == 500
 
 
-def test_images_are_learnt_from_with_ppos_passes_under_the_environments_threshold():
+def test_images_are_learnt_from_with_ppos_passes_and_without_a_penalty_on_what_is_known_of_the_state():
     model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
-    assert (model.beta, model.cost_limit) == ("auto", 5.0)
+    assert (model.beta, model.nuisance, model.nuisance_steps) == (math.inf, {"images": {}}, 24)
     assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 80, 0.2)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
     assert model.env.num_envs == 160
@@ -292,7 +292,7 @@ def test_a_cost_limit_alone_asks_for_the_weight_that_keeps_it():
 
 
 def test_the_threshold_of_the_registration_is_the_default_limit():
-    model = TDPG("TRVPolicy", with_threshold(toy_vec_env(observation_space=IMAGE), 3.0), n_episodes=8, device="cpu")
+    model = TDPG("TRVPolicy", with_threshold(toy_vec_env(observation_space=IMAGE), 3.0), n_episodes=8, beta="auto")
     assert model.cost_limit == -3.0
 
 

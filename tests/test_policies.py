@@ -10,7 +10,7 @@ from gymnasium import spaces
 from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs
 
 from sb3_tdpg import TDPG, TRVPolicy
-from sb3_tdpg.buffers import RebuiltTRVs
+from sb3_tdpg.buffers import RebuiltTRVs, each
 from sb3_tdpg.features import observation_kind
 from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
 
@@ -83,7 +83,7 @@ def test_segments_side_by_side_give_the_trvs_of_whole_episodes(n_steps):
     model = tiny_tdpg("Pendulum-v1", n_episodes=4, n_envs=2, beta=math.inf)
     train_epochs(model, 1)
     batch = model.rollout_buffer.episode_batch()
-    batch = type(batch)(*(x[:5] for x in batch))
+    batch = type(batch)(*(each(x, lambda v: v[:5]) for x in batch))
     whole = model.policy.rebuild_trvs(model.policy.episode_features(batch), batch)
     trvs = whole.trvs.detach()
     parts = batch._replace(trvs=trvs, prev_trvs=th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])).segments(n_steps)

@@ -20,7 +20,7 @@ SLOW = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[1]
 SAVE_FREQ = 2
 # Seven epochs of 20 episodes on Lava, about as many on CartPole, of 8 episodes of varying length.
-TOTAL = {"lava": 700, "lava_in_dummy_vec_env": 700, "cartpole": 1600}
+TOTAL = {"lava": 700, "lava_in_dummy_vec_env": 700, "cartpole": 3000}
 
 ENVIRONMENTS = {
     "lava": lambda: BatchedVecEnv(LavaEnv(), 20),
@@ -48,6 +48,8 @@ SETTINGS = {
         beta="auto", cost_limit=1e4, n_epochs=2, batch_size=4, clip_range=0.2, encoder_gradient="pathwise"
     ),
     "policy gradient without a seed": dict(beta=float("inf"), seed=None),
+    "a nuisance": dict(nuisance={"vector_noise": (1, 3), "vector_bias": 5}, nuisance_steps=2),
+    "a nuisance in the rollouts": dict(nuisance="vector_bias", nuisance_steps=2, nuisance_level="trv"),
 }
 
 

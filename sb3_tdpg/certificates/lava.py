@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
+from sb3_tdpg.certificates.models import load_models
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
@@ -20,9 +21,7 @@ from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import save_figure
-from sb3_tdpg.evaluation.environments import check_models_fit
 from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, legend_above, log_axis, new_panels
-from sb3_tdpg.tdpg import TDPG
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,7 +77,7 @@ def certify_lava(
             raise ValueError(f"{name}={value} must be at least {least}")
     if cost_bound is not None and not (math.isfinite(cost_bound) and cost_bound > 0):
         raise ValueError(f"cost_bound={cost_bound} must be finite and above 0: it bounds the cost of an episode")
-    loaded = _load(models, training)
+    loaded = load_models(models, training)
     out.mkdir(parents=True, exist_ok=True)  # now, so that an error does not come at the very end
     std = float(training.env_kwargs.get("sensor_noise_std", LAVA[0].env_kwargs["sensor_noise_std"]))
     bound = wall_cost(next(iter(loaded.values())).horizon) if cost_bound is None else cost_bound
@@ -114,23 +113,6 @@ def certify_lava(
     summary = "\n\n".join([*_sections(frames, confidence, bound), how_made(how["command"], how)]) + "\n"
     write_atomically(out / "summary.md", summary)
     return summary
-
-
-def _load(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
-    models: dict[str, TDPG] = {}
-    if twice := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
-        raise ValueError(f"{twice[0]} is given twice")
-    for path in paths:
-        try:
-            model = TDPG.load(path, device="cpu")
-        except OSError as e:
-            raise ValueError(f"{path} cannot be read ({e.strerror}): give .zip files that model.save() wrote") from e
-        method = "PG" if model.beta == math.inf else "TDPG"
-        # The shortest label that is free; only the last one contains the whole path.
-        labels = (method, f"{method} ({path.parent.name}/{path.stem})", f"{method} ({path})")
-        models[next(label for label in labels if label not in models)] = model
-    check_models_fit(models, [training])
-    return models
 
 
 def _row(episodes: TrainingEpisodes, shift: Shift, n_budget: int | None, n_test: int, test_seed: int) -> dict[str, Any]:

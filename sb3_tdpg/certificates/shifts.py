@@ -36,6 +36,7 @@ from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
 from sb3_tdpg.evaluation.rollout import act
 from sb3_tdpg.information import InformationBatch, LogDet
+from sb3_tdpg.robustness.nuisance import Members, Nuisance
 from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
@@ -55,12 +56,14 @@ class Shift:
     :param start_kl: D[shifted start || start in training] in nats.
     :param sensor_kl: Largest D[shifted sensor || sensor in training] of one observation over all states; inf if it is
         not known.
+    :param nuisance: A change of the observations on top of the sensor's; every episode has a member of it.
     """
 
     name: str
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     start_kl: float = 0.0
     sensor_kl: float = math.inf
+    nuisance: Nuisance | None = None
 
 
 class Budget(NamedTuple):
@@ -266,12 +269,43 @@ class TrainingEpisodes:
         by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
         return shifted.costs, shift.start_kl + float(by_step[:-2].sum() + by_step[-2:].min())
 
-    def _shifted(self, shift: Shift) -> POMDPEnv:
+    def _shifted(self, shift: Shift) -> Any:
         kwargs = {**self.scenario.env_kwargs, **shift.env_kwargs}
-        return _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
+        env = _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
+        return env if shift.nuisance is None else _UnderNuisance(env, shift.nuisance, self.seed)
 
 
-def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
+class _UnderNuisance:
+    """An environment whose sensor shows what the members of a nuisance make of it, drawn at the first call."""
+
+    def __init__(self, env: POMDPEnv, nuisance: Nuisance, seed: int) -> None:
+        self.env, self.nuisance = env, nuisance
+        self.members: Members | None = None
+        self.random_state = th.Generator().manual_seed(seed).get_state()  # torch's own stays as it is
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        return self.env.np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self.env.np_random = generator
+
+    def _sensor(self, state: np.ndarray) -> Any:
+        plain = self.env._sensor(state)
+        with th.random.fork_rng(devices=[]):
+            th.set_rng_state(self.random_state)
+            if self.members is None:
+                self.members = self.nuisance.members(len(state))
+            seen = self.members(plain, state, np.arange(len(state)))
+            self.random_state = th.get_rng_state()
+        return seen
+
+
+def record_episodes(model: Any, env: Any, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
     """Run n episodes whose start, sensor, dynamics and policy have separate random streams, for :func:`encode`."""
     env.np_random = np.random.default_rng([*seed, _START])
     state, costs = env._initial_state(n), np.zeros(n)
@@ -294,7 +328,7 @@ def record_episodes(model: Any, env: POMDPEnv, n: int, seed: tuple[int, ...]) ->
     return RecordedEpisodes(costs, np.stack(states), th.stack(prev_trvs), step.noise, [*densities, last], seed)
 
 
-def encode(model: Any, env: POMDPEnv, recorded: RecordedEpisodes) -> list[Normal]:
+def encode(model: Any, env: Any, recorded: RecordedEpisodes) -> list[Normal]:
     """
     Encode the recorded states as the sensor of another environment observes them, with the same random numbers.
 

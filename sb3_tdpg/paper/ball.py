@@ -53,7 +53,7 @@ SECOND_STAGE = dict(n_timesteps=80_000)
 METHODS: tuple[Method, ...] = (
     Method("PG", "BallCatch-v0-pg", renderer="pybullet"),
     Method("PG, perturbed images", "BallCatch-v0-perturbed-pg"),
-    Method("TDPG", "BallCatch-v0", "PG, perturbed images", "pybullet", SECOND_STAGE),
+    Method("TDPG", "BallCatch-v0-two-stages", "PG, perturbed images", "pybullet", SECOND_STAGE),
     Method(NO_PENALTY, "BallCatch-v0-perturbed-pg", "PG, perturbed images"),
     Method("TDPG, plain images", "BallCatch-v0-plain", "PG", overrides=SECOND_STAGE),
     Method(NO_PENALTY_PLAIN, "BallCatch-v0-pg", "PG"),

@@ -199,8 +199,12 @@ BALL_BASELINES = Comparison(
     baselines=(
         Baseline("first stage", "BallCatch-v0-perturbed-pg", is_shown=False),
         # One seed, for its time.
-        Baseline("TDPG, perturbed images", "BallCatch-v0", "first stage", overrides=BALL_SECOND_STAGE, max_seeds=1),
-        Baseline("VIB, perturbed images", "BallCatch-v0", "first stage", overrides={**VIB, **BALL_SECOND_STAGE}),
+        Baseline(
+            "TDPG, perturbed images", "BallCatch-v0-two-stages", "first stage", overrides=BALL_SECOND_STAGE, max_seeds=1
+        ),
+        Baseline(
+            "VIB, perturbed images", "BallCatch-v0-two-stages", "first stage", overrides={**VIB, **BALL_SECOND_STAGE}
+        ),
         with_weight_decay("BallCatch-v0-pg", BALL_STEPS),
         Baseline("PPO", "BallCatch-v0", algo="ppo"),
         Baseline("PPO, pixel noise", "BallCatch-v0", overrides=NOISE, algo="ppo"),

@@ -1,8 +1,12 @@
 """
 Random changes to the images of a training, so that the bottleneck has something to leave out.
 
-Dimension key: N environments, C channels, H and W rows and columns.
+Dimension key: N images or episodes, C channels, H and W rows and columns.
 """
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch as th
@@ -14,54 +18,109 @@ from torch.nn.functional import interpolate
 
 PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
 
+Drawn = dict[str, th.Tensor]  # what was drawn for N images or episodes, with a leading dimension of N
 
-class VecImagePerturbation(VecEnvWrapper):
+
+@dataclass(frozen=True)
+class ImageMixture:
     r"""
-    Perturb every image of a vectorised environment at random.
-
-    These steps are applied in order, with y in [0, 1] and new random numbers for every image:
+    A mixture of random changes of images, applied in this order to y in [0, 1]:
 
     1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, with rows
        divided by their sums (or by 0.3, if that is more);
     2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p (the size of its cells, and
-       whether they have edges, are drawn once for all images of a step); a is uniform up to ``pattern``, 0 for three
-       images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's sides;
+       whether they have edges, are drawn once for all N); a is uniform up to ``pattern``, 0 for three images of ten,
+       and 1 in a rectangle with sides uniform up to ``patch`` of the image's sides;
     3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
        [0, 1];
     4. noise: Gaussian at every pixel, with a standard deviation uniform up to ``noise``.
 
-    The true state does not change. The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound
-    the information about everything in the image, so what an encoder keeps of these changes counts as information.
     The random numbers are torch's, so a seed and a checkpoint cover them.
 
-    :param venv: Environments with images of bytes, channels first or last.
     :param color: Strength of the mixing; 0 leaves the colours unchanged.
     :param pattern: Largest opacity of the pattern, at most 1.
     :param patch: Largest side of the opaque rectangle, at most 1.
     :param contrast: Largest loss of contrast, at most 1.
     :param noise: Largest standard deviation of the noise.
+    :raises ValueError: if a strength is out of its range.
+    """
+
+    color: float = 0.35
+    pattern: float = 0.7
+    patch: float = 0.5
+    contrast: float = 0.7
+    noise: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            largest = np.inf if name in ("color", "noise") else 1.0
+            if not 0 <= value <= largest:
+                raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
+
+    def draw(self, n: int, channels: int, height: int, width: int) -> Drawn:
+        """Draw N changes of images of a size: everything but the noise at each pixel."""
+
+        def uniform() -> th.Tensor:
+            return th.rand(n, 1, 1, 1)
+
+        mixing = th.eye(channels) + self.color * th.randn(n, channels, channels)
+        amount = self.pattern * uniform() * (uniform() < 0.7)
+        size = PATTERN_SIZES[int(th.randint(len(PATTERN_SIZES), ()))]
+        mode = ("nearest", "bilinear")[int(th.randint(2, ()))]
+        return dict(
+            mixing=mixing / mixing.sum(dim=2, keepdim=True).clamp(min=0.3),
+            pattern=interpolate(th.rand(n, channels, size, size), size=(height, width), mode=mode),
+            amount=th.maximum(amount, self._patches(n, height, width)),
+            scale=1 - self.contrast * uniform(),
+            offset=uniform(),
+            noise=self.noise * uniform(),
+        )
+
+    def _patches(self, n: int, height: int, width: int) -> th.Tensor:
+        """Draw rectangles with sides uniform up to ``patch`` of the image's: ``(N, 1, H, W)``, 1 inside."""
+
+        def interval(length: int) -> th.Tensor:
+            size = self.patch * th.rand(n, 1)
+            start = (1 - size) * th.rand(n, 1)
+            at = (th.arange(length) + 0.5) / length
+            return (at >= start) & (at < start + size)
+
+        return (interval(height)[:, None, :, None] & interval(width)[:, None, None, :]).float()
+
+    def apply(self, images: np.ndarray, drawn: Drawn) -> np.ndarray:
+        """
+        Change each image as drawn, with new noise.
+
+        :param images: ``(N, C, H, W)`` uint8
+        :return: the same shape and type
+        """
+        y = th.as_tensor(images) / 255.0
+        y = (drawn["mixing"] @ y.flatten(2)).unflatten(2, y.shape[2:])
+        y = th.lerp(y, drawn["pattern"], drawn["amount"])
+        y = drawn["scale"] * y + (1 - drawn["scale"]) * drawn["offset"]
+        y = y + drawn["noise"] * th.randn_like(y)
+        return (255 * y.clamp(0, 1)).round().to(th.uint8).numpy()
+
+
+class VecImagePerturbation(VecEnvWrapper):
+    """
+    Change every image of a vectorised environment by an :class:`ImageMixture`, with new random numbers for each.
+
+    The true state does not change. The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound
+    the information about everything in the image, so what an encoder keeps of these changes counts as information.
+    TDPG's ``nuisance`` removes it without changing the images of the rollouts.
+
+    :param venv: Environments with images of bytes, channels first or last.
+    :param strengths: See :class:`ImageMixture`.
     :raises ValueError: if the observations are not images of bytes, or a strength is out of its range.
     """
 
-    def __init__(
-        self,
-        venv: VecEnv,
-        color: float = 0.35,
-        pattern: float = 0.7,
-        patch: float = 0.5,
-        contrast: float = 0.7,
-        noise: float = 0.1,
-    ) -> None:
+    def __init__(self, venv: VecEnv, **strengths: float) -> None:
         super().__init__(venv)
         space = venv.observation_space
         if not (isinstance(space, spaces.Box) and is_image_space(space)):
             raise ValueError(f"VecImagePerturbation takes images of bytes (uint8, 0 to 255), not {space}")
-        strengths = dict(color=color, pattern=pattern, patch=patch, contrast=contrast, noise=noise)
-        for name, value in strengths.items():
-            largest = np.inf if name in ("color", "noise") else 1.0
-            if not 0 <= value <= largest:
-                raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
-        self.color, self.pattern, self.patch, self.contrast, self.noise = strengths.values()
+        self.mixture = ImageMixture(**strengths)
         self._channels_last = space.shape[0] > space.shape[2]
 
     def reset(self) -> np.ndarray:
@@ -76,39 +135,9 @@ class VecImagePerturbation(VecEnvWrapper):
         assert isinstance(images, np.ndarray)
         return self.perturb(images), rewards, dones, infos
 
-    def _patches(self, n: int, height: int, width: int) -> th.Tensor:
-        """Draw rectangles with sides uniform up to ``patch`` of the image's: ``(N, 1, H, W)``, 1 inside."""
-
-        def interval(length: int) -> th.Tensor:
-            size = self.patch * th.rand(n, 1)
-            start = (1 - size) * th.rand(n, 1)
-            at = (th.arange(length) + 0.5) / length
-            return (at >= start) & (at < start + size)
-
-        return (interval(height)[:, None, :, None] & interval(width)[:, None, None, :]).float()
-
     def perturb(self, images: np.ndarray) -> np.ndarray:
         """Perturb each image with new random numbers: ``(N, C, H, W)`` or ``(N, H, W, C)``, uint8."""
-        y = th.as_tensor(images.transpose(0, 3, 1, 2) if self._channels_last else images) / 255.0
-        n, channels, height, width = y.shape
-
-        def uniform() -> th.Tensor:
-            return th.rand(n, 1, 1, 1)
-
-        mixing = th.eye(channels) + self.color * th.randn(n, channels, channels)
-        mixing = mixing / mixing.sum(dim=2, keepdim=True).clamp(min=0.3)
-        y = (mixing @ y.flatten(2)).unflatten(2, (height, width))
-
-        amount = self.pattern * uniform() * (uniform() < 0.7)
-        size = PATTERN_SIZES[int(th.randint(len(PATTERN_SIZES), ()))]
-        mode = ("nearest", "bilinear")[int(th.randint(2, ()))]
-        pattern = interpolate(th.rand(n, channels, size, size), size=(height, width), mode=mode)
-        amount = th.maximum(amount, self._patches(n, height, width))
-        y = (1 - amount) * y + amount * pattern
-
-        scale = 1 - self.contrast * uniform()
-        y = scale * y + (1 - scale) * uniform()
-
-        y = y + self.noise * uniform() * th.randn_like(y)
-        result = (255 * y.clamp(0, 1)).round().to(th.uint8).numpy()
+        if self._channels_last:
+            images = images.transpose(0, 3, 1, 2)
+        result = self.mixture.apply(images, self.mixture.draw(*images.shape))
         return result.transpose(0, 2, 3, 1) if self._channels_last else result

@@ -16,7 +16,7 @@ from torch.distributions import Normal, kl_divergence
 
 from sb3_tdpg.certificates import shifts
 from sb3_tdpg.certificates.certificate import cost_distribution, worst_mean
-from sb3_tdpg.certificates.lava import _load
+from sb3_tdpg.certificates.models import load_models
 from sb3_tdpg.certificates.shifts import (
     Budget,
     Shift,
@@ -303,11 +303,11 @@ def test_models_from_folders_of_one_name_are_all_certified(tmp_path):
     for path in paths:
         path.parent.mkdir(parents=True)
         tiny_tdpg().save(path)
-    assert list(_load(paths, TRAINING)) == ["TDPG", "TDPG (b/model)", "TDPG (a/model)"]
+    assert list(load_models(paths, TRAINING)) == ["TDPG", "TDPG (b/model)", "TDPG (a/model)"]
     beside = tmp_path / "d" / "a" / "model.zip"
     beside.parent.mkdir(parents=True)
     tiny_tdpg().save(beside)
-    assert list(_load([*paths, beside], TRAINING))[3] == f"TDPG ({beside})"
+    assert list(load_models([*paths, beside], TRAINING))[3] == f"TDPG ({beside})"
 
 
 @pytest.mark.slow

@@ -91,7 +91,12 @@ def test_a_second_stage_starts_from_the_policy_of_the_first(tmp_path, tiny):
     complete_run(run, tmp_path / "first", BALL_CATCH[:1], n_eval_episodes=2)
     # A rate of zero: what is found is what it started from.
     second = Run(
-        "TDPG", "BallCatch-v0", "BallCatch-v0", 0, {"n_timesteps": 100, "learning_rate": 0.0}, start=tmp_path / "first"
+        "TDPG",
+        "BallCatch-v0",
+        "BallCatch-v0-two-stages",
+        0,
+        {"n_timesteps": 100, "learning_rate": 0.0},
+        start=tmp_path / "first",
     )
     complete_run(second, tmp_path / "second", BALL_CATCH[:1], n_eval_episodes=2)
     costs = [pd.read_csv(tmp_path / name / "episodes.csv")["cost"].to_numpy() for name in ("first", "second")]

@@ -1,0 +1,122 @@
+"""Certify saved policies under a declared nuisance: upper bounds on their cost for random members of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from tqdm import tqdm
+
+from sb3_tdpg.certificates.lava import wall_cost
+from sb3_tdpg.certificates.models import load_models
+from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes
+from sb3_tdpg.common.files import write_atomically
+from sb3_tdpg.common.markdown import markdown_table
+from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.threads import threads
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.robustness.nuisance import OneMember, make_nuisance
+
+FAMILY = "a member for each episode"
+
+
+def certify_nuisance(
+    models: Sequence[Path],
+    env_id: str,
+    declared: Any,
+    out: Path,
+    *,
+    cost_bound: float | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    n_members: int = 1000,
+    n_episodes: int = 100_000,
+    n_budget_episodes: int = 20_000,
+    n_test_episodes: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> str:
+    """
+    Certify policies under a declared nuisance, and compare the bounds with the cost that they have under it.
+
+    The first row of a model is the whole family, a member for each episode; the others are one random member each.
+
+    :param models: Files that ``model.save()`` wrote.
+    :param env_id: The training environment, one of this package.
+    :param declared: See :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`.
+    :param out: Folder for ``summary.md``, ``nuisance.csv`` and ``config.json``.
+    :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
+        the cost of standing at the wall.
+    :param env_kwargs: Keywords of the training environment.
+    :param n_members: Number of random members.
+    :param n_episodes: Recorded training episodes.
+    :param n_budget_episodes: Recorded episodes whose observations are changed, for each member.
+    :param n_test_episodes: Episodes under each member, to measure the cost.
+    :param confidence: Confidence of each certificate.
+    :param seed: Seed of the episodes and of the members.
+    :return: the summary, as Markdown
+    :raises ValueError: if an argument is wrong; no episode has been run by then.
+    """
+    if n_test_episodes < 2 or n_members < 1:
+        raise ValueError(f"n_test_episodes={n_test_episodes} must be at least 2, n_members={n_members} at least 1")
+    training = Scenario("Training", env_id, dict(env_kwargs or {}))
+    loaded = load_models(models, training)
+    if cost_bound is None and env_id.rpartition(":")[2] != "Lava-v0":
+        raise ValueError(f"cost_bound is needed for {env_id}: an upper bound on the cost of an episode")
+    cost_bound = wall_cost(next(iter(loaded.values())).horizon) if cost_bound is None else cost_bound
+    out.mkdir(parents=True, exist_ok=True)
+    n_budget_episodes = min(n_budget_episodes, n_episodes)
+    settings: dict[str, Any] = dict(n_episodes=n_episodes, cost_bound=cost_bound, confidence=confidence, seed=seed)
+    rows: list[dict[str, Any]] = []
+    with threads(1):
+        for label, model in loaded.items():
+            env = scenario_env(training, model, n_episodes=1, n_envs=1)
+            family = make_nuisance(declared, model.observation_space, env)
+            if family is None:
+                raise ValueError(f"nuisance={declared!r} is none for {model.observation_space}: name the perturbations")
+            print(f"{label}: {n_episodes:,} training episodes")
+            episodes = TrainingEpisodes(model, training, n_budget_episodes=n_budget_episodes, **settings)
+            shifts = [Shift(FAMILY, nuisance=family)]
+            shifts += [Shift(f"member {i}", nuisance=OneMember(family, seed + i)) for i in range(n_members)]
+            for i, shift in enumerate(tqdm(shifts, desc=label)):
+                certified = episodes.certify(shift)
+                costs, measured = episodes.measure(shift, n_test_episodes, seed=seed + 1 + i)
+                error = costs.std(ddof=1) / math.sqrt(len(costs))
+                row = dict(model=label, shift=shift.name, training_cost=episodes.costs.mean(), cost=costs.mean())
+                row.update(standard_error=error, clipped_cost=np.minimum(costs, cost_bound).mean())
+                row.update(bound=certified.bound, kl=certified.budget.kl, exceedance=certified.budget.exceedance)
+                rows.append(row | dict(measured_kl=measured))
+    records = pd.DataFrame(rows)
+    write_frame_atomically(records, out / "nuisance.csv")
+    how = provenance()
+    settings.update(nuisance=str(declared), n_members=n_members, n_budget_episodes=n_budget_episodes)
+    settings.update(n_test_episodes=n_test_episodes, env_id=env_id, env_kwargs=training.env_kwargs)
+    write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
+    text = (
+        f"The trivial bound is {cost_bound:g}: the cost is clipped there. Confidence of each bound: {confidence:.0%}."
+    )
+    summary = "\n\n".join([nuisance_table(records, cost_bound), text, how_made(how["command"], how)]) + "\n"
+    write_atomically(out / "summary.md", summary)
+    return summary
+
+
+def nuisance_table(records: pd.DataFrame, trivial: float) -> str:
+    """Count the members whose cost exceeds the bound, and summarise how wide the bounds are."""
+    rows = []
+    for label, group in records.groupby("model", sort=False):
+        family, members = group[group["shift"] == FAMILY].iloc[0], group[group["shift"] != FAMILY]
+        cost, bound, error = members["clipped_cost"], members["bound"], members["standard_error"]
+        above = cost - bound
+        row = {"policy": label, "cost in training": f"{family['training_cost']:.3g}"}
+        row["a member for each episode: cost, bound"] = f"{family['clipped_cost']:.3g}, {family['bound']:.3g}"
+        row |= {"random members": len(members), "cost above the bound": int((above > 0).sum())}
+        row["by more than 3 standard errors"] = int((above > 3 * error).sum())
+        row["bound below the trivial one"] = int((bound < 0.999 * trivial).sum())
+        quantiles = (bound - cost).quantile([0.1, 0.5, 0.9])
+        row["bound - cost: median [10 %, 90 %]"] = "{1:.3g} [{0:.3g}, {2:.3g}]".format(*quantiles)
+        rows.append(row)
+    return markdown_table(rows)

@@ -1,0 +1,469 @@
+"""The nuisance: its declaration, its members, the phase that removes it, and the bound on what is known of it."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_problems import assert_same_parameters, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+from torch.distributions import Normal
+from torch.nn.functional import avg_pool2d
+
+from sb3_tdpg import TDPG, make_episodes_env
+from sb3_tdpg.cli import main
+from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.features import TRVCnn
+from sb3_tdpg.information.nuisance import action_divergence, behaviour, encoder_divergence
+from sb3_tdpg.robustness.nuisance import Members, Nuisance, OneMember, make_nuisance
+
+IMAGES = spaces.Box(0, 255, (3, 24, 24), np.uint8)
+DEPTH = spaces.Box(0.2, 0.7, (1, 16, 16), np.float32)
+VECTOR = spaces.Box(-1, 1, (2,), np.float32)
+PARTS = spaces.Dict(camera=IMAGES, arm=VECTOR)
+
+
+def ball_env(n=6, **kwargs):
+    return make_episodes_env("BallCatch-v0", n, env_kwargs=dict(renderer="fast", **kwargs), seed=0)
+
+
+def observed(space, n=4, length=3, seed=0):
+    """Observations of n episodes, a list of steps."""
+    rng = np.random.default_rng(seed)
+
+    def one(part):
+        if isinstance(part, spaces.Dict):
+            return {key: one(x) for key, x in part.items()}
+        high = 256 if part.dtype == np.uint8 else part.high.flat[0]
+        return rng.uniform(part.low.flat[0], high, (n, *part.shape)).astype(part.dtype)
+
+    return [one(space) for _ in range(length)]
+
+
+def shown(members, steps, which=None, states=None):
+    n = len(next(iter(steps[0].values())) if isinstance(steps[0], dict) else steps[0])
+    which = np.arange(n) if which is None else which
+    return [members(step, np.zeros((n, 1)) if states is None else states, which) for step in steps]
+
+
+def rollouts(model):
+    """Roll out an epoch without an update; the batch that the update would get."""
+    model.train = lambda: None
+    train_epochs(model, 1)
+    return model.rollout_buffer.episode_batch()
+
+
+# -- declarations -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("declared", "space"), [
+    ("auto", IMAGES),
+    ({"noise": 1, "dropped_pixels": (1, 4), "brightness": 2}, DEPTH),
+    ("auto", PARTS),
+    ("images", IMAGES),
+    ({"images": dict(color=0.0, held=False)}, IMAGES),
+    ("noise", IMAGES),
+    ({"noise": (1, 3), "contrast": 4, "delay": 2}, IMAGES),
+    ({"vector_bias": (4, 5), "noise": (4, 5)}, PARTS),
+    ({"vector_noise": 5}, VECTOR),
+    (lambda y, rng: y + np.asarray(rng.random(), y.dtype), VECTOR),
+])  # fmt: skip
+def test_a_declared_nuisance_changes_the_observations_and_keeps_shape_and_type(declared, space):
+    nuisance = make_nuisance(declared, space, toy_vec_env(observation_space=space))
+    steps = observed(space)
+    before = [{k: v.copy() for k, v in s.items()} if isinstance(s, dict) else s.copy() for s in steps]
+    for step, unchanged, after in zip(steps, before, shown(nuisance.members(4), steps), strict=True):
+        parts = [(step, unchanged, after)]
+        if isinstance(step, dict):
+            parts = [(step[k], unchanged[k], after[k]) for k in step]
+        for y, copy, changed in parts:
+            np.testing.assert_array_equal(y, copy)
+            assert changed.shape == y.shape and changed.dtype == y.dtype
+        if declared != {"noise": (1, 3), "contrast": 4, "delay": 2}:
+            assert any((y != changed).any() for y, _, changed in parts)
+
+
+@pytest.mark.parametrize(("declared", "space", "fragment"), [
+    ("fog", IMAGES, "perturbation='fog' is unknown"),
+    ("noise", VECTOR, "'noise' does not apply"),
+    ("images", DEPTH, "images of bytes"),
+    ("vector_noise", spaces.Dict(camera=IMAGES), "applies to no part"),
+    ({"noise": 6}, IMAGES, "severity=6"),
+    ({"noise": (3, 1)}, IMAGES, "the lowest and the highest"),
+    ({"images": dict(colour=1)}, IMAGES, "keywords of MixtureNuisance"),
+    ({"images": dict(pattern=2)}, IMAGES, "pattern=2 must be between 0 and 1"),
+    ({}, IMAGES, "must be None, 'auto'"),
+    (3, IMAGES, "must be None, 'auto'"),
+    ({"env_kwargs": dict(texture="violet_dots")}, IMAGES, "needs an environment that can observe a given state"),
+])  # fmt: skip
+def test_a_wrong_declaration_is_explained(declared, space, fragment):
+    with pytest.raises(ValueError, match=fragment):
+        make_nuisance(declared, space, toy_vec_env(observation_space=space))
+
+
+def test_a_function_that_changes_the_shape_is_refused():
+    nuisance = make_nuisance(lambda y, rng: y[:, :1], VECTOR, toy_vec_env())
+    with pytest.raises(ValueError, match=r"shape \(4, 1\).*expected those it was given: \(4, 2\)"):
+        shown(nuisance.members(4), observed(VECTOR))
+
+
+@pytest.mark.parametrize(("arguments", "fragment"), [
+    (dict(nuisance="vector_noise", nuisance_steps=0), "nuisance_steps=0 must be an integer of at least 1"),
+    (dict(nuisance="vector_noise", nuisance_level="both"), "nuisance_level='both' is unknown"),
+    (dict(nuisance="noise"), "does not apply"),
+])  # fmt: skip
+def test_wrong_arguments_are_refused_before_training(arguments, fragment):
+    with pytest.raises(ValueError, match=fragment):
+        tiny_tdpg("Lava-v0", **arguments)
+
+
+def test_the_default_is_a_nuisance_for_images_and_none_for_vectors():
+    assert tiny_tdpg("Lava-v0").nuisance is None
+    assert tiny_tdpg("Lava-v0").nuisance_phase is None
+    assert tiny_tdpg(toy_vec_env(observation_space=DEPTH), beta=math.inf).nuisance is None
+    assert tiny_tdpg(ball_env(20)).nuisance == {"images": {}}
+    assert tiny_tdpg(ball_env(20), nuisance=None).nuisance_phase is None
+
+
+# -- members ----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_held_changes_equal_images_of_an_episode_equally():
+    space = spaces.Box(0, 255, (3, 24, 24), np.uint8)
+    env = toy_vec_env(observation_space=space)
+    steps = [observed(space, length=1)[0]] * 3
+    for held in (True, False):
+        members = make_nuisance({"images": dict(noise=0.0, held=held)}, space, env).members(4)
+        first, second, third = shown(members, steps)
+        assert (first == second).all() == held == (first == third).all()
+    members = make_nuisance({"images": dict(noise=0.0)}, space, env).members(4)
+    first = shown(members, steps[:1])[0]
+    members.begin(np.array([1, 3]))
+    second = shown(members, steps[:1])[0]
+    assert [bool((first[i] == second[i]).all()) for i in range(4)] == [True, False, True, False]
+
+
+def test_every_episode_has_one_family_of_several():
+    space = spaces.Box(-100, 100, (2,), np.float32)
+    declared = dict(vector_bias=5, vector_scale=5)
+    members = make_nuisance(declared, space, toy_vec_env(observation_space=space)).members(400)
+    zeros = [np.zeros((400, 2), np.float32)] * 2
+    first, second = shown(members, zeros)
+    is_biased = (first != 0).any(axis=1)  # a scale leaves zeros as they are
+    np.testing.assert_array_equal(first, second)
+    assert 0.4 < is_biased.mean() < 0.6
+    # Other episodes in another order: the same members.
+    which = np.array([7, 3, 390])
+    np.testing.assert_array_equal(members(zeros[0][:3], np.zeros((3, 1)), which), first[which])
+
+
+def test_another_scene_is_seen_in_the_same_state():
+    env = ball_env()
+    declared = dict(env_kwargs=[dict(texture="violet_dots"), dict(texture="grey_plaster")])
+    nuisance = make_nuisance(declared, env.observation_space, env)
+    images = env.reset()
+    states = np.stack([info["state"] for info in env.reset_infos])
+    members = nuisance.members(6)
+    (seen,) = shown(members, [images], states=states)
+    others = [BallCatchEnv(renderer="fast", **kwargs)._sensor(states) for kwargs in declared["env_kwargs"]]
+    for i in range(6):
+        assert any((seen[i] == other[i]).all() for other in others)
+        assert not (seen[i] == images[i]).all()
+
+
+def test_a_scene_may_redraw_components_of_the_state():
+    env = ball_env()
+    declared = {"env_kwargs": dict(robot_range=(1.0, 1.0)), "redraw": ["d (m)"]}
+    images = env.reset()
+    states = np.stack([info["state"] for info in env.reset_infos])
+    (seen,) = shown(make_nuisance(declared, env.observation_space, env).members(6), [images], states=states)
+    states[:, 0] = 1.0
+    np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast")._sensor(states))
+    with pytest.raises(ValueError, match=r"redraw=\['e'\] are no components of the state: use some of \['d \(m\)'"):
+        make_nuisance({**declared, "redraw": ["e"]}, env.observation_space, env)
+
+
+def test_the_members_follow_torch_and_leave_the_environment_alone():
+    def train(nuisance):
+        model = tiny_tdpg("Lava-v0", nuisance=nuisance, nuisance_steps=2)
+        train_epochs(model, 2)
+        return model
+
+    declared = {"vector_noise": (1, 5), "vector_dropout": 3}
+    assert_same_parameters(parameters(train(declared).policy), parameters(train(declared).policy))
+    first_rollouts = [rollouts(tiny_tdpg("Lava-v0", nuisance=n)).observations for n in (None, declared)]
+    th.testing.assert_close(*first_rollouts, rtol=0, atol=0)
+
+
+# -- the phase --------------------------------------------------------------------------------------------------
+
+
+class Shifted(Nuisance):
+    """A sensor that adds one of some offsets, which the episode keeps."""
+
+    def __init__(self, *offsets):
+        self.offsets = np.array(offsets, np.float32)
+
+    def members(self, n):
+        return ShiftedMembers(self.offsets, n)
+
+
+class ShiftedMembers(Members):
+    def __init__(self, offsets, n):
+        self.offsets, self.offset = offsets, np.zeros(n, np.float32)
+        self.begin(np.arange(n))
+
+    def begin(self, which):
+        self.offset[which] = self.offsets[th.randint(len(self.offsets), (len(which),)).numpy()]
+
+    def __call__(self, observations, states, which):
+        return observations + self.offset[which, None]
+
+
+@pytest.mark.parametrize("level", ["action", "trv"])
+@pytest.mark.parametrize(("env", "settings"), [
+    ("Lava-v0", {}),
+    ("Lava-v0", dict(beta=math.inf, encoder_gradient="pathwise")),
+    ("Lava-v0", dict(policy_kwargs=dict(time_varying=False), bptt_steps=2)),
+    ("Discrete", {}),
+    ("MultiDiscrete", {}),
+])  # fmt: skip
+def test_the_phase_lowers_what_is_known_of_the_nuisance(env, settings, level):
+    actions = dict(Discrete=spaces.Discrete(3), MultiDiscrete=spaces.MultiDiscrete([2, 3])).get(env)
+    env = "Lava-v0" if actions is None else toy_vec_env(2, action_space=actions)
+    settings = dict(nuisance=Shifted(-1.0, 1.0), nuisance_steps=40, nuisance_level=level, learning_rate=1e-2) | settings
+    model = tiny_tdpg(env, **settings)
+    batch = rollouts(model)
+    if not model.policy.time_varying:
+        batch = batch.segments(2)
+    phase, which = model.nuisance_phase, level == "trv"
+    for group in phase.optimizer.param_groups:
+        group["lr"] = 1e-2
+    with th.no_grad():  # a policy that reacts to its observations
+        for parameter in model.policy.encoder.parameters():
+            parameter.mul_(3.0)
+    th.manual_seed(1)
+    perturbed = phase.perturbed(batch)
+    before = [x.mean().item() for x in phase.divergences(batch, perturbed)]
+    known = phase.remove(batch, 5.0, model._check_finite)
+    after = [x.mean().item() for x in phase.divergences(batch, perturbed)]
+    assert after[which] < 0.5 * before[which]
+    assert known.keys() == {"action_kl", "trv_kl", "information"}
+    assert known["information"] == pytest.approx(5.0 * known["trv_kl"])
+    assert known[("action_kl", "trv_kl")[which]] < 0.7 * before[which]
+
+
+def test_on_plain_observations_the_policy_stays_as_it_was():
+    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-1.0, 1.0), nuisance_steps=40)
+    batch = rollouts(model)
+    with th.no_grad():
+        before = behaviour(model.policy, batch, batch.observations)
+        shift = action_divergence(behaviour(model.policy, batch, batch.observations + 1.0), before).mean()
+    model.nuisance_phase.remove(batch, 5.0, model._check_finite)
+    with th.no_grad():
+        moved = action_divergence(behaviour(model.policy, batch, batch.observations), before).mean()
+    assert moved < 0.3 * shift
+
+
+def test_a_nuisance_that_changes_nothing_changes_no_parameter():
+    model = tiny_tdpg("Lava-v0", nuisance=Shifted(0.0), nuisance_steps=5)
+    batch = rollouts(model)
+    before = parameters(model.policy)
+    known = model.nuisance_phase.remove(batch, 5.0, model._check_finite)
+    for name, value in parameters(model.policy).items():
+        th.testing.assert_close(value, before[name], rtol=0, atol=1e-4)  # rounding, and Adam makes it a step
+    assert known["action_kl"] == known["trv_kl"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_divergences_are_those_of_the_two_densities():
+    model = tiny_tdpg("Lava-v0", nuisance=Shifted(1.0))
+    batch = rollouts(model)
+    phase, policy = model.nuisance_phase, model.policy
+    actions, trvs = phase.divergences(batch, batch.observations + 1.0)
+    trv = plain_trv = th.zeros(20, policy.trv_dim)
+    for t in range(model.horizon):
+        at, y, eps = np.full(20, t), batch.observations[t], batch.noise[t]
+        with th.no_grad():
+            shifted, plain = policy.encoder_density(y + 1.0, trv, at), policy.encoder_density(y, trv, at)
+            expected = th.distributions.kl_divergence(Normal(*shifted), Normal(*plain)).sum(1)
+            th.testing.assert_close(trvs[t], expected, rtol=1e-4, atol=1e-6)
+            mean, std = policy.encoder_density(y, plain_trv, at)
+            trv, plain_trv = shifted[0] + shifted[1] * eps, mean + std * eps
+            p, q = (policy.action_density(x, at).distribution for x in (trv, plain_trv))
+            expected = th.distributions.kl_divergence(p, q).sum(1)
+            th.testing.assert_close(actions[t], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_under_the_nuisance_the_policy_sees_it_and_the_buffer_keeps_both():
+    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-5.0, 5.0), nuisance_level="trv")
+    batch = rollouts(model)
+    difference = batch.observations - batch.plain_observations
+    assert (difference.abs() - 5.0).abs().max() < 1e-5
+    assert (difference == difference[:1, :, :1]).float().mean() > 0.5  # one offset for an episode, up to rounding
+    assert (difference[0, :, 0] > 0).float().mean().item() == pytest.approx(0.5, abs=0.4)
+    with th.no_grad():
+        now = behaviour(model.policy, batch, batch.observations)
+    th.testing.assert_close(now.trvs, batch.trvs, rtol=1e-4, atol=1e-5)  # the policy acted on what it was shown
+
+
+def test_the_sum_over_time_bounds_the_information_about_the_nuisance():
+    """Of two equally likely members; the exact information by Monte Carlo, on whole episodes of TRVs."""
+    model = tiny_tdpg("Lava-v0", n_episodes=2000, nuisance=Shifted(-4.0, 4.0), nuisance_level="trv")
+    batch = rollouts(model)
+    policy, plain = model.policy, batch.plain_observations
+    with th.no_grad():
+        p = behaviour(policy, batch, batch.observations)
+        bound = encoder_divergence(policy, p, batch, plain).sum(0).mean().item()
+        # The density of an episode's TRVs under each member, given the states and the plain sensor's noise.
+        log_likelihoods = []
+        for offset in (-4.0, 4.0):
+            shifted = batch._replace(observations=plain + offset)
+            q = policy.episode_encoder_density(policy.episode_features(shifted), shifted)
+            log_likelihoods.append(q.log_prob(batch.trvs).sum((0, 2)))
+    joint = th.stack(log_likelihoods)
+    own = th.where(batch.observations[0, :, 0] < plain[0, :, 0], joint[0], joint[1])
+    information = (own - (th.logsumexp(joint, 0) - math.log(2))).mean().item()
+    assert 0.001 < information <= bound
+    assert information < math.log(2)
+
+
+def test_a_function_that_returns_nan_stops_with_the_parameters_of_before():
+    model = tiny_tdpg("Lava-v0", nuisance=lambda y, rng: y + np.float32(np.nan))
+    batch = rollouts(model)
+    before = parameters(model.policy)
+    with pytest.raises(ValueError, match="the nuisance returned observations that are NaN or infinite"):
+        model.nuisance_phase.remove(batch, 5.0, model._check_finite)
+    assert_same_parameters(parameters(model.policy), before)
+
+
+# -- the model --------------------------------------------------------------------------------------------------
+
+
+def test_a_loaded_model_goes_on_and_the_nuisance_may_be_changed(tmp_path):
+    plain = tiny_tdpg("Lava-v0")
+    train_epochs(plain, 1)
+    plain.save(tmp_path / "plain")
+    env = make_episodes_env("Lava-v0", 20, seed=0)
+    model = TDPG.load(tmp_path / "plain", env=env, nuisance={"vector_noise": 3}, nuisance_steps=2)
+    train_epochs(model, 1)
+    assert model.nuisance_phase.optimizer.state
+    model.save(tmp_path / "model")
+    assert TDPG.load(tmp_path / "model").nuisance == {"vector_noise": 3}  # without an environment
+    again = TDPG.load(tmp_path / "model", env=env)
+    first, second = (m.nuisance_phase.optimizer.state_dict()["state"][0]["exp_avg"] for m in (model, again))
+    th.testing.assert_close(first, second)
+    without = TDPG.load(tmp_path / "model", env=env, nuisance=None)
+    assert without.nuisance_phase is None
+    train_epochs(without, 1)
+
+
+def test_the_log_shows_what_is_known_of_the_nuisance():
+    model = tiny_tdpg("Lava-v0", nuisance="vector_bias", nuisance_steps=2)
+    train_epochs(model, 1)
+    logged = model.logger.name_to_value
+    assert {"nuisance/action_kl", "nuisance/trv_kl", "nuisance/information"} <= logged.keys()
+
+
+def test_training_on_images_with_the_default_makes_the_actions_less_sensitive():
+    def known(nuisance):
+        model = tiny_tdpg(ball_env(20), nuisance=nuisance, nuisance_steps=30, policy_kwargs={}, seed=1)
+        train_epochs(model, 3)
+        judge = TDPG("TRVPolicy", ball_env(20), n_episodes=20, seed=2).nuisance_phase
+        judge.policy = model.policy
+        batch = rollouts(model)
+        th.manual_seed(3)
+        return judge.divergences(batch, judge.perturbed(batch))[0].mean().item()
+
+    assert known("auto") < 0.5 * known(None)
+
+
+def test_other_seeds_train_other_policies():
+    models = [tiny_tdpg("Lava-v0", nuisance="vector_bias", nuisance_steps=2, seed=seed) for seed in (0, 1)]
+    for model in models:
+        train_epochs(model, 1)
+    assert not same_parameters(*(parameters(model.policy) for model in models))
+
+
+# -- the encoder ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(3, 24, 24), (1, 25, 26), (3, 26, 25)])
+def test_pixels_are_pooled_to_their_means(shape):
+    space = spaces.Box(0, 255, shape, np.uint8)
+    cnn = TRVCnn(space, pool=2)
+    images = th.as_tensor(observed(space, n=5, length=1)[0])
+    pooled = cnn.pooled(images)
+    th.testing.assert_close(pooled, avg_pool2d(images.float(), 2))
+    th.testing.assert_close(cnn.pooled(images.contiguous(memory_format=th.channels_last)), pooled)
+    assert cnn.pooled(pooled) is pooled
+    th.testing.assert_close(cnn(images / 255.0), cnn(pooled / 255.0))
+
+
+def test_a_texture_finer_than_the_layers_step_is_seen_as_its_mean():
+    """Stripes of one pixel that move by a pixel: without pooling, the features of a random layer move with them."""
+    space = spaces.Box(0, 255, (3, 24, 24), np.uint8)
+    stripes = np.zeros((2, 3, 24, 24), np.uint8)
+    stripes[0, :, :, ::2] = stripes[1, :, :, 1::2] = 255
+    th.manual_seed(0)
+    moved = {
+        pool: th.diff(TRVCnn(space, pool=pool)(th.as_tensor(stripes) / 255.0), dim=0).abs().max() for pool in (1, 2)
+    }
+    assert moved[2] < 1e-6 < 0.1 < moved[1]
+
+
+def test_small_images_are_not_pooled():
+    assert TRVCnn(spaces.Box(0, 255, (3, 16, 16), np.uint8), pool=2).pool == 1
+    assert TRVCnn(spaces.Box(0, 255, (3, 20, 40), np.uint8), pool=2).pool == 2
+
+
+def test_a_model_of_an_early_version_keeps_its_encoder(tmp_path):
+    model = tiny_tdpg(ball_env(20), policy_kwargs={})
+    assert model.policy.features_extractor.pool == 2
+    model.preset = None
+    model.policy_kwargs = {}
+    model._setup_model()  # as in a file that knows of no preset
+    assert model.policy.features_extractor.pool == 1
+
+
+# -- certificates -----------------------------------------------------------------------------------------------
+
+
+def test_one_member_of_a_family_is_the_same_for_all_episodes_and_every_time():
+    steps = observed(VECTOR, n=1) * 2
+    steps = [np.repeat(step, 4, axis=0) for step in steps]
+    family = make_nuisance("vector_bias", VECTOR, toy_vec_env(observation_space=VECTOR))
+    before = th.get_rng_state()
+    first, again, other = (shown(OneMember(family, seed).members(4), steps) for seed in (1, 1, 2))
+    assert (th.get_rng_state() == before).all()
+    np.testing.assert_array_equal(first, again)
+    assert (first[0] == first[0][:1]).all()
+    assert (np.array(first) != np.array(other)).any()
+
+
+def test_certified_bounds_hold_for_random_members(tmp_path):
+    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias", nuisance_level="trv")
+    train_epochs(model, 3)
+    model.save(tmp_path / "model.zip")
+    declared = "{vector_noise: [1, 5], vector_bias: 2}"
+    command = ["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--nuisance", declared, "--members", "20"]
+    main([*command, "--n-episodes", "2000", "--n-test-episodes", "200", "--out", str(tmp_path / "out")])
+    records = pd.read_csv(tmp_path / "out" / "nuisance.csv")
+    assert len(records) == 21
+    assert (records["clipped_cost"] <= records["bound"]).all()
+    assert records["kl"].nunique() > 15  # another member, another divergence
+    assert (records["measured_kl"] <= records["kl"] + 1e-6).mean() > 0.9
+    assert "random members" in (tmp_path / "out" / "summary.md").read_text()
+
+
+@pytest.mark.parametrize(("arguments", "fragment"), [
+    (["--nuisance", "vector_bias", "--random-shifts", "3"], "leave them or --nuisance out"),
+    (["--nuisance", "{"], "is not YAML"),
+    (["--nuisance", "fog"], "perturbation='fog' is unknown"),
+    (["--nuisance", "auto"], "is none for"),
+])  # fmt: skip
+def test_wrong_arguments_of_certify_are_explained(arguments, fragment, tmp_path, capsys):
+    model = tiny_tdpg("Lava-v0")
+    model.save(tmp_path / "model.zip")
+    assert main(["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--out", str(tmp_path), *arguments]) != 0
+    assert fragment in capsys.readouterr().err
