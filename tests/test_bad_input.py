@@ -19,6 +19,7 @@ from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointC
 from sb3_tdpg.envs.lava import LavaEnv
 
 IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
+DEPTH = spaces.Box(0.2, 0.7, (1, 16, 16), np.float32)
 
 
 def lava(n=20, **kwargs):
@@ -41,9 +42,14 @@ ARGUMENTS = {
     "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
     "beta a string": (dict(beta="0.1"), "beta='0.1'", "positive number"),
     "beta auto without a limit": (dict(beta="auto"), "beta='auto'", "cost_limit=", "reward_threshold", "inf"),
-    "image without beta or limit": (
-        dict(env=toy_vec_env(observation_space=IMAGE)), "beta='auto'", "cost_limit=", "reward_threshold"
+    "depth image without beta or limit": (
+        dict(env=toy_vec_env(observation_space=DEPTH)), "beta='auto'", "cost_limit=", "reward_threshold"
     ),
+    "nuisance unknown": (dict(nuisance="fog"), "'fog' is unknown", "vector_noise"),
+    "nuisance of another kind": (dict(nuisance="contrast"), "'contrast' does not apply", "images"),
+    "nuisance a number": (dict(nuisance=3), "nuisance=3 must be None, 'auto'", "a function of the observations"),
+    "nuisance_steps zero": (dict(nuisance="vector_noise", nuisance_steps=0), "nuisance_steps=0", "nuisance=None"),
+    "nuisance_level unknown": (dict(nuisance="vector_noise", nuisance_level="all"), "nuisance_level='all'", "trv"),
     "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
     "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
     "cost_limit beside a number for beta": (
