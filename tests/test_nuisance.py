@@ -90,6 +90,7 @@ def test_a_declared_nuisance_changes_the_observations_and_keeps_shape_and_type(d
     ("images", DEPTH, "images of bytes"),
     ("vector_noise", spaces.Dict(camera=IMAGES), "applies to no part"),
     ({"noise": 6}, IMAGES, "severity=6"),
+    ("vector_noise", spaces.Dict(arm=spaces.Box(-np.inf, np.inf, (2,))), "needs finite bounds of"),
     ({"noise": (3, 1)}, IMAGES, "the lowest and the highest"),
     ({"images": dict(colour=1)}, IMAGES, "keywords of MixtureNuisance"),
     ({"images": dict(pattern=2)}, IMAGES, "pattern=2 must be between 0 and 1"),

@@ -22,6 +22,7 @@ from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import N_SEVERITIES, find
 from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.sensor import finite_range
 from sb3_tdpg.robustness.training import ImageMixture
 
 Observations = Any
@@ -328,10 +329,10 @@ def declaration(declared: Any, space: spaces.Space) -> Any:
     return {IMAGES: {}} if any(_applies(IMAGES, part) for part in parts) else None
 
 
-def _named(name: str, value: Any, space: spaces.Space, env: VecEnv) -> list[Nuisance]:
-    """Return one family for each severity, or the mixture."""
+def _named(name: str, value: Any, space: spaces.Space, env: VecEnv | None) -> list[Nuisance]:
+    """Return one family for each severity, or the mixture; a part of a ``Dict`` has no environment of its own."""
     if isinstance(space, spaces.Dict):
-        by_key = {key: _named(name, value, part, env) for key, part in space.items() if _applies(name, part)}
+        by_key = {key: _named(name, value, part, None) for key, part in space.items() if _applies(name, part)}
         if not by_key:
             raise ValueError(f"nuisance={name!r} applies to no part of the observation space {space}")
         return [PartsNuisance(dict(zip(by_key, row, strict=True))) for row in zip(*by_key.values(), strict=True)]
@@ -347,7 +348,14 @@ def _named(name: str, value: Any, space: spaces.Space, env: VecEnv) -> list[Nuis
         find(name).value(severity)
     if low > high:
         raise ValueError(f"nuisance={{{name!r}: {value!r}}} must be a severity, or the lowest and the highest one")
-    scale = default_scale(space, env) if find(name).kind == "vector" else None
+    scale = None
+    if find(name).kind == "vector":
+        if env is None and not np.isfinite(finite_range(space)).all():  # type: ignore[arg-type]
+            raise ValueError(
+                f"the nuisance {name!r} needs finite bounds of {space}, a part of the observation, as its unit: give "
+                "the space such bounds, or a function as the nuisance"
+            )
+        scale = default_scale(space, env)  # type: ignore[arg-type]
     return [PerturbationNuisance(name, severity, space, scale) for severity in range(low, high + 1)]
 
 
