@@ -133,13 +133,15 @@ class NuisancePhase:
         :param batch: The rollouts: whole episodes, or segments of them.
         :param episode_length: Mean number of steps of an episode.
         :param check_finite: Called with a name and the loss; raises an error unless it is finite.
-        :return: ``action_kl`` and ``trv_kl`` in nats a step and ``information`` in nats an episode, of the new policy
-            on fresh perturbations
+        :return: ``action_kl`` and ``trv_kl`` in nats a step and ``information`` in nats an episode, of the new policy;
+            with plain rollouts on fresh perturbations
         """
-        parts = [batch.select(columns) for columns in self._minibatches(batch)]
+        minibatches = self._minibatches(batch)
         with th.no_grad():  # the policy as it is now, for all steps
+            parts = map(batch.select, minibatches)  # one at a time: images need room
             teachers = [behaviour(self.policy, part, part.observations) for part in parts]
-        for part, teacher in zip(parts, teachers, strict=True):
+        for columns, teacher in zip(minibatches, teachers, strict=True):
+            part = batch.select(columns)
             n, perturbed = part.alive.sum(), self.perturbed(part)
             if self.level == "action":
                 invariance = action_divergence(behaviour(self.policy, part, perturbed), teacher)
