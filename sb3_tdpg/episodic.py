@@ -162,7 +162,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     @property
     def perturbs_rollouts(self) -> bool:
         """Whether the policy of the rollouts sees perturbed observations."""
-        return self.nuisance_phase is not None and self.nuisance_phase.level == "trv"
+        return self.nuisance_phase is not None and self.nuisance_phase.level != "action"
 
     # -- rollouts ---------------------------------------------------------------------------------------------
 

@@ -123,7 +123,7 @@ def test_the_default_is_a_nuisance_for_images_and_none_for_vectors():
     assert tiny_tdpg("Lava-v0").nuisance is None
     assert tiny_tdpg("Lava-v0").nuisance_phase is None
     assert tiny_tdpg(toy_vec_env(observation_space=DEPTH), beta=math.inf).nuisance is None
-    assert tiny_tdpg(ball_env(20)).nuisance == {"images": {}}
+    assert tiny_tdpg(ball_env(20)).nuisance == {"images": {"held": False}}
     assert tiny_tdpg(ball_env(20), nuisance=None).nuisance_phase is None
 
 
@@ -277,6 +277,31 @@ def test_a_nuisance_that_changes_nothing_changes_no_parameter():
     assert known["action_kl"] == known["trv_kl"] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_in_rollouts_the_policy_gradient_alone_removes_the_nuisance_and_what_is_left_is_measured():
+    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-1.0, 1.0), nuisance_level="rollouts")
+    batch = rollouts(model)
+    before = parameters(model.policy)
+    known = model.nuisance_phase.remove(batch, 5.0, model._check_finite)
+    assert all(th.equal(value, before[name]) for name, value in parameters(model.policy).items())
+    assert known["information"] == pytest.approx(5.0 * known["trv_kl"]) and known["trv_kl"] > 0
+
+
+@pytest.mark.parametrize(("nuisance", "level", "expected"), [
+    ("auto", "auto", ("rollouts", {"images": {"held": False}})),
+    ("auto", "action", ("action", {"images": {"held": True}})),
+    ({"noise": 2}, "auto", ("action", {"noise": 2})),
+    (None, "auto", ("auto", None)),
+])  # fmt: skip
+def test_images_have_the_nuisance_in_the_rollouts_unless_one_is_declared(tmp_path, nuisance, level, expected):
+    model = tiny_tdpg(ball_env(4), n_episodes=4, nuisance=nuisance, nuisance_level=level, policy_kwargs={})
+    assert (model.nuisance_level, model.nuisance) == expected
+    assert model.perturbs_rollouts == (expected[0] == "rollouts")
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=model.env)
+    assert (loaded.nuisance_level, loaded.nuisance) == expected
+    assert loaded.perturbs_rollouts == model.perturbs_rollouts
+
+
 def test_the_divergences_are_those_of_the_two_densities():
     model = tiny_tdpg("Lava-v0", nuisance=Shifted(1.0))
     batch = rollouts(model)
@@ -296,8 +321,9 @@ def test_the_divergences_are_those_of_the_two_densities():
             th.testing.assert_close(actions[t], expected, rtol=1e-4, atol=1e-6)
 
 
-def test_under_the_nuisance_the_policy_sees_it_and_the_buffer_keeps_both():
-    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-5.0, 5.0), nuisance_level="trv")
+@pytest.mark.parametrize("level", ["rollouts", "trv"])
+def test_under_the_nuisance_the_policy_sees_it_and_the_buffer_keeps_both(level):
+    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-5.0, 5.0), nuisance_level=level)
     batch = rollouts(model)
     difference = batch.observations - batch.plain_observations
     assert (difference.abs() - 5.0).abs().max() < 1e-5
@@ -366,11 +392,24 @@ def test_the_log_shows_what_is_known_of_the_nuisance():
     assert {"nuisance/action_kl", "nuisance/trv_kl", "nuisance/information"} <= logged.keys()
 
 
-def test_training_on_images_with_the_default_makes_the_actions_less_sensitive():
+def test_with_the_default_for_images_the_policy_sees_changed_ones_each_with_its_own_change():
+    model = tiny_tdpg(ball_env(20), policy_kwargs={})
+    batch = rollouts(model)
+    change = batch.observations.float() - batch.plain_observations.float()
+    by_image = change.abs().mean(dim=(2, 3, 4))
+    assert (by_image > 5).float().mean() > 0.8
+    assert (by_image.std(dim=0) > 5).all()  # an image that is held would have nearly the same at all steps
+    with th.no_grad():
+        now = behaviour(model.policy, batch, batch.observations)
+    th.testing.assert_close(now.trvs, batch.trvs, rtol=1e-3, atol=1e-4)
+
+
+def test_the_phase_on_images_makes_the_actions_less_sensitive():
     def known(nuisance):
-        model = tiny_tdpg(ball_env(20), nuisance=nuisance, nuisance_steps=30, policy_kwargs={}, seed=1)
+        settings = dict(nuisance=nuisance, nuisance_level="action", nuisance_steps=30)
+        model = tiny_tdpg(ball_env(20), **settings, policy_kwargs={}, seed=1)
         train_epochs(model, 3)
-        judge = TDPG("TRVPolicy", ball_env(20), n_episodes=20, seed=2).nuisance_phase
+        judge = TDPG("TRVPolicy", ball_env(20), nuisance_level="action", n_episodes=20, seed=2).nuisance_phase
         judge.policy = model.policy
         batch = rollouts(model)
         th.manual_seed(3)

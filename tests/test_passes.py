@@ -270,7 +270,7 @@ def test_vectors_are_learnt_from_as_in_the_paper():
 
 def test_images_are_learnt_from_with_ppos_passes_and_without_a_penalty_on_what_is_known_of_the_state():
     model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
-    assert (model.beta, model.nuisance, model.nuisance_steps) == (math.inf, {"images": {}}, 24)
+    assert (model.beta, model.nuisance, model.nuisance_level) == (math.inf, {"images": {"held": False}}, "rollouts")
     assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 80, 0.2)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
     assert model.env.num_envs == 160

@@ -24,7 +24,7 @@ import torch as th
 from torch.distributions import Distribution, Normal, kl_divergence
 
 BATCH_STEPS = 400  # of a gradient step: 16 episodes of 25 steps
-LEVELS = ("action", "trv")
+LEVELS = ("rollouts", "action", "trv")
 
 
 class Behaviour(NamedTuple):
@@ -81,9 +81,12 @@ class NuisancePhase:
     ``level="trv"``: rollouts are perturbed, and the first term is the divergence of the encoder above, whose sum
     over time bounds the information; the second one keeps the actions on perturbed observations.
 
+    ``level="rollouts"``: rollouts are perturbed, and the policy gradient alone removes what the task does not need. The
+    phase takes no steps, and measures what is left.
+
     :param policy: A :class:`~sb3_tdpg.TRVPolicy`.
     :param n_steps: Gradient steps of a phase.
-    :param level: ``"action"`` or ``"trv"``.
+    :param level: ``"rollouts"``, ``"action"`` or ``"trv"``.
     """
 
     nuisance: Any = None
@@ -136,7 +139,7 @@ class NuisancePhase:
         :return: ``action_kl`` and ``trv_kl`` in nats a step and ``information`` in nats an episode, of the new policy;
             with plain rollouts on fresh perturbations
         """
-        minibatches = self._minibatches(batch)
+        minibatches = [] if self.level == "rollouts" else self._minibatches(batch)
         with th.no_grad():  # the policy as it is now, for all steps
             parts = map(batch.select, minibatches)  # one at a time: images need room
             teachers = [behaviour(self.policy, part, part.observations) for part in parts]

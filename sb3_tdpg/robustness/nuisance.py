@@ -319,14 +319,18 @@ def make_nuisance(declared: Any, space: spaces.Space, env: VecEnv) -> Nuisance |
     return families[0] if len(families) == 1 else UnionNuisance(families)
 
 
-def declaration(declared: Any, space: spaces.Space) -> Any:
-    """Replace ``"auto"`` and the name of a perturbation by the dict that it stands for."""
+def declaration(declared: Any, space: spaces.Space, **images: Any) -> Any:
+    """
+    Replace ``"auto"`` and the name of a perturbation by the dict that it stands for.
+
+    :param images: Keywords of :class:`MixtureNuisance` for ``"auto"``.
+    """
     if not isinstance(declared, str):
         return declared
     if declared != "auto":
         return {declared: {} if declared == IMAGES else (1, N_SEVERITIES)}
     parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-    return {IMAGES: {}} if any(_applies(IMAGES, part) for part in parts) else None
+    return {IMAGES: images} if any(_applies(IMAGES, part) for part in parts) else None
 
 
 def _named(name: str, value: Any, space: spaces.Space, env: VecEnv | None) -> list[Nuisance]:
