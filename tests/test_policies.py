@@ -388,7 +388,7 @@ def test_images_train_in_either_layout(space, tmp_path):
     assert model.rollout_buffer.observations.dtype == np.uint8
     assert model.rollout_buffer.observations.shape == (3, 20, 3, 20, 16)
     state = model.rollout_buffer.states[0, :, 0]
-    shown = model.rollout_buffer.observations[0, :, 0, 0, 0]
+    shown = model.rollout_buffer.plain_observations[0, :, 0, 0, 0]
     np.testing.assert_array_equal(shown, (127 * (state + 1)).astype(np.uint8))
     env = ToyEnv(observation_space=space)
     observation, _ = env.reset(seed=0)
