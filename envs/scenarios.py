@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -54,16 +54,20 @@ class Scenario:
     :param env_id: A registered Gymnasium id.
     :param env_kwargs: Keywords of the environment's constructor.
     :param paper: The paper's numbers by method ("PG", "TDPG").
+    :param sensor: A wrapper of an SB3 ``VecEnv`` that changes what the sensor shows.
+    :param n_episodes: Episodes of this row; default: those of the table.
     """
 
     name: str
     env_id: str
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     paper: Mapping[str, PaperResult] = field(default_factory=dict)
+    sensor: Callable[[Any], Any] | None = None
+    n_episodes: int | None = None
 
     def with_kwargs(self, **env_kwargs: Any) -> Scenario:
         """Return the same row with further keywords (the row's own win)."""
-        return Scenario(self.name, self.env_id, {**env_kwargs, **self.env_kwargs}, self.paper)
+        return replace(self, env_kwargs={**env_kwargs, **self.env_kwargs})
 
 
 def _lava(name: str, variance: float, pg: PaperResult, tdpg: PaperResult) -> Scenario:

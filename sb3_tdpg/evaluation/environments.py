@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gymnasium import spaces
@@ -13,23 +13,19 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
 from sb3_tdpg.vec_env import make_episodes_env
 
-EnvWrapper = Callable[[VecEnv], VecEnv]  # for instance a perturbation
 
-
-def scenario_env(
-    scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int | None = None, sensor: EnvWrapper | None = None
-) -> VecEnv:
+def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int | None = None) -> VecEnv:
     """
     Make a new environment of a scenario (see ``make_episodes_env``), wrapped as an SB3 model needs it.
 
     If the model's own environment normalises observations (``VecNormalize``), the new one does so with the same
-    statistics, frozen. A ``sensor`` is put around the environment, inside the wrappers of the model.
+    statistics, frozen. The scenario's ``sensor`` is put around the environment, inside the wrappers of the model.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
     )
-    if sensor is not None:
-        env = sensor(env)
+    if scenario.sensor is not None:
+        env = scenario.sensor(env)
     if (normalize := model.get_vec_normalize_env()) is not None:
         normalize = copy.copy(normalize)  # without an environment
         normalize.set_venv(env)

@@ -15,7 +15,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation.environments import EnvWrapper, check_models_fit, scenario_env
+from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import is_monitored, rollout
 from sb3_tdpg.problem import read_problem
@@ -51,7 +51,7 @@ def evaluate_scenarios(
 
     :param model: One SB3 model, or several by their label.
     :param scenarios: The rows of the table to make.
-    :param n_episodes: Number of episodes of each model in each scenario.
+    :param n_episodes: Number of episodes of each model in each scenario that has no number of its own.
     :param seed: Seed of the environments and of the policies' sampling.
     :param deterministic: Act without noise. The default is the stochastic policy, which the paper's tables use.
     :param env_kwargs: Keywords for the environments of all scenarios; a scenario's own keywords take precedence.
@@ -66,7 +66,8 @@ def evaluate_scenarios(
     check_models_fit(models, rows)
 
     frames = []
-    with tqdm(total=len(models) * len(rows) * n_episodes, unit="episode", disable=not progress_bar) as progress:
+    total = len(models) * sum(row.n_episodes or n_episodes for row in rows)
+    with tqdm(total=total, unit="episode", disable=not progress_bar) as progress:
         for label, each in models.items():
             for scenario in rows:
                 progress.set_description(f"{label}, {scenario.name}")
@@ -85,17 +86,18 @@ def run_episodes(
     *,
     seed: int,
     deterministic: bool = False,
-    sensor: EnvWrapper | None = None,
     at_end: Callable[[], Any] = lambda: None,
 ) -> pd.DataFrame:
     """
-    Run one model in one scenario that it fits; see :func:`evaluate_scenarios`, and for ``sensor`` ``scenario_env``.
+    Run one model in one scenario that it fits; see :func:`evaluate_scenarios`.
 
+    :param n_episodes: Number of episodes, unless the scenario has its own.
     :param at_end: Called at the end of each episode.
     :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``:
         first the first episodes of all environments, then the second ones, and so on
     """
-    env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES), sensor=sensor)
+    n_episodes = scenario.n_episodes or n_episodes
+    env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES))
     returns, monitored = np.zeros(env.num_envs), is_monitored(env)
     ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and environment
     with contextlib.closing(env):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +50,12 @@ def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
     def sensor(env: VecEnv) -> VecEnv:
         return PerturbedVecEnv(env, row.perturbation, row.severity, seed=plan.seed, scale=plan.scale)
 
-    how: dict[str, Any] = dict(seed=plan.seed, deterministic=plan.deterministic)
-    how["sensor"] = sensor if row.kind == "sensor" else None
+    scenario = replace(row.scenario, sensor=sensor) if row.kind == "sensor" else row.scenario
     labels = dict(perturbation=row.perturbation, severity=row.severity, kind=row.kind)
     frames = []
     for label, of_method in models.items():
         for number, model in enumerate(of_method):
-            frame = run_episodes(model, row.scenario, plan.n_episodes, **how)
+            frame = run_episodes(model, scenario, plan.n_episodes, seed=plan.seed, deterministic=plan.deterministic)
             frames.append(frame.assign(model=label, train_seed=number, **labels))
     records = pd.concat(frames, ignore_index=True)
     keys = ("model", "train_seed", "perturbation", "severity", "kind")

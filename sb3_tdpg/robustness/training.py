@@ -104,23 +104,27 @@ class ImageMixture:
 
 class VecImagePerturbation(VecEnvWrapper):
     """
-    Change every image of a vectorised environment by an :class:`ImageMixture`, with new random numbers for each.
+    Change every image of a vectorised environment by an :class:`ImageMixture`.
 
     The true state does not change. The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound
     the information about everything in the image, so what an encoder keeps of these changes counts as information.
     TDPG's ``nuisance`` removes it without changing the images of the rollouts.
 
     :param venv: Environments with images of bytes, channels first or last.
+    :param held: Whether an episode keeps what was drawn at its beginning, but for the noise; else every image has its
+        own.
     :param strengths: See :class:`ImageMixture`.
     :raises ValueError: if the observations are not images of bytes, or a strength is out of its range.
     """
 
-    def __init__(self, venv: VecEnv, **strengths: float) -> None:
+    def __init__(self, venv: VecEnv, *, held: bool = False, **strengths: float) -> None:
         super().__init__(venv)
         space = venv.observation_space
         if not (isinstance(space, spaces.Box) and is_image_space(space)):
             raise ValueError(f"VecImagePerturbation takes images of bytes (uint8, 0 to 255), not {space}")
         self.mixture = ImageMixture(**strengths)
+        self.held = held
+        self._drawn: Drawn = {}  # of the running episodes
         self._channels_last = space.shape[0] > space.shape[2]
 
     def reset(self) -> np.ndarray:
@@ -133,11 +137,24 @@ class VecImagePerturbation(VecEnvWrapper):
         """Step, and perturb the images."""
         images, rewards, dones, infos = self.venv.step_wait()
         assert isinstance(images, np.ndarray)
-        return self.perturb(images), rewards, dones, infos
+        return self.perturb(images, dones if self.held else None), rewards, dones, infos
 
-    def perturb(self, images: np.ndarray) -> np.ndarray:
-        """Perturb each image with new random numbers: ``(N, C, H, W)`` or ``(N, H, W, C)``, uint8."""
+    def perturb(self, images: np.ndarray, begins: np.ndarray | None = None) -> np.ndarray:
+        """
+        Perturb N images.
+
+        :param images: ``(N, C, H, W)`` or ``(N, H, W, C)``, uint8
+        :param begins: Which of them have new random numbers, ``(N,)``; the others keep those of the last call. None:
+            all have new ones.
+        """
         if self._channels_last:
             images = images.transpose(0, 3, 1, 2)
-        result = self.mixture.apply(images, self.mixture.draw(*images.shape))
+        which = np.arange(len(images)) if begins is None else np.flatnonzero(begins)
+        drawn = self.mixture.draw(len(which), *images.shape[1:])
+        if begins is None:
+            self._drawn = drawn
+        else:
+            for name, values in drawn.items():
+                self._drawn[name][which] = values
+        result = self.mixture.apply(images, self._drawn)
         return result.transpose(0, 2, 3, 1) if self._channels_last else result

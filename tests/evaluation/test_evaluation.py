@@ -2,6 +2,7 @@ import math
 import random
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.lava import GOAL
@@ -146,6 +147,24 @@ def test_the_keywords_for_all_scenarios_reach_the_environment_and_a_scenarios_ow
     costly = evaluate_scenarios(tdpg, LAVA[:1], 5, env_kwargs=dict(action_cost=10.0, sensor_noise_std=50.0))
     assert (costly["cost"] > as_text["cost"]).all()
     np.testing.assert_array_equal(costly["final_state_0"], as_text["final_state_0"])
+
+
+def test_a_scenario_may_have_a_sensor_and_a_number_of_episodes_of_its_own(tdpg):
+    class Blind(VecEnvWrapper):
+        def reset(self):
+            return np.zeros_like(self.venv.reset())
+
+        def step_wait(self):
+            observations, *rest = self.venv.step_wait()
+            return np.zeros_like(observations), *rest
+
+    rows = [LAVA[0], replace(LAVA[0], name="blind", sensor=Blind, n_episodes=7)]
+    records = evaluate_scenarios(tdpg, rows, 20)
+    assert records.groupby("scenario")["episode"].count().to_dict() == {"Training": 20, "blind": 7}
+    # The same start, and another end: nothing but the observation differs.
+    costs = records.set_index(["scenario", "episode"])["cost"]
+    assert (costs["Training"][:7] != costs["blind"]).all()
+    assert rows[1].with_kwargs(horizon=5).sensor is Blind
 
 
 def test_labels_become_constant_columns_in_front(tdpg):

@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_problems import tiny_tdpg, toy_vec_env, train_epochs
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.robustness.training import VecImagePerturbation
@@ -43,6 +44,24 @@ def test_every_perturbation_changes_equal_images_in_different_ways(strength):
     if strength == "noise":
         residuals = (changed - equal)[:, 0, 30:40].reshape(6, -1)
         assert np.abs(np.corrcoef(residuals)[np.triu_indices(6, 1)]).max() < 0.3
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_an_episode_keeps_its_changes_only_if_they_are_held(held):
+    class Ends(VecEnvWrapper):  # a camera that sees grey; the second environment begins anew at every step
+        def reset(self):
+            return np.full_like(self.venv.reset(), 120)
+
+        def step_wait(self):
+            images, rewards, _, infos = self.venv.step_wait()
+            return np.full_like(images, 120), rewards, np.array([False, True]), infos
+
+    th.manual_seed(0)
+    env = VecImagePerturbation(Ends(ball_env(2)), held=held, noise=0.0)
+    seen = [env.reset(), *(env.step(np.zeros((2, 1)))[0] for _ in range(4))]
+    of_first, of_second = ([(seen[0][i] == later[i]).all() for later in seen[1:]] for i in (0, 1))
+    assert of_first == [held] * 4
+    assert not any(of_second)
 
 
 def test_mixing_colours_leaves_grey_as_it_is():
