@@ -22,7 +22,7 @@ from torch import nn
 from torch.distributions import Normal
 from torch.nn import functional as F
 
-from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
+from sb3_tdpg.buffers import EpisodeBatch, Observations, PolicyStep, RebuiltTRVs, each
 from sb3_tdpg.features import Changes, ObservationNorm, TRVCnn, flat_action_space, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
 from sb3_tdpg.settings import POLICY_DEFAULTS, check_count, check_floors, check_net_arch, default, fill_in_trvs
@@ -310,6 +310,13 @@ class TRVPolicy(BasePolicy):
                 self.changes.update(self.episode_features(batch), batch.alive)
 
     # -- whole episodes, for training -------------------------------------------------------------------------
+
+    def pooled(self, observations: Observations) -> Observations:
+        """Pool images once for all passes over an epoch: ``(T, N, *obs)``, or a dict of such, which stays as it is."""
+        cnn = self.features_extractor
+        if not isinstance(cnn, TRVCnn) or cnn.pool == 1 or isinstance(observations, dict):
+            return observations
+        return cnn.pooled(observations.flatten(0, 1)).unflatten(0, observations.shape[:2])
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Extract the features of every observation: ``(T, N, F)``."""

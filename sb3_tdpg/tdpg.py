@@ -357,16 +357,18 @@ class TDPG(EpisodicAlgorithm):
         batch = whole = batch._replace(advantages=advantages)
         if in_segments:
             batch = batch.segments(self.bptt_steps or len(batch.costs))
+        # What the passes need of it: images are pooled once.
+        passes = batch._replace(observations=self.policy.pooled(batch.observations), plain_observations=None)
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
                 old_log_prob = th.empty_like(batch.costs)
-                for columns in self._minibatches(batch):
-                    old_log_prob[:, columns], _ = self._evaluate(batch.select(columns))
+                for columns in self._minibatches(passes):
+                    old_log_prob[:, columns], _ = self._evaluate(passes.select(columns))
 
         for _ in range(self.n_epochs):
-            for columns in self._minibatches(batch):
-                part = batch.select(columns)
+            for columns in self._minibatches(passes):
+                part = passes.select(columns)
                 log_prob, rebuilt = self._evaluate(part, rebuild=mi_coef > 0.0)
                 if old_log_prob is None:
                     policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
@@ -449,7 +451,7 @@ class TDPG(EpisodicAlgorithm):
         After Ctrl-C the model keeps the parameters of the last finished update: it can be used, saved or trained on.
 
         :param total_timesteps: Environment steps; default: 400 policy epochs for vectors (a million steps on Lava),
-            50 for images, 100 for depth images.
+            75 for images, 100 for depth images.
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:

@@ -23,7 +23,7 @@ from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import N_SEVERITIES, find
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.sensor import finite_range
-from sb3_tdpg.robustness.training import ImageMixture
+from sb3_tdpg.robustness.training import Drawn, ImageMixture
 
 Observations = Any
 """An array ``(n, *obs)``, or a dict of such."""
@@ -83,16 +83,22 @@ class MixtureNuisance(Nuisance):
 class _MixtureMembers(Members):
     def __init__(self, nuisance: MixtureNuisance, n: int) -> None:
         self.nuisance = nuisance
-        self.drawn = nuisance.mixture.draw(n, *nuisance.shape)
+        self.held = self._draw(n) if nuisance.held else None
+
+    def _draw(self, n: int) -> Drawn:
+        return self.nuisance.mixture.draw(n, *self.nuisance.shape)
 
     def begin(self, which: np.ndarray) -> None:
-        for name, values in self.nuisance.mixture.draw(len(which), *self.nuisance.shape).items():
-            self.drawn[name][which] = values
+        if self.held is not None:
+            for name, values in self._draw(len(which)).items():
+                self.held[name][which] = values
 
     def __call__(self, observations: Observations, states: np.ndarray, which: np.ndarray) -> Observations:
-        if not self.nuisance.held:
-            self.begin(which)
-        return self.nuisance.mixture.apply(observations, {name: values[which] for name, values in self.drawn.items()})
+        if self.held is None:
+            drawn = self._draw(len(which))
+        else:
+            drawn = {name: values[which] for name, values in self.held.items()}
+        return self.nuisance.mixture.apply(observations, drawn)
 
 
 class PerturbationNuisance(Nuisance):
