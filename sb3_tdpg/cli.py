@@ -58,20 +58,18 @@ class Experiment(NamedTuple):
 
 EXPERIMENTS = {
     "lava": Experiment("lava:reproduce_lava", "lava_reproduction", flags=("n_paper_seeds",)),
-    "ball": Experiment("ball:reproduce_ball", "ball_catch", flags=("n_paper_seeds", "controls")),
-    "ball-varying": Experiment(
-        "ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("n_paper_seeds", "controls")
-    ),
+    "ball": Experiment("ball:reproduce_ball", "ball_catch", flags=("controls",)),
+    "ball-varying": Experiment("ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)),
     "grasp": Experiment("grasp:reproduce_grasp", "panda_grasp"),
     "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
-    "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_ball_seeds", "n_grasp_seeds")),
+    "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
 }
 
 
 def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
     chosen = EXPERIMENTS[experiment]
     given = {name: value for name, value in options.items() if value is not None}
-    for name in ("controls", "n_paper_seeds", "n_ball_seeds", "n_grasp_seeds"):
+    for name in ("controls", "n_paper_seeds", "n_grasp_seeds"):
         if name in given and name not in chosen.flags:
             flag = "--no-controls" if name == "controls" else f"--{name.replace('_', '-')}"
             others = " and ".join(other for other in EXPERIMENTS if name in EXPERIMENTS[other].flags)
@@ -262,9 +260,12 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--out", type=Path, help="folder for the results (default: one in results/ for each experiment)")
     add("--publish", type=Path, help="copy everything except the runs to this folder")
     add("--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, others 5)")
-    add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: lava 3, ball 1)")
-    add("--n-ball-seeds", type=int, help="baselines: training seeds on ball catching (0: none); --n-seeds: on lava")
-    add("--n-grasp-seeds", type=int, help="baselines: training seeds on grasping (0: none; default: 1)")
+    add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: 3)")
+    add(
+        "--n-grasp-seeds",
+        type=int,
+        help="baselines: training seeds on grasping (0: none; default: 1); --n-seeds: on lava",
+    )
     text = "ball: train PG and TDPG without the ablations; a later call without this flag adds them"
     add("--no-controls", action="store_false", dest="controls", default=None, help=text)
 

@@ -76,17 +76,18 @@ IMAGE = Defaults(
     n_episodes=160,
     epoch_steps=None,
     n_epochs=4,
-    batch_size=80,
+    batch_size=40,
     clip_range=0.2,
     normalize_advantage=True,
     encoder_gradient="pathwise",
     mi_estimator="logdet",
     n_threads=None,
-    total_epochs=50,
+    total_epochs=75,
+    baseline="value",
 )
 
 # Depth images come from environments that simulate each trial: even more expensive.
-DEPTH = IMAGE._replace(beta="auto", n_episodes=400, batch_size=200, total_epochs=100)
+DEPTH = IMAGE._replace(beta="auto", n_episodes=400, batch_size=200, total_epochs=100, baseline="regression")
 
 
 # Ordinary environments: PPO's update, with minibatches of short segments and a value network.
@@ -130,7 +131,7 @@ class PolicyDefaults(NamedTuple):
 # Images start with narrow TRVs: training with wide ones takes twice as long.
 POLICY_DEFAULTS = dict(
     vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
-    image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, dict(pool=2)),
+    image=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, dict(pool=2, n_channels=12)),
     # The number of TRVs beside those that keep the observation. These are nearly free of noise at the start: a velocity
     # is a small difference of them.
     long=PolicyDefaults(

@@ -271,8 +271,9 @@ def test_vectors_are_learnt_from_as_in_the_paper():
 def test_images_are_learnt_from_with_ppos_passes_and_without_a_penalty_on_what_is_known_of_the_state():
     model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
     assert (model.beta, model.nuisance, model.nuisance_level) == (math.inf, {"images": {"held": False}}, "rollouts")
-    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 80, 0.2)
+    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 40, 0.2)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
+    assert (model.baseline, model.policy.features_extractor.cnn[0].out_channels) == ("value", 12)
     assert model.env.num_envs == 160
 
 
@@ -303,7 +304,7 @@ def test_learning_without_a_number_of_steps_takes_the_default(monkeypatch):
     )
     TDPG("TRVPolicy", "Lava-v0", device="cpu").learn()
     TDPG("TRVPolicy", "BallCatch-v0", device="cpu").learn()
-    assert asked == [1_000_000, 200_000]
+    assert asked == [1_000_000, 300_000]
 
 
 def test_the_one_line_training_in_miniature():

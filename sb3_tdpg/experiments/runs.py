@@ -1,8 +1,10 @@
 """Training runs: from settings to a trained and evaluated model in a folder, resumable, one at a time or many."""
 
 import hashlib
+import json
 import re
 import shutil
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -10,17 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, make_output_format
 from tqdm import tqdm
 
 from sb3_tdpg.callbacks import TrainingCheckpointCallback
+from sb3_tdpg.common.files import replaced_atomically, write_atomically
 from sb3_tdpg.common.processes import process_pool, usable_cores
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
-from sb3_tdpg.experiments.training import make_training
+from sb3_tdpg.experiments.training import make_training, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.settings import rate_schedule
 from sb3_tdpg.tdpg import TDPG
 
 # A checkpoint resets the environments, so the number of epochs between checkpoints is part of the run.
@@ -77,10 +83,20 @@ class Run:
         Train once, or resume an interrupted training.
 
         :param attempt: Number of the training, from 0.
-        :param folder: Gets ``model.zip``, ``selected.json`` and the training log; while training, a checkpoint.
+        :param folder: Gets ``model.zip``, ``selected.json``, the training log and ``time.json``, the wall time and the
+            CPU time of the training in seconds, to which a resumed call adds; while training, a checkpoint.
         :param progress_bar: Show a progress bar.
         :return: the policy, and whether any epoch met the limits of the selection (otherwise it is the last epoch's)
         """
+        path = folder / "time.json"
+        before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
+        wall, cpu = time.perf_counter(), time.process_time()
+        trained = self._train(attempt, folder, progress_bar)
+        wall, cpu = before["wall_s"] + time.perf_counter() - wall, before["cpu_s"] + time.process_time() - cpu
+        write_atomically(path, json.dumps(dict(wall_s=round(wall, 3), cpu_s=round(cpu, 3))))
+        return trained
+
+    def _train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
         result, checkpoint = folder / "model.zip", folder / "checkpoint.zip"
         if result.exists():
             return TDPG.load(result, device="cpu"), (folder / "selected.json").exists()
@@ -110,6 +126,40 @@ class Run:
         for path in (checkpoint, folder / "selected.zip"):
             path.unlink(missing_ok=True)
         return TDPG.load(result, device="cpu"), (folder / "selected.json").exists()
+
+
+@dataclass(frozen=True)
+class SB3Run(Run):
+    """A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew."""
+
+    algo: str = "ppo"  # or "ppo_lstm"; the block is in hyperparams/<algo>.yml
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The block with the overrides."""
+        return {**load_hyperparams(self.block, self.algo), **self.overrides}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The settings that make this run."""
+        return {**super().config, "algo": self.algo}
+
+    def _train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+        algorithm: Any = {"ppo": PPO, "ppo_lstm": RecurrentPPO}[self.algo]
+        path = folder / "model.zip"
+        if path.exists():
+            return algorithm.load(path, device="cpu"), False
+        settings = self.settings
+        n_timesteps = int(settings.pop("n_timesteps"))
+        env = take_env(self.env_id, settings)
+        settings["learning_rate"] = rate_schedule(settings["learning_rate"])
+        model = algorithm(settings.pop("policy"), env, **settings, seed=self.seed, device="cpu")
+        model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
+        model.learn(n_timesteps, progress_bar=progress_bar)
+        model.logger.close()
+        with replaced_atomically(path) as partial:
+            model.save(partial)
+        return model, False
 
 
 Task = tuple[Run, Path, Sequence[Scenario]]
@@ -170,6 +220,11 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
     :raises ValueError: if the folder holds a run with other settings.
     """
     rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
+    for row, scenario in zip(rows, scenarios, strict=True):  # the folders of earlier versions have neither
+        if scenario.sensor is not None:
+            row["sensor"] = str(scenario.sensor)
+        if scenario.n_episodes is not None:
+            row["n_episodes"] = scenario.n_episodes
     config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
     check_same_config(folder / "config.json", config, "run")
     return config

@@ -1,12 +1,15 @@
-"""Reproduce Table II, ball catching: policy gradient, TDPG, and the ablations without the penalty."""
+"""Reproduce Table II, ball catching: TDPG and PG on the paper's rows, ablations and PPO on a hundred unseen walls."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.threads import threads
@@ -20,137 +23,179 @@ from sb3_tdpg.envs.scenarios import (
 )
 from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure, training_curves
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
+from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
-from sb3_tdpg.paper.common import NO_PENALTY, Method
-from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves
+from sb3_tdpg.paper.baselines import baselines_table, training_times
+from sb3_tdpg.paper.common import Method
+from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves, sorted_walls
 from sb3_tdpg.paper.knowledge import trv_knowledge
+from sb3_tdpg.robustness.training import VecImagePerturbation
 from sb3_tdpg.tdpg import TDPG
 
-# Fixed before any policy was evaluated on the test rows. Seeds below 100 were used to make the blocks.
-FIRST_SEED = 100
+# Fixed before any policy was evaluated on the test rows: the defaults were chosen on seeds below 100 and on the walls
+# random-100 to random-199.
+FIRST_SEED = 200
+WALLS = range(300, 400)
+N_EPISODES, N_WALL_EPISODES = 200, 20  # of a row, and in front of a wall
+N_EXPENSIVE = 5  # training seeds of the methods that take longest
 
-COLUMNS = ["model", "train_seed", "selected", "scenario", "renderer", "episode", "cost", "distance", "seed",
-           "deterministic"]  # fmt: skip
+COLUMNS = ["model", "train_seed", "scenario", "renderer", "episode", "cost", "distance", "seed", "deterministic"]
 NOISE_ROWS = tuple(row.name for row in BALL_CATCH[1:5])
 BACKGROUND_ROWS = tuple(row.name for row in BALL_CATCH[5:])
 GROUPS = {"Sensor noise, mean of 4": NOISE_ROWS, "Test backgrounds, mean of 7": BACKGROUND_ROWS}
-KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "backgrounds": BACKGROUND_ROWS}
+WALL_ROWS = tuple(f"Wall {i}" for i in WALLS)
+ALL_WALLS, WORST_WALLS = "100 unseen walls", "worst tenth of them"
+HELD, REDRAWN, GAMMA = "declared changes, held", "declared changes, redrawn", "gamma (undeclared)"
+KINDS = {
+    "training": ("Training",),
+    "sensor noise": NOISE_ROWS,
+    "test backgrounds": BACKGROUND_ROWS,
+    ALL_WALLS: (ALL_WALLS,),
+    WORST_WALLS: (WORST_WALLS,),
+    HELD: (HELD,),
+    REDRAWN: (REDRAWN,),
+    GAMMA: (GAMMA,),
+}
+
+SHOWN = ("Training", NOISE_ROWS[-1], ALL_WALLS, WORST_WALLS, HELD, REDRAWN, GAMMA)
 
 # The largest interquartile mean over seeds, by method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
-    "PG": {"Training": 7.0},
     "TDPG": {
-        "Training": 12.0,
-        **dict(zip(NOISE_ROWS, (12.0, 13.0, 15.0, 18.0), strict=True)),
-        "Test backgrounds, mean of 7": 30.0,
+        "Training": 2.5,
+        NOISE_ROWS[-1]: 3.5,
+        "Test backgrounds, mean of 7": 7.0,
+        ALL_WALLS: 6.0,
+        WORST_WALLS: 20.0,
     },
 }
 
-NO_PENALTY_PLAIN = f"{NO_PENALTY}, plain images"
-
-# A second stage is as long as the first one; an ablation differs from its method in the missing penalty only.
-SECOND_STAGE = dict(n_timesteps=80_000)
-METHODS: tuple[Method, ...] = (
-    Method("PG", "BallCatch-v0-pg", renderer="pybullet"),
-    Method("PG, perturbed images", "BallCatch-v0-perturbed-pg"),
-    Method("TDPG", "BallCatch-v0-two-stages", "PG, perturbed images", "pybullet", SECOND_STAGE),
-    Method(NO_PENALTY, "BallCatch-v0-perturbed-pg", "PG, perturbed images"),
-    Method("TDPG, plain images", "BallCatch-v0-plain", "PG", overrides=SECOND_STAGE),
-    Method(NO_PENALTY_PLAIN, "BallCatch-v0-pg", "PG"),
-)
-# From scratch, a policy learns too slowly from perturbed images: they follow plain ones.
-VARYING_METHODS: tuple[Method, ...] = (
-    Method("PG", "BallCatch-v0-varying-pg"),
-    Method("PG, perturbed images", "BallCatch-v0-varying-perturbed-pg", "PG"),
-    Method("TDPG", "BallCatch-v0-varying", "PG, perturbed images"),
-    Method(NO_PENALTY, "BallCatch-v0-varying-perturbed-pg", "PG, perturbed images"),
-    Method("TDPG, plain images", "BallCatch-v0-varying-plain", "PG"),
-    Method(NO_PENALTY_PLAIN, "BallCatch-v0-varying-pg", "PG", overrides=dict(n_timesteps=120_000)),
-)
-PAPER_METHODS: tuple[Method, ...] = (
-    Method("paper's PG", "BallCatch-v0-paper-pg"),
-    Method("paper's TDPG, 1/beta = 16", "BallCatch-v0-paper", "paper's PG"),
-)
-WITHOUT_CONTROLS = ("PG", "PG, perturbed images", "TDPG")
-COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG, plain images", NO_PENALTY_PLAIN), ("TDPG", "PG"))
+BLOCK = "BallCatch-v0"
+LAUNCHES: Mapping[str, Mapping[str, Any]] = dict(fixed={}, varying=BALL_VARYING_LAUNCH)
+# About one and a half times what the rollouts cost in the end without a penalty: with the nuisance, and without it.
+COST_LIMITS = {"fixed": (3.0, 1.5), "varying": (25.0, 6.0)}
 
 
-def reproduce_ball(
-    out: Path, *, launch: str = "fixed", controls: bool = True, n_seeds: int = 5, n_paper_seeds: int = 1, **options: Any
-) -> str:
+def methods(launch: str) -> tuple[Method, ...]:
+    """List the methods; each differs from the user's one line in what its name says, and takes as many steps."""
+    env_kwargs = dict(renderer="fast", **LAUNCHES[launch])
+    limit, limit_alone = COST_LIMITS[launch]
+
+    def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:
+        return Method(label, BLOCK, renderer=renderer, overrides={**overrides, "env_kwargs": env_kwargs})
+
+    def of_sb3(label: str, algo: str) -> Method:
+        wrapper = ["sb3_tdpg.robustness.training.VecImagePerturbation"]
+        n_timesteps = load_hyperparams(BLOCK)["n_timesteps"]
+        overrides = dict(n_timesteps=n_timesteps, vec_env_wrapper=wrapper, env_kwargs=env_kwargs)
+        return Method(label, BLOCK, overrides=overrides, algo=algo, max_seeds=N_EXPENSIVE)
+
+    return (
+        method("TDPG", "pybullet"),
+        method("PG", "pybullet", nuisance=None),
+        method("nuisance phase", nuisance_level="action"),
+        method("with the penalty", beta="auto", cost_limit=limit),
+        method("penalty alone", nuisance=None, beta="auto", cost_limit=limit_alone),
+        replace(method("more gradient steps", n_epochs=10), max_seeds=N_EXPENSIVE),  # as many as with the phase
+        of_sb3("PPO", "ppo"),
+        of_sb3("RecurrentPPO", "ppo_lstm"),
+    )
+
+
+WITHOUT_CONTROLS = ("TDPG", "PG")
+
+
+def gamma(images: np.ndarray) -> np.ndarray:
+    """Square the brightness of every pixel, which the declared changes do not contain: uint8, any shape."""
+    return np.rint(images.astype(np.float32) ** 2 / 255).astype(np.uint8)
+
+
+class VecGamma(VecEnvWrapper):
+    """A camera with :func:`gamma`."""
+
+    def reset(self) -> np.ndarray:
+        """Reset, and change the first images."""
+        return gamma(self.venv.reset())
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step, and change the images."""
+        images, rewards, dones, infos = self.venv.step_wait()
+        return gamma(images), rewards, dones, infos
+
+
+SHIFTS: tuple[Scenario, ...] = (
+    *(
+        Scenario(name, BLOCK, dict(texture=f"random-{i}"), n_episodes=N_WALL_EPISODES)
+        for name, i in zip(WALL_ROWS, WALLS, strict=True)
+    ),
+    Scenario(HELD, BLOCK, sensor=partial(VecImagePerturbation, held=True)),
+    Scenario(REDRAWN, BLOCK, sensor=VecImagePerturbation),
+    Scenario(GAMMA, BLOCK, sensor=VecGamma),
+)
+"""Rows of our own: walls that no policy was trained or tuned on, the changes of the training, and one that is not."""
+
+
+def reproduce_ball(out: Path, *, launch: str = "fixed", controls: bool = True, n_seeds: int = 5, **options: Any) -> str:
     """
     Train every method with several seeds, evaluate it on the rows of Table II; write tables, figures and records.
 
-    :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
-    :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own, without the paper's settings.
-    :param controls: Also train the ablations without the penalty, and the paper's own settings; a later call may add
-        them.
+    :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz`` (the paper's rows), ``shifts.csv.xz``
+        (:data:`SHIFTS`), figures, ``config.json`` and ``runs/``.
+    :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own.
+    :param controls: Also train the ablations, PPO and RecurrentPPO; a later call may add them.
     :param n_seeds: Training seeds of each method.
-    :param n_paper_seeds: Training seeds of the paper's own settings.
-    :param options: See :class:`~sb3_tdpg.paper.common.Options`.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`; 200 episodes a row by default, 20 in front of a wall.
     :return: the summary, as Markdown
     """
-    given = common.Options(**options)
-    is_fixed = launch == "fixed"
-    methods, rows = (METHODS, BALL_CATCH) if is_fixed else (VARYING_METHODS, BALL_CATCH_VARYING_LAUNCH)
-    launch_kwargs = {} if is_fixed else BALL_VARYING_LAUNCH
-    if not controls:
-        methods = tuple(method for method in methods if method.label in WITHOUT_CONTROLS)
-    paper_methods = PAPER_METHODS if is_fixed and controls else ()
-    diagnosis = [row.with_kwargs(**launch_kwargs, renderer="fast") for row in BALL_CATCH_DIAGNOSIS]
+    given = common.Options(**{"n_eval_episodes": N_EPISODES, **options})
+    is_fixed, launch_kwargs = launch == "fixed", LAUNCHES[launch]
+    rows = BALL_CATCH if is_fixed else BALL_CATCH_VARYING_LAUNCH
+    chosen = [method for method in methods(launch) if controls or method.label in WITHOUT_CONTROLS]
+    others = [row.with_kwargs(**launch_kwargs, renderer="fast") for row in (*BALL_CATCH_DIAGNOSIS, *SHIFTS)]
+    for i, row in enumerate(others):
+        if row.n_episodes is not None:
+            others[i] = replace(row, n_episodes=min(row.n_episodes, given.n_eval_episodes))
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
-    everything = [(method, seed) for method in methods for seed in seeds]
-    everything += [(method, seed) for method in paper_methods for seed in seeds[:n_paper_seeds]]
+    everything = [(method, seed) for i, seed in enumerate(seeds) for method in chosen if i < method.max_seeds]
 
     def rows_of(method: Method) -> list[Scenario]:
-        return [*(row.with_kwargs(renderer=method.renderer) for row in rows), *diagnosis]
+        return [*(row.with_kwargs(renderer=method.renderer) for row in rows), *others]
 
-    tasks = common.make_tasks("BallCatch-v0", out / "runs", everything, rows_of, given.overrides)
-    labels = {renderer: [m.label for m in methods if m.renderer == renderer] for renderer in ("pybullet", "fast")}
-    # The longest runs first, so that the cores finish together.
-    longest_first = sorted(tasks, key=lambda task: task[0].method in labels["fast"])
-    complete_runs(longest_first, **given.of_runs)
+    tasks = common.make_tasks(BLOCK, out / "runs", everything, rows_of, given.overrides)
+    complete_runs(tasks, **given.of_runs)
 
     records = common.read_records(tasks)
+    is_shift = records["scenario"].isin([row.name for row in SHIFTS])
     is_row = records["scenario"].isin([row.name for row in rows])
-    renderers = records["model"].map({method.label: method.renderer for method, _ in everything})
+    renderers = records["model"].map({method.label: method.renderer for method in chosen})
     distances = (records["final_state_0"] - records["final_state_1"]).abs()
     records = records.assign(distance=distances, renderer=renderers.where(is_row, "fast"))
-    write_frame_atomically(records[COLUMNS].round({"cost": 3, "distance": 4}), out / "episodes.csv.xz")
-    table = with_groups(records[is_row])
+    kept = records[COLUMNS].round({"cost": 3, "distance": 4})
+    write_frame_atomically(kept[~is_shift], out / "episodes.csv.xz")
+    write_frame_atomically(kept[is_shift].drop(columns="distance"), out / "shifts.csv.xz")
+    table = with_groups(records[is_row | is_shift])
     by_seed = table.groupby(["model", "train_seed", "scenario"], sort=False)[["cost", "distance"]].mean().reset_index()
     write_frame_atomically(by_seed, out / "seeds.csv")
 
-    folders = common.folders_of(tasks)
-    shown = table[table["model"].isin([method.label for method in methods])]
-    first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in methods if m.start is not None}
-    save_figure(robustness_curves(shown, NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
-    save_figure(diagnosis_bars(records[~is_row & records["model"].isin(shown["model"])]), out / "diagnosis.png")
+    folders, labels = common.folders_of(tasks), [method.label for method in chosen]
+    first = {label: read_progress(folders[label, FIRST_SEED]) for label in ("TDPG", "PG", *labels[2:6])}
+    save_figure(robustness_curves(records[is_row], NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
+    save_figure(sorted_walls(by_seed[by_seed["scenario"].isin(WALL_ROWS)]), out / "walls.png")
+    save_figure(diagnosis_bars(records[~is_row & ~is_shift]), out / "diagnosis.png")
     save_figure(training_curves(first), out / "training.png")
 
-    costs, distances = aggregate_seeds(table), aggregate_seeds(table.assign(cost=table["distance"]))
+    of_paper = table[table["model"].isin(WITHOUT_CONTROLS)]
+    costs, distances = aggregate_seeds(of_paper), aggregate_seeds(of_paper.assign(cost=of_paper["distance"]))
     cost_rows = [*rows, *group_rows(rows)]
     distance_rows = [
         replace(row, paper={m: PaperResult(p.distance) for m, p in row.paper.items() if p.distance is not None})
         for row in cost_rows
     ]
-    quantity, results = "final distance between robot and ball in m", {}
-    for title, names in {
-        "Methods evaluated on images by PyBullet": labels["pybullet"],
-        "Methods evaluated on images by the ray caster": labels["fast"],
-        "The paper's own settings (images by the ray caster)": [method.label for method in paper_methods],
-    }.items():
-        if names:
-            is_shown = costs["model"].isin(names)
-            results[title] = dict(
-                cost=comparison_markdown(costs[is_shown], cost_rows),
-                distance=comparison_markdown(distances[is_shown], distance_rows, quantity=quantity, digits=3),
-            )
     with threads(1):  # sums are the same on any number of cores
         knowledge = [
             dict(model=m.label, train_seed=seed, **trv_knowledge(TDPG.load(path, device="cpu"), launch_kwargs))
-            for m in methods
-            for seed in seeds
+            for m, seed in everything
+            if m.algo == "tdpg"
             for path in [folders[m.label, seed] / "model.zip"]
         ]
     command = "make reproduce-ball" + ("-varying" if not is_fixed else "-controls" if controls else "")
@@ -161,17 +206,30 @@ def reproduce_ball(
         command,
         given.publish,
         scenario="Table II" if is_fixed else "a launch that varies",
-        results=results,
-        goals=common.goals_table(costs, GOALS) if is_fixed else "",
-        comparisons=common.comparisons_table(table, COMPARISONS, KINDS),
+        cost=comparison_markdown(costs, cost_rows),
+        distance=comparison_markdown(
+            distances, distance_rows, quantity="final distance between robot and ball in m", digits=3
+        ),
+        goals=common.goals_table(costs, GOALS),
+        shifts=baselines_table(table, SHOWN, training_times(tasks)),
+        comparisons=common.comparisons_table(table, [("TDPG", label) for label in labels[1:]], KINDS),
         knowledge=common.write_knowledge(pd.DataFrame(knowledge), ["model"], out),
     )
 
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:
-    """Append the records of :data:`GROUPS`; all rows of a group have equally many episodes."""
+    """
+    Append the records of :data:`GROUPS` and of the walls; all rows of a group have equally many episodes.
+
+    The worst tenth of the walls is that of each policy.
+    """
     groups = [records[records["scenario"].isin(rows)].assign(scenario=name) for name, rows in GROUPS.items()]
-    return pd.concat([records, *groups], ignore_index=True)
+    walls = records[records["scenario"].isin(WALL_ROWS)]
+    policies = ["model", "train_seed"]
+    means = walls.groupby([*policies, "scenario"], sort=False)["cost"].mean()
+    worst = means.groupby(policies, sort=False, group_keys=False).nlargest(len(WALL_ROWS) // 10)
+    of_worst = walls.set_index([*policies, "scenario"]).loc[worst.index].reset_index().assign(scenario=WORST_WALLS)
+    return pd.concat([records, *groups, walls.assign(scenario=ALL_WALLS), of_worst], ignore_index=True)
 
 
 def group_rows(rows: Sequence[Scenario]) -> list[Scenario]:

@@ -1,6 +1,7 @@
 """Shared by all reproductions: the runs of several methods, tables, and the files of a result."""
 
 import json
+import math
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from sb3_tdpg.common.markdown import fill_template, markdown_table
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
-from sb3_tdpg.experiments.runs import Run, Task
+from sb3_tdpg.experiments.runs import Run, SB3Run, Task
 
 RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
 """The columns of the records that are kept."""
@@ -60,10 +61,14 @@ class Method:
     renderer: str = "fast"  # of the images in the evaluation, if the environment has several
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
+    algo: str = "tdpg"  # or "ppo", "ppo_lstm"; the block is in hyperparams/<algo>.yml
+    max_seeds: float = math.inf  # fewer for expensive methods
+    is_shown: bool = True  # a first stage need not be shown
 
     def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
         """Return the run of this method with one seed."""
-        return Run(self.label, env_id, self.block, seed, {**self.overrides, **overrides}, self.max_attempts, start)
+        run = Run(self.label, env_id, self.block, seed, {**self.overrides, **overrides}, self.max_attempts, start)
+        return run if self.algo == "tdpg" else SB3Run(**vars(run), algo=self.algo)
 
 
 def make_tasks(
@@ -121,18 +126,21 @@ def comparisons_table(
     """
     Write how likely a seed of one method beats a seed of another one, and the paired difference of their means.
 
-    Each mean is over the rows of one of ``kinds``. Comparisons with a method that the records lack are left out.
+    Each mean is over the rows of one of ``kinds``, and over the seeds that both methods have. Comparisons with a method
+    that the records lack are left out.
     """
-    columns = ["method", "compared with", "rows", "probability of being better [95 %]"]
+    columns = ["method", "compared with", "rows", "seeds", "probability of being better [95 %]"]
     columns += [f"{quantity} of the method", f"{quantity} of the other", "difference [95 %]"]
     rows = []
+    of_model = table.groupby("model")["train_seed"].unique().map(set)
     for model, other in [pair for pair in comparisons if set(pair) <= set(table["model"])]:
+        seeds = of_model[model] & of_model[other]
         for name, members in kinds.items():
-            part = table[table["scenario"].isin(members)]
+            part = table[table["scenario"].isin(members) & table["train_seed"].isin(seeds)]
             better = "{:.2f} [{:.2f}, {:.2f}]".format(*probability_of_improvement(part, model, other))
             difference = "{:+.3g} [{:+.3g}, {:+.3g}]".format(*paired_difference(part, model, other))
             costs = part.groupby("model")["cost"].mean()[[model, other]].map("{:.3g}".format)
-            rows.append([model, other, name, better, *costs, difference])
+            rows.append([model, other, name, str(len(seeds)), better, *costs, difference])
     return markdown_table(rows, columns)
 
 

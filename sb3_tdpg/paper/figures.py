@@ -142,6 +142,24 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
     return figure
 
 
+def sorted_walls(seed_means: pd.DataFrame) -> Figure:
+    """
+    Draw the mean cost in front of each wall, from the wall that costs least to the one that costs most.
+
+    :param seed_means: ``model``, ``train_seed``, ``scenario`` (a wall) and ``cost``. A line is the median over seeds of
+        each policy's own order of the walls.
+    """
+    figure, ((axes,),) = new_panels(WIDTH, 3.4)
+    for color, (model, group) in zip(cycle(PALETTE), seed_means.groupby("model", sort=False), strict=False):
+        costs = np.sort(group.pivot(index="train_seed", columns="scenario", values="cost"), axis=1)
+        axes.plot(np.arange(1, costs.shape[1] + 1), np.median(costs, axis=0), color=color, label=str(model))
+    log_axis(axes, "y", subs=(1, 2, 5))
+    axes.set_xlabel("walls, in the order of their cost", fontsize=9)
+    axes.set_ylabel("mean episode cost", fontsize=9)
+    legend_above(figure, axes)
+    return figure
+
+
 def _seed_means(
     records: pd.DataFrame, column: str, rows: list[str], spacing: float
 ) -> Iterator[tuple[str, str, np.ndarray, pd.DataFrame]]:

@@ -10,7 +10,7 @@ from small_problems import complete_runs_here
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.ball_catch import RENDERERS
 from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS
-from sb3_tdpg.experiments.runs import Run, complete_run
+from sb3_tdpg.experiments.runs import Run
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import ball, common
 
@@ -34,6 +34,8 @@ def tiny(monkeypatch):
     ):
         monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     monkeypatch.setattr(ball, "trv_knowledge", partial(ball.trv_knowledge, n_walls=4))
+    monkeypatch.setattr(ball, "WALL_ROWS", ball.WALL_ROWS[:10])
+    monkeypatch.setattr(ball, "SHIFTS", (*ball.SHIFTS[:10], *ball.SHIFTS[100:]))
     asked = []
 
     def complete_runs(tasks, *, n_eval_episodes, jobs):
@@ -51,25 +53,19 @@ def test_from_nothing_to_tables_figures_and_records(n_seeds, tmp_path, tiny):
     summary = ball.reproduce_ball(out, n_seeds=n_seeds, n_eval_episodes=2, n_timesteps=100, publish=published)
 
     assert (out / "summary.md").read_text() == summary
-    assert {path.name for path in published.iterdir()} == {path.name for path in out.iterdir()} - {"runs"}
-    assert {"episodes.csv.xz", "seeds.csv", "config.json", "robustness.png", "diagnosis.png", "training.png"} <= {
-        path.name for path in out.iterdir()
-    }
+    files = {path.name for path in out.iterdir()} - {"runs"}
+    assert {path.name for path in published.iterdir()} == files
+    pictures = {"robustness.png", "walls.png", "diagnosis.png", "training.png"}
+    assert {"episodes.csv.xz", "shifts.csv.xz", "seeds.csv", "config.json", *pictures} <= files
     assert "MISSED" in summary, "an epoch reaches no goal, and the summary must say so"
-    for method in (*ball.METHODS, *ball.PAPER_METHODS):
-        assert method.label in summary
-    for title in (
-        "images by PyBullet",
-        "images by the ray caster",
-        "own settings",
-        "Goals",
-        "Effect of the penalty",
-        "TRVs know",
-    ):
+    for method in ball.methods("fixed"):
+        assert f"| {method.label} |" in summary
+    for title in ("Table II", "Goals", "Unseen walls", "TDPG compared with", "TRVs know"):
         assert title in summary
-    records = pd.read_csv(out / "episodes.csv.xz")
-    n_policies = n_seeds * len(ball.METHODS) + len(ball.PAPER_METHODS)
+    records, shifts = (pd.read_csv(out / name) for name in ("episodes.csv.xz", "shifts.csv.xz"))
+    n_policies = n_seeds * len(ball.methods("fixed"))
     assert len(records) == n_policies * (len(BALL_CATCH) + len(BALL_CATCH_DIAGNOSIS)) * 2
+    assert len(shifts) == n_policies * len(ball.SHIFTS) * 2
     # A terminal cost of 100 for each metre, and a little for driving.
     assert (records["cost"] >= 100 * records["distance"] - 0.1).all()
     assert (records["cost"] <= 100 * records["distance"] + 25 * 0.2 + 0.1).all()
@@ -79,28 +75,11 @@ def test_from_nothing_to_tables_figures_and_records(n_seeds, tmp_path, tiny):
 def test_the_ablations_may_be_added_later(tmp_path, tiny):
     arguments = dict(n_seeds=1, n_eval_episodes=2, n_timesteps=100)
     summary = ball.reproduce_ball(tmp_path, controls=False, **arguments)
-    assert common.NO_PENALTY not in summary
-    assert sorted(tiny[0]) == ["PG", "PG, perturbed images", "TDPG"]
-    before = (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes()
-    assert common.NO_PENALTY in ball.reproduce_ball(tmp_path, **arguments)
-    assert (tmp_path / "runs" / "tdpg-seed100" / "model.zip").read_bytes() == before
-
-
-def test_a_second_stage_starts_from_the_policy_of_the_first(tmp_path, tiny):
-    run = Run("PG", "BallCatch-v0", "BallCatch-v0-pg", 0, {"n_timesteps": 100})
-    complete_run(run, tmp_path / "first", BALL_CATCH[:1], n_eval_episodes=2)
-    # A rate of zero: what is found is what it started from.
-    second = Run(
-        "TDPG",
-        "BallCatch-v0",
-        "BallCatch-v0-two-stages",
-        0,
-        {"n_timesteps": 100, "learning_rate": 0.0},
-        start=tmp_path / "first",
-    )
-    complete_run(second, tmp_path / "second", BALL_CATCH[:1], n_eval_episodes=2)
-    costs = [pd.read_csv(tmp_path / name / "episodes.csv")["cost"].to_numpy() for name in ("first", "second")]
-    np.testing.assert_allclose(*costs)
+    assert "penalty alone" not in summary
+    assert sorted(tiny[0]) == ["PG", "TDPG"]
+    before = (tmp_path / "runs" / "tdpg-seed200" / "model.zip").read_bytes()
+    assert "penalty alone" in ball.reproduce_ball(tmp_path, **arguments)
+    assert (tmp_path / "runs" / "tdpg-seed200" / "model.zip").read_bytes() == before
 
 
 @pytest.mark.slow
@@ -108,7 +87,7 @@ def test_the_varying_launch_has_a_reproduction_of_its_own(tmp_path, tiny, capsys
     arguments = ["--n-seeds", "1", "--n-eval-episodes", "2", "--n-timesteps", "100"]
     assert main(["reproduce", "ball-varying", "--out", str(tmp_path), *arguments]) == 0
     assert "a launch that varies" in capsys.readouterr().out
-    records = pd.read_csv(tmp_path / "runs" / "pg-seed100" / "episodes.csv")
+    records = pd.read_csv(tmp_path / "runs" / "pg-seed200" / "episodes.csv")
     landing = records.loc[records["scenario"] == "Training", "final_state_1"]
     assert landing.nunique() > 1
 
@@ -126,29 +105,58 @@ def test_a_group_is_the_mean_of_its_rows():
 
 
 def test_every_goal_is_of_a_row_and_a_method_of_the_table():
-    names = {row.name for row in (*BALL_CATCH, *ball.group_rows(BALL_CATCH))}
+    names = {row.name for row in (*BALL_CATCH, *ball.group_rows(BALL_CATCH))} | {ball.ALL_WALLS, ball.WORST_WALLS}
     for method, goals in ball.GOALS.items():
-        assert method in {m.label for m in ball.METHODS if m.renderer == "pybullet"}
+        assert method in {m.label for m in ball.methods("fixed") if m.renderer == "pybullet"}
         assert set(goals) <= names
 
 
-def test_every_method_but_the_first_stages_starts_from_one():
-    first_stages = (["PG", "PG, perturbed images"], ["PG"])
-    for methods, first in zip((ball.METHODS, ball.VARYING_METHODS), first_stages, strict=True):
-        assert [m.label for m in methods if m.start is None] == first
-        labels = [m.label for m in methods]
-        for method in methods:
-            assert method.start is None or labels.index(method.start) < labels.index(method.label)
-        assert {label for pair in ball.COMPARISONS for label in pair} <= set(labels)
+def test_the_worst_walls_are_those_of_each_policy():
+    rows = [
+        ("TDPG", seed, name, float(number if seed else -number))
+        for seed in (0, 1)
+        for number, name in enumerate(ball.WALL_ROWS)
+    ]
+    records = pd.DataFrame(rows, columns=["model", "train_seed", "scenario", "cost"])
+    grouped = ball.with_groups(records).groupby(["train_seed", "scenario"])["cost"].mean()
+    assert grouped[1, ball.ALL_WALLS] == 49.5
+    assert grouped[1, ball.WORST_WALLS] == 94.5
+    assert grouped[0, ball.WORST_WALLS] == -4.5
 
 
-def test_an_ablation_differs_from_its_method_in_nothing_but_the_penalty():
-    for methods in (ball.METHODS, ball.VARYING_METHODS):
-        by_label = {method.label: method for method in methods}
-        for model, ablation in ball.COMPARISONS[:2]:
-            settings = [
-                {**load_hyperparams(by_label[label].block), **by_label[label].overrides} for label in (model, ablation)
-            ]
-            assert by_label[model].start == by_label[ablation].start
-            assert {key for key in settings[0] if settings[0][key] != settings[1].get(key)} == {"beta", "cost_limit"}
-            assert set(settings[0]) == set(settings[1])
+def test_each_row_changes_the_image_as_it_says():
+    images = np.arange(256, dtype=np.uint8)
+    changed = ball.gamma(images)
+    assert (changed[[0, 255]] == [0, 255]).all()
+    assert (changed[1:255] < images[1:255]).all()
+    # Squares of the brightness, which no change of contrast gives.
+    assert changed[128] == 64
+    assert len({row.name for row in ball.SHIFTS}) == 103
+    assert [row.sensor is None for row in ball.SHIFTS] == [True] * 100 + [False] * 3
+
+
+def settings_of(method):
+    return {**load_hyperparams(method.block, method.algo), **method.overrides}
+
+
+@pytest.mark.parametrize("launch", ["fixed", "varying"])
+def test_a_method_differs_from_the_one_line_in_what_its_name_says(launch):
+    tdpg, *others = ball.methods(launch)
+    one_line = settings_of(tdpg)
+    assert one_line == {**load_hyperparams("BallCatch-v0"), "env_kwargs": {"renderer": "fast", **ball.LAUNCHES[launch]}}
+    changed = {
+        method.label: {key for key in settings_of(method) if settings_of(method)[key] != one_line.get(key)}
+        for method in others
+        if method.algo == "tdpg"
+    }
+    assert changed == {
+        "PG": {"nuisance"},
+        "nuisance phase": {"nuisance_level"},
+        "with the penalty": {"beta", "cost_limit"},
+        "penalty alone": {"nuisance", "beta", "cost_limit"},
+        "more gradient steps": {"n_epochs"},
+    }
+    for method in others:
+        assert settings_of(method)["n_timesteps"] == one_line["n_timesteps"]
+        assert settings_of(method)["env_kwargs"] == one_line["env_kwargs"]
+    assert ["VecImagePerturbation" in str(settings_of(method)) for method in others] == [False] * 5 + [True] * 2

@@ -4,7 +4,6 @@ import json
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 from sb3_contrib import RecurrentPPO
@@ -15,22 +14,16 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.envs.scenarios import LAVA
-from sb3_tdpg.experiments.runs import Run, complete_run
+from sb3_tdpg.experiments import runs
+from sb3_tdpg.experiments.runs import Run, SB3Run, complete_run
 from sb3_tdpg.experiments.training import make_training, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.paper import ball, baselines, grasp
-from sb3_tdpg.paper.baselines import (
-    BALL_BASELINES,
-    GRASP_BASELINES,
-    LAVA_BASELINES,
-    Baseline,
-    SB3Run,
-    TimedRun,
-    training_time,
-)
+from sb3_tdpg.paper import baselines, grasp
+from sb3_tdpg.paper.baselines import GRASP_BASELINES, LAVA_BASELINES, training_time, training_times
+from sb3_tdpg.paper.common import Method
 from sb3_tdpg.settings import rate_schedule
 
-COMPARISONS = (LAVA_BASELINES, BALL_BASELINES, GRASP_BASELINES)
+COMPARISONS = (LAVA_BASELINES, GRASP_BASELINES)
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
@@ -65,7 +58,7 @@ def tiny(monkeypatch):
 @pytest.mark.slow
 def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
     out, published = tmp_path / "out", tmp_path / "docs"
-    arguments = dict(n_seeds=2, n_ball_seeds=1, n_eval_episodes=2, n_timesteps=100, records=results)
+    arguments = dict(n_seeds=2, n_eval_episodes=2, n_timesteps=100, records=results)
     summary = baselines.reproduce_baselines(out, publish=published, **arguments)
 
     assert (published / "summary.md").read_text() == summary
@@ -78,21 +71,19 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
     # Of a method with records the table has these, of its first five seeds, and not the training for its time.
     plain = summary.replace("**", "")
     assert "| TDPG (log-det) | 5 | 302.00 " in plain
-    assert "| TDPG, perturbed images | 5 | 102.00 " in plain
     assert "| VIB | 2 | " in plain
     # One seed has no interval.
     assert "| PPO | 1 | " in plain
     assert "[" not in plain.split("## Grasping")[1].split("| PPO | 1 | ")[1].split("\n")[0]
     n_runs = [
         sum(min(n, baseline.max_seeds) for baseline in each.baselines)
-        for each, n in zip(COMPARISONS, (2, 1, 1), strict=True)
+        for each, n in zip(COMPARISONS, (2, 1), strict=True)
     ]
     records = pd.read_csv(out / "episodes.csv.xz")
     assert len(records) == 2 * sum(n * len(each.rows) for each, n in zip(COMPARISONS, n_runs, strict=True))
     assert not records.isna().any().any()
     assert records.groupby("env_id")["train_seed"].unique().map(list).to_dict() == {
         "Lava-v0": [300, 301],
-        "BallCatch-v0": [100],
         "PandaGrasp-v0": [100],
     }
     seeds = pd.read_csv(out / "seeds.csv")
@@ -108,7 +99,7 @@ def test_from_nothing_to_the_table_and_the_records(tmp_path, tiny, results):
 
 @pytest.mark.parametrize(("algo", "cls"), [("ppo", PPO), ("ppo_lstm", RecurrentPPO)])
 def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tiny):
-    run = Baseline("baseline", "Lava-v0", algo=algo, overrides=dict(n_timesteps=200)).run("Lava-v0", 3)
+    run = Method("baseline", "Lava-v0", algo=algo, overrides=dict(n_timesteps=200)).run("Lava-v0", 3)
     complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=4)
 
     settings = run.settings
@@ -126,7 +117,7 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
 
 
 def test_a_model_that_was_half_written_when_a_run_was_killed_is_trained_anew(tmp_path, tiny, monkeypatch):
-    run = Baseline("baseline", "Lava-v0", algo="ppo", overrides=dict(n_timesteps=20)).run("Lava-v0", 3)
+    run = Method("baseline", "Lava-v0", algo="ppo", overrides=dict(n_timesteps=20)).run("Lava-v0", 3)
     save = PPO.save
 
     def killed(self, path, *args, **kwargs):
@@ -150,8 +141,8 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
             return self.now
 
     wall, cpu = Clock(), Clock()
-    monkeypatch.setattr(baselines.time, "perf_counter", wall)
-    monkeypatch.setattr(baselines.time, "process_time", cpu)
+    monkeypatch.setattr(runs.time, "perf_counter", wall)
+    monkeypatch.setattr(runs.time, "process_time", cpu)
 
     def train(run, attempt, folder, progress_bar):
         folder.mkdir(parents=True, exist_ok=True)
@@ -161,8 +152,8 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
             raise KeyboardInterrupt
         return PPO("MlpPolicy", "Lava-v0", device="cpu"), wall.now == 40.0
 
-    monkeypatch.setattr(Run, "train", train)
-    run = TimedRun("TDPG", "Lava-v0", "Lava-v0-logdet", 0, max_attempts=3)
+    monkeypatch.setattr(Run, "_train", train)
+    run = Run("TDPG", "Lava-v0", "Lava-v0-logdet", 0, max_attempts=3)
     with pytest.raises(KeyboardInterrupt):
         complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
     complete_run(run, tmp_path, LAVA[:1], n_eval_episodes=2)
@@ -171,13 +162,11 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
 
 
 def test_the_time_of_a_second_stage_holds_that_of_the_first(tmp_path, monkeypatch):
-    tasks = [task for task in BALL_BASELINES.tasks(1, tmp_path) if task[0].method[:3] in ("fir", "VIB")]
+    tasks = [task for task in GRASP_BASELINES.tasks(1, tmp_path) if task[0].method[:3] in ("fir", "VIB")]
     for (run, folder, _), seconds in zip(tasks, (100.0, 30.0), strict=True):
         write_atomically(path_of_time(folder), json.dumps(dict(wall_s=seconds, cpu_s=seconds / 2)))
         assert run.start == (None if run.method == "first stage" else tasks[0][1])
-    rows = [("BallCatch-v0", run.method, 100, 1, False, "Training", 1.0) for run, *_ in tasks]
-    columns = ["env_id", "model", "train_seed", "attempts", "selected", "scenario", "cost"]
-    table = baselines._seed_table(pd.DataFrame(rows, columns=columns), tasks)
+    table = training_times(tasks)
     assert list(table["wall_s"]) == [100.0, 130.0]
     assert list(table["cpu_s"]) == [50.0, 65.0]
 
@@ -196,22 +185,6 @@ def test_weight_decay_reaches_the_optimiser_and_changes_nothing_else():
     assert [group["weight_decay"] for group in optimizer.param_groups] == [0.001] * len(optimizer.param_groups)
 
 
-def test_each_augmentation_changes_images_and_only_as_it_says():
-    images = {}
-    for label, baseline in {
-        baseline.label: baseline for baseline in BALL_BASELINES.baselines if baseline.algo == "ppo"
-    }.items():
-        settings = {**load_hyperparams("BallCatch-v0", "ppo"), **baseline.overrides, "n_envs": 3}
-        env = take_env("BallCatch-v0", settings)
-        env.seed(0)
-        images[label] = env.reset().astype(float)
-    plain, noisy, other = (images[f"PPO{what}"] for what in ("", ", pixel noise", ", random backgrounds"))
-    # Noise has no mean and no neighbours; a pattern has both.
-    assert 0 < np.abs((noisy - plain).mean()) < 10
-    assert np.abs(noisy - plain).mean() > 3
-    assert np.abs((other - plain).mean(axis=(2, 3))).max() > 10
-
-
 def settings_of(comparison):
     return {baseline.label: baseline.run(comparison.env_id, 0).settings for baseline in comparison.baselines}
 
@@ -224,7 +197,6 @@ def changed(one, other):
 def test_the_baselines_of_one_table_have_as_many_steps_as_tdpg_in_all_stages(comparison):
     of_tdpg = {
         "Lava-v0": load_hyperparams("Lava-v0-logdet")["n_timesteps"],
-        "BallCatch-v0": load_hyperparams("BallCatch-v0-perturbed-pg")["n_timesteps"] + ball.SECOND_STAGE["n_timesteps"],
         "PandaGrasp-v0": load_hyperparams("PandaGrasp-v0-pg")["n_timesteps"] + grasp.SECOND_STAGE["n_timesteps"],
     }
     settings = settings_of(comparison)
@@ -235,31 +207,26 @@ def test_the_baselines_of_one_table_have_as_many_steps_as_tdpg_in_all_stages(com
 
 
 def test_a_baseline_differs_in_what_its_name_says():
-    lava, on_ball, on_grasp = (settings_of(comparison) for comparison in COMPARISONS)
+    lava, on_grasp = (settings_of(comparison) for comparison in COMPARISONS)
     assert changed(lava["TDPG (log-det)"], lava["VIB"]) == {"mi_estimator"}
     assert changed(lava["PG"], lava["PG, weight decay"]) == {"policy_kwargs"}
-    assert changed(on_ball["TDPG, perturbed images"], on_ball["VIB, perturbed images"]) == {"mi_estimator"}
     attempts = {baseline.label: baseline.max_attempts for baseline in LAVA_BASELINES.baselines}
     assert attempts["TDPG (log-det)"] == attempts["VIB"]
     # And from the methods of the tables of which the records are.
-    for methods, vib in (
-        (ball.METHODS, on_ball["VIB, perturbed images"]),
-        (grasp.METHODS["fixed"], on_grasp["VIB"]),
-    ):
-        (tdpg,) = (method for method in methods if method.label == "TDPG")
-        assert changed({**load_hyperparams(tdpg.block), **tdpg.overrides}, vib) == {"mi_estimator"}
+    (tdpg,) = (method for method in grasp.METHODS["fixed"] if method.label == "TDPG")
+    assert changed({**load_hyperparams(tdpg.block), **tdpg.overrides}, on_grasp["VIB"]) == {"mi_estimator"}
 
 
 def test_without_the_records_it_says_how_to_make_them_and_trains_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["reproduce", "baselines"]) == 2
-    assert "make reproduce-lava reproduce-ball-controls" in capsys.readouterr().err
+    assert "make reproduce-lava reproduce-grasp" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["lava", "--n-ball-seeds", "2"], ["grasp", "--n-grasp-seeds", "2"], ["baselines", "--n-paper-seeds", "2"]],
+    [["grasp", "--n-grasp-seeds", "2"], ["baselines", "--n-paper-seeds", "2"], ["ball", "--n-paper-seeds", "2"]],
 )
 def test_an_option_of_another_experiment_is_refused(arguments, capsys):
     assert main(["reproduce", *arguments]) == 2
