@@ -255,7 +255,8 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("results/lava"), help="folder for the results")
     add("--reading", choices=("table", "text"), default="table", help="cost definition: of the paper's table or text")
 
-    add = command(_reproduce, "reproduce an experiment of the paper with many seeds", "--jobs", *sizes)
+    add = command(_reproduce, "reproduce an experiment of the paper with many seeds", "--jobs", "--n-timesteps")
+    add("--n-eval-episodes", type=_positive, help="episodes of each row of the table (default: 1000; ball: 200)")
     add("experiment", choices=tuple(EXPERIMENTS))
     add("--out", type=Path, help="folder for the results (default: one in results/ for each experiment)")
     add("--publish", type=Path, help="copy everything except the runs to this folder")

@@ -3,18 +3,14 @@
 import math
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch as th
 from gymnasium import spaces
 from small_problems import assert_same_parameters, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
 from torch.distributions import Normal
-from torch.nn.functional import avg_pool2d
 
 from sb3_tdpg import TDPG, make_episodes_env
-from sb3_tdpg.cli import main
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.features import TRVCnn
 from sb3_tdpg.information.nuisance import action_divergence, behaviour, encoder_divergence
 from sb3_tdpg.robustness.nuisance import Members, Nuisance, OneMember, make_nuisance
 
@@ -195,6 +191,18 @@ def test_the_members_follow_torch_and_leave_the_environment_alone():
     assert_same_parameters(parameters(train(declared).policy), parameters(train(declared).policy))
     first_rollouts = [rollouts(tiny_tdpg("Lava-v0", nuisance=n)).observations for n in (None, declared)]
     th.testing.assert_close(*first_rollouts, rtol=0, atol=0)
+
+
+def test_one_member_of_a_family_is_the_same_for_all_episodes_and_every_time():
+    steps = observed(VECTOR, n=1) * 2
+    steps = [np.repeat(step, 4, axis=0) for step in steps]
+    family = make_nuisance("vector_bias", VECTOR, toy_vec_env(observation_space=VECTOR))
+    before = th.get_rng_state()
+    first, again, other = (shown(OneMember(family, seed).members(4), steps) for seed in (1, 1, 2))
+    assert (th.get_rng_state() == before).all()
+    np.testing.assert_array_equal(first, again)
+    assert (first[0] == first[0][:1]).all()
+    assert (np.array(first) != np.array(other)).any()
 
 
 # -- the phase --------------------------------------------------------------------------------------------------
@@ -423,87 +431,3 @@ def test_other_seeds_train_other_policies():
     for model in models:
         train_epochs(model, 1)
     assert not same_parameters(*(parameters(model.policy) for model in models))
-
-
-# -- the encoder ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", [(3, 24, 24), (1, 25, 26), (3, 26, 25)])
-def test_pixels_are_pooled_to_their_means(shape):
-    space = spaces.Box(0, 255, shape, np.uint8)
-    cnn = TRVCnn(space, pool=2)
-    images = th.as_tensor(observed(space, n=5, length=1)[0])
-    pooled = cnn.pooled(images)
-    th.testing.assert_close(pooled, avg_pool2d(images.float(), 2))
-    th.testing.assert_close(cnn.pooled(images.contiguous(memory_format=th.channels_last)), pooled)
-    assert cnn.pooled(pooled) is pooled
-    th.testing.assert_close(cnn(images / 255.0), cnn(pooled / 255.0))
-
-
-def test_a_texture_finer_than_the_layers_step_is_seen_as_its_mean():
-    """Stripes of one pixel that move by a pixel: without pooling, the features of a random layer move with them."""
-    space = spaces.Box(0, 255, (3, 24, 24), np.uint8)
-    stripes = np.zeros((2, 3, 24, 24), np.uint8)
-    stripes[0, :, :, ::2] = stripes[1, :, :, 1::2] = 255
-    th.manual_seed(0)
-    moved = {
-        pool: th.diff(TRVCnn(space, pool=pool)(th.as_tensor(stripes) / 255.0), dim=0).abs().max() for pool in (1, 2)
-    }
-    assert moved[2] < 1e-6 < 0.1 < moved[1]
-
-
-def test_small_images_are_not_pooled():
-    assert TRVCnn(spaces.Box(0, 255, (3, 16, 16), np.uint8), pool=2).pool == 1
-    assert TRVCnn(spaces.Box(0, 255, (3, 20, 40), np.uint8), pool=2).pool == 2
-
-
-def test_a_model_of_an_early_version_keeps_its_encoder(tmp_path):
-    model = tiny_tdpg(ball_env(20), policy_kwargs={})
-    assert model.policy.features_extractor.pool == 2
-    model.preset = None
-    model.policy_kwargs = {}
-    model._setup_model()  # as in a file that knows of no preset
-    assert model.policy.features_extractor.pool == 1
-
-
-# -- certificates -----------------------------------------------------------------------------------------------
-
-
-def test_one_member_of_a_family_is_the_same_for_all_episodes_and_every_time():
-    steps = observed(VECTOR, n=1) * 2
-    steps = [np.repeat(step, 4, axis=0) for step in steps]
-    family = make_nuisance("vector_bias", VECTOR, toy_vec_env(observation_space=VECTOR))
-    before = th.get_rng_state()
-    first, again, other = (shown(OneMember(family, seed).members(4), steps) for seed in (1, 1, 2))
-    assert (th.get_rng_state() == before).all()
-    np.testing.assert_array_equal(first, again)
-    assert (first[0] == first[0][:1]).all()
-    assert (np.array(first) != np.array(other)).any()
-
-
-def test_certified_bounds_hold_for_random_members(tmp_path):
-    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias", nuisance_level="trv")
-    train_epochs(model, 3)
-    model.save(tmp_path / "model.zip")
-    declared = "{vector_noise: [1, 5], vector_bias: 2}"
-    command = ["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--nuisance", declared, "--members", "20"]
-    main([*command, "--n-episodes", "2000", "--n-test-episodes", "200", "--out", str(tmp_path / "out")])
-    records = pd.read_csv(tmp_path / "out" / "nuisance.csv")
-    assert len(records) == 21
-    assert (records["clipped_cost"] <= records["bound"]).all()
-    assert records["kl"].nunique() > 15  # another member, another divergence
-    assert (records["measured_kl"] <= records["kl"] + 1e-6).mean() > 0.9
-    assert "random members" in (tmp_path / "out" / "summary.md").read_text()
-
-
-@pytest.mark.parametrize(("arguments", "fragment"), [
-    (["--nuisance", "vector_bias", "--random-shifts", "3"], "leave them or --nuisance out"),
-    (["--nuisance", "{"], "is not YAML"),
-    (["--nuisance", "fog"], "perturbation='fog' is unknown"),
-    (["--nuisance", "auto"], "is none for"),
-])  # fmt: skip
-def test_wrong_arguments_of_certify_are_explained(arguments, fragment, tmp_path, capsys):
-    model = tiny_tdpg("Lava-v0")
-    model.save(tmp_path / "model.zip")
-    assert main(["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--out", str(tmp_path), *arguments]) != 0
-    assert fragment in capsys.readouterr().err

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from small_problems import words
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_tdpg  # noqa: F401  (registers the environments)
@@ -17,7 +16,7 @@ from sb3_tdpg.envs.scenarios import (
     BALL_PUBLISHED_READING,
     BALL_VARYING_LAUNCH,
 )
-from sb3_tdpg.envs.textures import TEST_TEXTURES, load_texture, random_texture
+from sb3_tdpg.envs.textures import TEST_TEXTURES
 
 READINGS = {"text": {}, "published": BALL_PUBLISHED_READING}
 IMAGE = (3, 64, 64)
@@ -390,80 +389,7 @@ def test_the_rows_of_the_varying_launch_differ_from_table_two_in_the_launch_alon
         assert not ours.paper
 
 
-# -- bad input -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("keywords", "message"), [
-    (dict(pixel_noise_std=-0.1), "pixel_noise_std=-0.1 must be finite and not negative"),
-    (dict(pixel_noise_std=np.nan), "pixel_noise_std=nan must be finite"),
-    (dict(noise_mode="max"), r"noise_mode='max' must be one of \['minmax', 'clip'\]"),
-    (dict(renderer="opengl"), r"renderer='opengl' must be one of \['pybullet', 'fast'\]"),
-    (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
-    (dict(dt=0.0), "dt=0.0 must be finite and positive"),
-    (dict(control_gain=-1.0), "control_gain=-1.0 must be finite and positive"),
-    (dict(gravity=np.inf), "gravity=inf must be finite"),
-    (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
-    (dict(robot_range=(1.0, -1.0)), r"robot_range=\(1.0, -1.0\) must be \(low, high\)"),
-    (dict(robot_range=2.0), r"robot_range=2.0 must be \(low, high\)"),
-    (dict(ball_start_range=(8.0, 1.0)), r"ball_start_range=\(8.0, 1.0\) must be \(\(low_x, low_y\)"),
-    (dict(ball_speed_range=((-4, 8), (-5, 8))), r"ball_speed_range=.* must be \(\(low_x, low_y\).* low <= high"),
-    (dict(ball_color=(0, 255, 0)), r"ball_color=\(0, 255, 0\) must be \(red, green, blue\), each between 0 and 1"),
-    (dict(ball_radius=0.0), "ball_radius=0.0 must be finite and positive"),
-    (dict(camera_height=-1.0), "camera_height=-1.0 must be finite and positive"),
-    (dict(camera_pitch=90.0), "camera_pitch=90.0 must be between -90 and 90 degrees"),
-    (dict(fov=np.nan), "fov=nan must be between 0 and 180 degrees"),
-    (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
-    (dict(texture="bricks"), r"texture='bricks' is unknown: use one of \['brick', 'blue_tiles', .*'red_planks'\]"),
-    (dict(texture=np.zeros((8, 8), np.uint8)), r"shape \(8, 8\) and dtype uint8; expected \(height, width, 3\)"),
-    (dict(texture=np.zeros((8, 8, 3))), "dtype float64; expected"),
-], ids=words)  # fmt: skip
-def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
-    with pytest.raises(ValueError, match=message):
-        fast_env(**keywords)
-
-
-def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no_such_wall.png'.*no such image file"):
-        fast_env(texture=tmp_path / "no_such_wall.png")
-    broken = tmp_path / "broken.png"
-    broken.write_bytes(b"\x89PNG\r\n\x1a\n but then nothing")
-    with pytest.raises(ValueError, match=r"broken.png' cannot be read as an image"):
-        fast_env(texture=str(broken))
-    text = tmp_path / "text.jpg"
-    text.write_text("not an image")
-    with pytest.raises(ValueError, match=r"text.jpg' cannot be read as an image"):
-        fast_env(texture=text)
-
-
-# -- textures ------------------------------------------------------------------------------------------------
-
-
-def test_the_built_in_textures_differ_in_hue_and_the_seventh_is_reddish_like_the_brick():
-    mean = {name: load_texture(name).reshape(-1, 3).mean(axis=0) for name in ("brick", *TEST_TEXTURES)}
-    assert len(TEST_TEXTURES) == 7
-    redness = {name: red / max(green, blue) for name, (red, green, blue) in mean.items()}
-    reddish = ("brick", TEST_TEXTURES[6])
-    assert min(redness[name] for name in reddish) > 1.4
-    assert max(redness[name] for name in TEST_TEXTURES[:6]) < 1.25
-    hues = np.array([color / color.sum() for color in mean.values()])
-    apart = np.linalg.norm(hues[:, None] - hues, axis=-1) + 9 * np.eye(8)
-    assert apart[:7, :7].min() > 0.05
-
-
-def test_a_texture_is_the_same_every_time_and_a_random_one_follows_its_seed():
-    np.testing.assert_array_equal(load_texture("random-11"), random_texture(11))
-    assert len({random_texture(seed).tobytes() for seed in range(50)}) == 50
-    with pytest.raises(ValueError, match="read-only"):
-        load_texture("brick")[0, 0] = 0
-
-
-def test_a_texture_continues_over_its_edges():
-    for name in ("brick", *TEST_TEXTURES):
-        texture = load_texture(name).astype(int)
-        inside = abs(np.diff(texture, axis=0)).mean(axis=(1, 2)).max()
-        assert abs(texture[0] - texture[-1]).mean() <= 1.1 * inside, name
-        inside = abs(np.diff(texture, axis=1)).mean(axis=(0, 2)).max()
-        assert abs(texture[:, 0] - texture[:, -1]).mean() <= 1.1 * inside, name
+# -- walls, and processes ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "P"])

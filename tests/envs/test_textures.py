@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_tdpg.envs.textures import TEST_TEXTURES, built_in_texture, floor_texture, load_texture
+from sb3_tdpg.envs.textures import TEST_TEXTURES, built_in_texture, floor_texture, load_texture, random_texture
 
 # Mean of each colour, the mean step between neighbouring texels along rows and columns, and what the first half of the
 # rows and of the columns is brighter than the rest.
@@ -51,3 +51,31 @@ def test_a_wall_is_the_picture_that_the_results_were_measured_with(name):
 
 def test_every_wall_of_the_test_is_checked():
     assert set(TEST_TEXTURES) < set(PICTURES)
+
+
+def test_the_built_in_textures_differ_in_hue_and_the_seventh_is_reddish_like_the_brick():
+    mean = {name: load_texture(name).reshape(-1, 3).mean(axis=0) for name in ("brick", *TEST_TEXTURES)}
+    assert len(TEST_TEXTURES) == 7
+    redness = {name: red / max(green, blue) for name, (red, green, blue) in mean.items()}
+    reddish = ("brick", TEST_TEXTURES[6])
+    assert min(redness[name] for name in reddish) > 1.4
+    assert max(redness[name] for name in TEST_TEXTURES[:6]) < 1.25
+    hues = np.array([color / color.sum() for color in mean.values()])
+    apart = np.linalg.norm(hues[:, None] - hues, axis=-1) + 9 * np.eye(8)
+    assert apart[:7, :7].min() > 0.05
+
+
+def test_a_texture_is_the_same_every_time_and_a_random_one_follows_its_seed():
+    np.testing.assert_array_equal(load_texture("random-11"), random_texture(11))
+    assert len({random_texture(seed).tobytes() for seed in range(50)}) == 50
+    with pytest.raises(ValueError, match="read-only"):
+        load_texture("brick")[0, 0] = 0
+
+
+def test_a_texture_continues_over_its_edges():
+    for name in ("brick", *TEST_TEXTURES):
+        texture = load_texture(name).astype(int)
+        inside = abs(np.diff(texture, axis=0)).mean(axis=(1, 2)).max()
+        assert abs(texture[0] - texture[-1]).mean() <= 1.1 * inside, name
+        inside = abs(np.diff(texture, axis=1)).mean(axis=(0, 2)).max()
+        assert abs(texture[:, 0] - texture[:, -1]).mean() <= 1.1 * inside, name

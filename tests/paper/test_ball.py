@@ -92,6 +92,15 @@ def test_the_varying_launch_has_a_reproduction_of_its_own(tmp_path, tiny, capsys
     assert landing.nunique() > 1
 
 
+def test_the_command_leaves_the_number_of_episodes_to_the_experiment(monkeypatch, tmp_path):
+    asked = {}
+    monkeypatch.setattr(ball, "reproduce_ball", lambda out, **options: asked.update(options) or "done")
+    assert main(["reproduce", "ball", "--out", str(tmp_path)]) == 0
+    assert asked == {}
+    assert main(["reproduce", "ball", "--out", str(tmp_path), "--n-eval-episodes", "7"]) == 0
+    assert asked == {"n_eval_episodes": 7}
+
+
 def test_a_group_is_the_mean_of_its_rows():
     rows = [(m, s, r.name, float(10 * i + s)) for m in ("PG",) for s in (0, 1) for i, r in enumerate(BALL_CATCH)]
     records = pd.DataFrame(rows, columns=["model", "train_seed", "scenario", "cost"])

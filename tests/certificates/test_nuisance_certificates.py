@@ -1,0 +1,35 @@
+"""Certificates for a declared nuisance: no random member costs more than its bound."""
+
+import pandas as pd
+import pytest
+from small_problems import tiny_tdpg, train_epochs
+
+from sb3_tdpg.cli import main
+
+
+def test_certified_bounds_hold_for_random_members(tmp_path):
+    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias", nuisance_level="trv")
+    train_epochs(model, 3)
+    model.save(tmp_path / "model.zip")
+    declared = "{vector_noise: [1, 5], vector_bias: 2}"
+    command = ["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--nuisance", declared, "--members", "20"]
+    main([*command, "--n-episodes", "2000", "--n-test-episodes", "200", "--out", str(tmp_path / "out")])
+    records = pd.read_csv(tmp_path / "out" / "nuisance.csv")
+    assert len(records) == 21
+    assert (records["clipped_cost"] <= records["bound"]).all()
+    assert records["kl"].nunique() > 15  # another member, another divergence
+    assert (records["measured_kl"] <= records["kl"] + 1e-6).mean() > 0.9
+    assert "random members" in (tmp_path / "out" / "summary.md").read_text()
+
+
+@pytest.mark.parametrize(("arguments", "fragment"), [
+    (["--nuisance", "vector_bias", "--random-shifts", "3"], "leave them or --nuisance out"),
+    (["--nuisance", "{"], "is not YAML"),
+    (["--nuisance", "fog"], "perturbation='fog' is unknown"),
+    (["--nuisance", "auto"], "is none for"),
+])  # fmt: skip
+def test_wrong_arguments_of_certify_are_explained(arguments, fragment, tmp_path, capsys):
+    model = tiny_tdpg("Lava-v0")
+    model.save(tmp_path / "model.zip")
+    assert main(["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--out", str(tmp_path), *arguments]) != 0
+    assert fragment in capsys.readouterr().err
