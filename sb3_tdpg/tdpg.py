@@ -28,7 +28,7 @@ from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, horizon_of, reward_threshold
-from sb3_tdpg.robustness.nuisance import declaration
+from sb3_tdpg.robustness.nuisance import resolved
 from sb3_tdpg.settings import (
     DEFAULTS,
     Defaults,
@@ -88,7 +88,7 @@ class TDPG(EpisodicAlgorithm):
     :param baseline: Variance reduction of the gradient. ``"regression"``: subtract a regression of the cost-to-go on
         the true state at each step; ``"value"``: a network of the true state and the time left
         (:class:`~sb3_tdpg.advantages.ValueFunction`); ``"mean"``: the batch mean of the episode cost, as in the paper.
-        Default: regression, regression, value.
+        Default: regression, value, value; for depth images regression.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper;
         ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both are unbiased; the second
         has less variance. Default: score, pathwise, pathwise.
@@ -96,7 +96,7 @@ class TDPG(EpisodicAlgorithm):
         steps must share their weights (``time_varying=False``). Default: none (whole episodes), none, 5.
     :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO; default: 1, 4, 10.
     :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own; default:
-        all, 80 episodes, 250 steps.
+        all, 40 episodes, 250 steps.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping. Default: inf, 0.2, 0.2.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning. Default: no, yes, yes.
@@ -275,15 +275,11 @@ class TDPG(EpisodicAlgorithm):
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
             value_function = ValueFunction(self.state_dim, self.horizon, with_changes=self.values_see_changes)
             self.value_function = value_function.to(self.device)
-        level = self.nuisance_level
-        if level == "auto":
-            level = "rollouts" if self.nuisance == "auto" else "action"
-        # Drawn anew for each image, as the measurements of docs/guide/nuisance.md were; held, it was not tried.
-        self.nuisance = declaration(self.nuisance, self.observation_space, held=level != "rollouts")
+        self.nuisance, level = resolved(self.nuisance, self.nuisance_level, self.observation_space)
         self.nuisance_phase = None
         if self.nuisance is not None:
             self.nuisance_level = level
-            self.nuisance_phase = NuisancePhase(self.policy, self.nuisance_steps, self.nuisance_level)
+            self.nuisance_phase = NuisancePhase(self.policy, self.nuisance_steps, level)
             self._make_nuisance()
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)

@@ -325,6 +325,18 @@ def make_nuisance(declared: Any, space: spaces.Space, env: VecEnv) -> Nuisance |
     return families[0] if len(families) == 1 else UnionNuisance(families)
 
 
+def resolved(declared: Any, level: str, space: spaces.Space) -> tuple[Any, str]:
+    """
+    Replace ``"auto"`` in TDPG's arguments ``nuisance`` and ``nuisance_level``.
+
+    In rollouts every image then has a change of its own, as in docs/results/ball_catch.md; in the phase a change is
+    held for the episode.
+    """
+    if level == "auto":
+        level = "rollouts" if declared == "auto" else "action"
+    return declaration(declared, space, held=level != "rollouts"), level
+
+
 def declaration(declared: Any, space: spaces.Space, **images: Any) -> Any:
     """
     Replace ``"auto"`` and the name of a perturbation by the dict that it stands for.
