@@ -79,9 +79,9 @@ reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
 
 reproduce-ball: $(STAMP) ## reproduce Table II: policy gradient and TDPG on ball catching
-	$(PY) -m sb3_tdpg reproduce ball --no-controls --out results/ball_catch --publish docs/results/ball_catch
+	$(PY) -m sb3_tdpg reproduce ball --no-controls --out results/ball_catch
 
-reproduce-ball-controls: $(STAMP) ## add the controls without the penalty, and the paper's own settings
+reproduce-ball-controls: $(STAMP) ## add the ablations, PPO and RecurrentPPO
 	$(PY) -m sb3_tdpg reproduce ball --out results/ball_catch --publish docs/results/ball_catch
 
 reproduce-ball-varying: $(STAMP) ## the same where the launch varies, a scenario of our own
@@ -93,7 +93,7 @@ reproduce-grasp: $(STAMP) ## reproduce Table III: policy gradient, TDPG and its 
 reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a scenario of our own
 	$(PY) -m sb3_tdpg reproduce grasp-camera --out results/panda_grasp_camera --publish docs/results/panda_grasp_camera
 
-reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay, VIB and augmented images beside TDPG, on all three environments
+reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside TDPG, on lava and grasping
 	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines
 
 reproduce-public: $(STAMP) ## our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO on public tasks

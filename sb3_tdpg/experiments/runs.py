@@ -219,7 +219,9 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
 
     :raises ValueError: if the folder holds a run with other settings.
     """
-    rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios]
+    rows: list[dict[str, Any]] = [
+        dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios
+    ]
     for row, scenario in zip(rows, scenarios, strict=True):  # the folders of earlier versions have neither
         if scenario.sensor is not None:
             row["sensor"] = str(scenario.sensor)
@@ -235,7 +237,8 @@ def read_progress(folder: Path) -> pd.DataFrame:
     frames = [pd.read_csv(path) for path in sorted(folder.glob("progress_*.csv"))]
     log, step = pd.concat([frame for frame in frames if len(frame)]), "time/total_timesteps"
     # Epochs after the last checkpoint were run again, with the same numbers.
-    return log.drop_duplicates(step, keep="last").sort_values(step, ignore_index=True)
+    log = log.drop_duplicates(step, keep="last").sort_values(step, ignore_index=True)
+    return log.assign(**{"time/iterations": range(1, len(log) + 1)})  # a resumed log begins with 1 again
 
 
 def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: int | None = None) -> None:

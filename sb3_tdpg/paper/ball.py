@@ -116,11 +116,14 @@ class VecGamma(VecEnvWrapper):
 
     def reset(self) -> np.ndarray:
         """Reset, and change the first images."""
-        return gamma(self.venv.reset())
+        images = self.venv.reset()
+        assert isinstance(images, np.ndarray)
+        return gamma(images)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step, and change the images."""
         images, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(images, np.ndarray)
         return gamma(images), rewards, dones, infos
 
 
@@ -186,9 +189,9 @@ def reproduce_ball(out: Path, *, launch: str = "fixed", controls: bool = True, n
     save_figure(diagnosis_bars(records[~is_row & ~is_shift]), out / "diagnosis.png")
     save_figure(training_curves(first), out / "training.png")
 
-    of_paper = table[table["model"].isin(WITHOUT_CONTROLS)]
-    costs, distances = aggregate_seeds(of_paper), aggregate_seeds(of_paper.assign(cost=of_paper["distance"]))
     cost_rows = [*rows, *group_rows(rows)]
+    of_paper = table[table["model"].isin(WITHOUT_CONTROLS) & table["scenario"].isin([row.name for row in cost_rows])]
+    costs, distances = aggregate_seeds(of_paper), aggregate_seeds(of_paper.assign(cost=of_paper["distance"]))
     distance_rows = [
         replace(row, paper={m: PaperResult(p.distance) for m, p in row.paper.items() if p.distance is not None})
         for row in cost_rows
@@ -212,7 +215,7 @@ def reproduce_ball(out: Path, *, launch: str = "fixed", controls: bool = True, n
         distance=comparison_markdown(
             distances, distance_rows, quantity="final distance between robot and ball in m", digits=3
         ),
-        goals=common.goals_table(costs, GOALS),
+        goals=common.goals_table(aggregate_seeds(table[table["model"].isin(list(GOALS))]), GOALS),
         shifts=baselines_table(table, SHOWN, training_times(tasks)),
         comparisons=common.comparisons_table(table, [("TDPG", label) for label in labels[1:]], KINDS),
         knowledge=common.write_knowledge(pd.DataFrame(knowledge), ["model"], out),
