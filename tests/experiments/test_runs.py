@@ -126,6 +126,7 @@ def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path, monkeypatch):
         read_progress(tmp_path / name).drop(columns=["time/fps", "time/time_elapsed"]) for name in ("whole", "halved")
     ]
     assert logs[0]["time/total_timesteps"].tolist() == logs[1]["time/total_timesteps"].tolist()
+    assert [log["time/iterations"].tolist() for log in logs] == [list(range(1, len(logs[0]) + 1))] * 2
     pd.testing.assert_series_equal(logs[0]["rollout/ep_cost_mean"], logs[1]["rollout/ep_cost_mean"])
 
 
