@@ -144,7 +144,7 @@ def reproduce_ball(out: Path, *, launch: str = "fixed", controls: bool = True, n
     Train every method with several seeds, evaluate it on the rows of Table II; write tables, figures and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz`` (the paper's rows), ``shifts.csv.xz``
-        (:data:`SHIFTS`), figures, ``config.json`` and ``runs/``.
+        (the rows ``SHIFTS``), figures, ``config.json`` and ``runs/``.
     :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own.
     :param controls: Also train the ablations, PPO and RecurrentPPO; a later call may add them.
     :param n_seeds: Training seeds of each method.
