@@ -73,7 +73,7 @@ GOALS: Mapping[str, Mapping[str, float]] = {
 
 BLOCK = "BallCatch-v0"
 LAUNCHES: Mapping[str, Mapping[str, Any]] = dict(fixed={}, varying=BALL_VARYING_LAUNCH)
-# About one and a half times what the rollouts cost in the end without a penalty: with the nuisance, and without it.
+# One and a half to two times what the rollouts cost in the end without a penalty: with the nuisance, and without it.
 COST_LIMITS = {"fixed": (3.0, 1.5), "varying": (25.0, 6.0)}
 
 

@@ -56,7 +56,7 @@ class Comparison:
     env_id: str
     baselines: Sequence[Method]
     rows: Sequence[Scenario]  # that the policies are evaluated on
-    columns: Sequence[str]  # rows, or groups of rows, that the table shows
+    columns: Sequence[str]  # rows that the table shows
     first_seed: int  # as in the records
     records: Path  # of the methods that are not trained again, in the folder of results
     recorded: Mapping[str, str]  # label of these methods in the records -> in the table
