@@ -246,10 +246,14 @@ def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: i
     Complete runs (see :func:`complete_run`) with a progress bar, as many at a time as ``jobs``, or as there are cores.
 
     A run that starts from the policy of another one waits for it. Ctrl-C keeps finished runs and checkpoints.
+
+    :raises ValueError: if a folder holds a run with other settings; nothing has been run then.
     """
     jobs = jobs or usable_cores()
-    for _, folder, _ in tasks:  # an error here comes before the progress bar
+    for run, folder, scenarios in tasks:  # an error here comes before anything has been run
         folder.parent.mkdir(parents=True, exist_ok=True)
+        if run.start is None or (run.start / "model.zip").exists():
+            check_folder(run, folder, scenarios, n_eval_episodes)
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
     running: dict[Future[Path], Path] = {}
     n_epochs = 0  # of finished runs

@@ -295,6 +295,14 @@ def test_runs_that_wait_for_each_other_are_refused(tmp_path):
         complete_runs([(run, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
 
 
+def test_a_folder_with_another_run_is_told_before_any_run_begins(tmp_path):
+    complete_run(tiny_run(), tmp_path / "old", LAVA[:1], n_eval_episodes=4)
+    tasks = [(tiny_run(), tmp_path / "new", LAVA[:1]), (tiny_run(seed=1), tmp_path / "old", LAVA[:1])]
+    with pytest.raises(ValueError, match="seed: 0 there, 1 here"):
+        complete_runs(tasks, n_eval_episodes=4, jobs=1)
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.slow
 def test_the_reproduction_runs_in_worker_processes(tmp_path):
     arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]
