@@ -6,6 +6,21 @@ import math
 import warnings
 
 LEAST_SLACK = 0.01  # of the limit
+# Of a limit that is a share of the improvement.
+WINDOW = 5  # epochs that a cost is averaged over
+LEVEL_EPOCHS = 10  # in so many epochs a cost that has levelled off falls by less than the slack
+LATEST_START = 0.5  # of the training: the weight then starts, whether or not the cost has levelled off
+
+
+def share_of(cost_limit: object) -> float | None:
+    """Return the share that a text such as ``"95%"`` stands for, or ``None`` if it is none between 0 and 100 %."""
+    if not (isinstance(cost_limit, str) and cost_limit.endswith("%")):
+        return None
+    try:
+        share = float(cost_limit[:-1]) / 100
+    except ValueError:
+        return None
+    return share if 0 < share < 1 else None
 
 
 class AutoWeight:
@@ -22,52 +37,91 @@ class AutoWeight:
     of C, since the few episodes of an epoch say little about the cost, and the weight grows more slowly than it
     shrinks, ``clip(., -3, 0.3)``: a policy loses the return within a few epochs, and takes many to find it again.
 
-    :param cost_limit: C
+    **A share of the improvement** s needs no number: C = first - s * (first - best), with the cost of the first epoch
+    and the lowest mean cost of five successive epochs so far. The weight starts once this mean has levelled off (it
+    falls by less than C - best in ten epochs), and at the latest in the middle of the training: before that it would
+    change what is attainable. Costs may have either sign. ``by_slack`` applies.
+
+    :param cost_limit: C, or a share such as ``"95%"``.
     :param by_slack: See above.
+    :param first_cost: Cost of the first epoch, where the training has begun without the weight.
     :param rate: Largest increase of log w per epoch, reached at a cost of one scale below the limit.
     :param max_growth: Largest multiple of the starting weight. Without it the weight would grow forever where the task
         needs no information.
     """
 
-    # Those of models that early versions saved.
-    by_slack = False
-    _lowest = math.inf
-
     def __init__(
-        self, cost_limit: float, by_slack: bool = False, rate: float = 0.3, max_growth: float = 1000.0
+        self,
+        cost_limit: float | str,
+        by_slack: bool = False,
+        first_cost: float | None = None,
+        rate: float = 0.3,
+        max_growth: float = 1000.0,
     ) -> None:
         self.cost_limit = cost_limit
-        self.by_slack = by_slack
+        self.share = share_of(cost_limit)
+        self.by_slack = by_slack or self.share is not None
+        self.first_cost = first_cost
         self.rate = rate
         self.max_growth = max_growth
-        self._start = 0.0
-        self._lowest = math.inf
+        self.limit = math.nan if isinstance(cost_limit, str) else cost_limit
+        """C; NaN where it is a share and less than five epochs have been run."""
         self.value = 0.0
         """w = 1 / beta, in units of cost per nat."""
+        self.information_before: float | None = None
+        """Information in nats of the epoch in which the weight started."""
+        self._start = 0.0
+        self._lowest = math.inf
+        self._costs: list[float] = []  # of the last WINDOW + LEVEL_EPOCHS epochs
 
-    def update(self, cost: float, information: float) -> None:
+    def update(self, cost: float, information: float, progress_remaining: float = 1.0) -> None:
         """
         Update the weight after an epoch.
 
         :param cost: Mean cost of the epoch's episodes.
         :param information: Estimated information in nats, summed over time.
+        :param progress_remaining: 1 at the beginning of the training, 0 at its end.
         """
-        self._lowest = min(self._lowest, cost)
-        scale, aim, low, high = abs(self.cost_limit), self.cost_limit, -2.0, 1.0
+        is_ready = cost <= self.limit
+        if self.share is None:
+            self._lowest = min(self._lowest, cost)
+        else:
+            is_ready = self._update_limit(cost, self.share) or (
+                progress_remaining <= LATEST_START and math.isfinite(self.limit)
+            )
+        scale, aim, low, high = abs(self.limit), self.limit, -2.0, 1.0
         if self.by_slack:
-            scale = max(self.cost_limit - self._lowest, LEAST_SLACK * scale)
-            aim, low, high = self.cost_limit - scale / 2, -3.0, 0.3
+            scale = max(self.limit - self._lowest, LEAST_SLACK * scale)
+            aim, low, high = self.limit - scale / 2, -3.0, 0.3
         if self.value > 0.0:
             self.value *= math.exp(self.rate * min(max((aim - cost) / scale, low), high))
             self.value = min(self.value, self.max_growth * self._start)
-        elif cost <= self.cost_limit:
+        elif is_ready:
             self.value = self._start = scale / max(information, 1.0)
+            self.information_before = information
 
-    def warn_if_never_met(self, origin: str) -> None:
-        """Warn at the end of a training that never met the limit; ``origin`` says where it comes from."""
-        if self.value == 0.0:
-            warnings.warn(
-                f"no epoch met cost_limit={self.cost_limit:g}{origin}, so that there was no penalty on the "
-                "information: train for longer, or give a higher cost_limit",
-                stacklevel=3,
-            )
+    def _update_limit(self, cost: float, share: float) -> bool:
+        """Move the limit that is a share, and return whether the cost has levelled off."""
+        if self.first_cost is None:
+            self.first_cost = cost
+        self._costs = [*self._costs, cost][-WINDOW - LEVEL_EPOCHS :]
+        if len(self._costs) < WINDOW:
+            return False
+        smoothed = sum(self._costs[-WINDOW:]) / WINDOW
+        self._lowest = min(self._lowest, smoothed)
+        slack = (1 - share) * (self.first_cost - self._lowest)
+        self.limit = self._lowest + slack
+        before = sum(self._costs[:WINDOW]) / WINDOW
+        return len(self._costs) == WINDOW + LEVEL_EPOCHS and before - smoothed < slack
+
+    def warn_if_never_met(self) -> None:
+        """Warn at the end of a training in which the weight never started."""
+        if self.value > 0.0:
+            return
+        if self.share is None:
+            why = f"no epoch met cost_limit={self.cost_limit:g}"
+            mend = "train for longer, or give a higher cost_limit"
+        else:
+            why = f"the training was too short for cost_limit={self.cost_limit!r}"
+            mend = f"train for more than {2 * WINDOW} epochs"
+        warnings.warn(f"{why}, so that there was no penalty on the information: {mend}", stacklevel=3)

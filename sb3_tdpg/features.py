@@ -183,9 +183,17 @@ class ObservationNorm(nn.Module):
             cast(RunningNorm, norm).update(x[alive.bool()].flatten(1).float())
 
 
+def least_side(layers: Sequence[tuple[int, int, int]]) -> int:
+    """Return the smallest side of an image, in pixels, for convolutions given as in :class:`TRVCnn`."""
+    side = 1
+    for _, kernel_size, stride in reversed(layers):
+        side = stride * (side - 1) + kernel_size
+    return side
+
+
 class TRVCnn(BaseFeaturesExtractor):
     """
-    The paper's two convolutional layers: 6 channels, stride 2, ELU, then flattened.
+    Convolutions in front of the encoder; by default the paper's two, 6 channels and stride 2, ELU, then flattened.
 
     With ``pool`` every square of ``pool x pool`` pixels is replaced by its mean before: a layer of stride 2 would
     otherwise turn fine textures, finer than its own step, into coarse ones (aliasing), and textures that were never
@@ -194,37 +202,42 @@ class TRVCnn(BaseFeaturesExtractor):
     Images of floats (depth in m, say) are first scaled from the bounds of their space to [-1, 1], if these are finite.
 
     :param observation_space: An image space with channels first.
-    :param kernel_sizes: Kernel of each of the two layers (4 and 4 for ball catching, 6 and 4 for grasping).
-    :param n_channels: Output channels of each layer.
+    :param layers: Output channels, kernel size and stride of each layer, in pixels.
+    :param activation_fn: Nonlinearity after each layer.
+    :param features_dim: Outputs of a last linear layer, as in SB3's ``NatureCNN``; None: the flattened convolutions.
     :param pool: Side of the squares in pixels; 1: no pooling, as in the paper. Images that would be too small for the
         layers are not pooled.
+    :raises ValueError: if the images are too small for the layers.
     """
 
     def __init__(
         self,
         observation_space: spaces.Box,
-        kernel_sizes: Sequence[int] = (4, 4),
-        n_channels: int = 6,
+        layers: Sequence[tuple[int, int, int]] = ((6, 4, 2), (6, 4, 2)),
+        activation_fn: type[nn.Module] = nn.ELU,
+        features_dim: int | None = None,
         pool: int = 1,
     ) -> None:
         super().__init__(observation_space, features_dim=1)
-        needed = 1  # pixels a side
-        for kernel_size in reversed(kernel_sizes):
-            needed = 2 * (needed - 1) + kernel_size
+        needed = least_side(layers)
         self.image_size = observation_space.shape[1:]
+        if min(self.image_size) < needed:
+            raise ValueError(f"images of {self.image_size} pixels are too small for layers={layers}, {needed} a side")
         self.pool = pool if min(self.image_size) // pool >= needed else 1
         low, high = float(observation_space.low.min()), float(observation_space.high.max())
         is_scaled = np.issubdtype(observation_space.dtype, np.floating) and -np.inf < low < high < np.inf
         self.offset, self.scale = ((low + high) / 2, (high - low) / 2) if is_scaled else (0.0, 1.0)
-        layers: list[nn.Module] = []
+        modules: list[nn.Module] = []
         channels = observation_space.shape[0]
-        for kernel_size in kernel_sizes:
-            layers += [nn.Conv2d(channels, n_channels, kernel_size, stride=2), nn.ELU(inplace=True)]
+        for n_channels, kernel_size, stride in layers:
+            modules += [nn.Conv2d(channels, n_channels, kernel_size, stride=stride), activation_fn()]
             channels = n_channels
-        # With so few channels, convolutions are faster in the channels_last layout.
-        self.cnn = nn.Sequential(*layers, nn.Flatten()).to(memory_format=th.channels_last)  # type: ignore[call-overload]
+        self.cnn = nn.Sequential(*modules, nn.Flatten())
         with th.no_grad():
             self._features_dim = self.cnn(self.pooled(th.zeros(1, *observation_space.shape))).shape[1]
+        if features_dim is not None:
+            self.cnn.extend([nn.Linear(self._features_dim, features_dim), activation_fn()])
+            self._features_dim = features_dim
 
     def pooled(self, images: th.Tensor) -> th.Tensor:
         """Replace squares of pixels by their means, ``(N, C, H, W) -> (N, C, H / pool, W / pool)``, unless done."""
@@ -239,6 +252,7 @@ class TRVCnn(BaseFeaturesExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """``(N, C, H, W) -> (N, features_dim)``; the images may be pooled already."""
+        # With so few channels, convolutions are faster in this layout.
         images = self.pooled(observations).contiguous(memory_format=th.channels_last)
         is_scaled = (self.offset, self.scale) != (0.0, 1.0)
         return self.cnn((images - self.offset) / self.scale if is_scaled else images)

@@ -23,7 +23,7 @@ from torch.distributions import Normal
 from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, Observations, PolicyStep, RebuiltTRVs, each
-from sb3_tdpg.features import Changes, ObservationNorm, TRVCnn, flat_action_space, observation_kind
+from sb3_tdpg.features import Changes, ObservationNorm, TRVCnn, flat_action_space, least_side, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
 from sb3_tdpg.settings import POLICY_DEFAULTS, check_count, check_floors, check_net_arch, default, fill_in_trvs
 
@@ -70,6 +70,10 @@ class TRVPolicy(BasePolicy):
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
         Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen. Default: yes,
         yes, yes, no.
+    :param gate: Whether a gate g in [0, 1] for each TRV, another output of the encoder, decides how much of the last
+        TRVs is kept, as the update gate of a GRU: ``mean = g * candidate + (1 - g) * last TRVs``, where the candidate
+        is the mean without a gate. The policy then remembers over many steps. Not with ``skip``. Default: no, yes, no,
+        no.
     :param squash_trv_log_var: Whether a tanh also keeps the log-variance in [-1, 1], before ``encoder_log_var_init`` is
         added, as in the paper's policies for images. The standard deviation is then at least 0.6, which hurts.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3,
@@ -110,6 +114,7 @@ class TRVPolicy(BasePolicy):
         scale_actions: bool | None = None,
         shared_action_noise: bool | None = None,
         squash_trv_mean: bool | None = None,
+        gate: bool | None = None,
         squash_trv_log_var: bool = False,
         encoder_log_var_init: float | None = None,
         action_log_var_init: float | None = None,
@@ -124,13 +129,15 @@ class TRVPolicy(BasePolicy):
         check_count("horizon", horizon)
         check_floors(encoder_var_floor=encoder_var_floor, action_var_floor=action_var_floor)
         kind = observation_kind(observation_space, normalize_images=normalize_images)
-        # Models of early versions have no preset, and their encoders pool no pixels.
-        defaults = POLICY_DEFAULTS[preset or ("early image" if kind == "image" else kind)]
+        defaults = POLICY_DEFAULTS[preset or kind]
         if features_extractor_class is None and isinstance(observation_space, spaces.Dict):
             features_extractor_class = CombinedExtractor
         elif features_extractor_class is None:
             features_extractor_class = defaults.features_extractor_class
-            features_extractor_kwargs = {**defaults.features_extractor_kwargs, **(features_extractor_kwargs or {})}
+            by_default = defaults.features_extractor_kwargs
+            if "layers" in by_default and min(observation_space.shape[1:]) < least_side(by_default["layers"]):
+                by_default = {}  # the paper's layers, for smaller images
+            features_extractor_kwargs = {**by_default, **(features_extractor_kwargs or {})}
         super().__init__(
             observation_space,
             action_space,
@@ -143,11 +150,12 @@ class TRVPolicy(BasePolicy):
         )
         self.horizon = horizon
         self.preset = preset
-        self.time_varying = default(time_varying, horizon <= MAX_TIME_VARYING_HORIZON and preset != "long")
+        self.time_varying = default(time_varying, default(defaults.time_varying, horizon <= MAX_TIME_VARYING_HORIZON))
         self.normalize_observations = default(normalize_observations, defaults.is_long)
         self.scale_actions = default(scale_actions, defaults.is_long)
         self.shared_action_noise = default(shared_action_noise, defaults.is_long)
         self.squash_trv_mean = default(squash_trv_mean, not defaults.is_long)
+        self.gate = default(gate, defaults.gate)
         self.squash_trv_log_var = squash_trv_log_var
         self.activation_fn = activation_fn
         self.encoder_log_var_init = default(encoder_log_var_init, defaults.encoder_log_var_init)
@@ -163,11 +171,13 @@ class TRVPolicy(BasePolicy):
         self.trv_dim, self.skip, self.skip_changes = fill_in_trvs(
             defaults, self.features_dim, trv_dim, skip, skip_changes
         )
+        if self.gate and self.skip:
+            raise ValueError("policy_kwargs: gate=True and skip=True both decide what the TRVs keep: give one of them")
         self.changes = Changes(self.features_dim) if self.skip_changes else None
         self.action_dist = make_proba_distribution(flat_action_space(action_space))
         self.encoder = TimeMLP(
             horizon,
-            [self.trv_dim + self.features_dim, *self.net_arch["encoder"], 2 * self.trv_dim],
+            [self.trv_dim + self.features_dim, *self.net_arch["encoder"], (3 if self.gate else 2) * self.trv_dim],
             activation_fn or defaults.encoder_activation_fn,
             time_varying=self.time_varying,
         )
@@ -204,7 +214,8 @@ class TRVPolicy(BasePolicy):
         data = super()._get_constructor_parameters()
         names = (
             "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip", "skip_changes",
-            "normalize_observations", "scale_actions", "shared_action_noise", "squash_trv_mean", "squash_trv_log_var",
+            "normalize_observations", "scale_actions", "shared_action_noise", "squash_trv_mean", "gate",
+            "squash_trv_log_var",
             "encoder_log_var_init", "action_log_var_init", "encoder_var_floor", "action_var_floor",
             "features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
         )  # fmt: skip
@@ -216,8 +227,14 @@ class TRVPolicy(BasePolicy):
     def _encoder_density(
         self, parameters: th.Tensor, features: th.Tensor, prev_trv: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Return mean and standard deviation of q: ``(..., 2 Z)``, ``(..., F)``, ``(..., Z)`` -> 2 x ``(..., Z)``."""
-        mean, log_var = parameters.chunk(2, dim=-1)
+        """
+        Return mean and standard deviation of q, ``(..., Z)`` each.
+
+        :param parameters: the encoder's outputs, ``(..., 2 Z)``, with a gate ``(..., 3 Z)``
+        :param features: ``(..., F)``
+        :param prev_trv: x~_{t-1}, ``(..., Z)``
+        """
+        mean, log_var, *gates = parameters.chunk(3 if self.gate else 2, dim=-1)
         if self.skip:
             skipped = [features]
             if self.changes is not None:
@@ -229,6 +246,8 @@ class TRVPolicy(BasePolicy):
             mean = mean + F.pad(known, (0, self.trv_dim - known.shape[-1]))
         if self.squash_trv_mean:
             mean = th.tanh(mean)
+        for gate in gates:
+            mean = th.lerp(prev_trv, mean, th.sigmoid(gate))
         if self.squash_trv_log_var:
             log_var = th.tanh(log_var)
         variance = self._variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor)

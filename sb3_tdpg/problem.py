@@ -106,18 +106,6 @@ def horizon_of(env: VecEnv | gym.Env) -> Any:
     return _attribute(env, "_max_episode_steps") if horizon is None else horizon
 
 
-def reward_threshold(env: VecEnv | None) -> float:
-    """Get the return at which the environment counts as solved; a ``ValueError`` if it was registered without one."""
-    spec = None if env is None else _attribute(env, "spec")
-    if spec is None or spec.reward_threshold is None:
-        raise ValueError(
-            "beta='auto' minimises the information under a limit on the expected cost, but the environment is "
-            "registered without a reward_threshold: give cost_limit=..., or beta=1/75, or beta=float('inf') for plain "
-            "policy gradient"
-        )
-    return float(spec.reward_threshold)
-
-
 def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
     """Read the names of the components of the state, which are optional."""
     names = _attribute(env, "state_names")

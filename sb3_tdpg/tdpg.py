@@ -27,9 +27,10 @@ from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_po
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import Problem, horizon_of, reward_threshold
+from sb3_tdpg.problem import Problem, horizon_of
 from sb3_tdpg.robustness.nuisance import resolved
 from sb3_tdpg.settings import (
+    DEFAULT_SHARE,
     DEFAULTS,
     Defaults,
     check_action_space,
@@ -76,7 +77,8 @@ class TDPG(EpisodicAlgorithm):
     :param beta: Weight of the cost against the information: a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
         (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, inf, inf.
-    :param cost_limit: Limit for ``beta="auto"``; default: minus the environment's registered ``reward_threshold``.
+    :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training to keep,
+        ``"90%"``; default: ``"95%"``.
     :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
         linearly; default: ``"lin_2e-3_2e-5"``, ``"lin_1e-3_5e-5"``, ``"lin_1e-3_1e-4"``.
     :param n_episodes: Episodes N of a policy epoch; default: 500, 160, none.
@@ -135,7 +137,7 @@ class TDPG(EpisodicAlgorithm):
         env: GymEnv | str | None = None,
         *,
         beta: float | Schedule | str | None = None,
-        cost_limit: float | None = None,
+        cost_limit: float | str | None = None,
         learning_rate: float | Schedule | str | None = None,
         n_episodes: int | None = None,
         epoch_steps: int | None = None,
@@ -226,7 +228,8 @@ class TDPG(EpisodicAlgorithm):
         self.n_threads: int | None = settings["n_threads"]
         self.nuisance = nuisance if is_new else None  # models of early versions have none
         self.nuisance_steps, self.nuisance_level = nuisance_steps, nuisance_level
-        self._limit_origin = ""
+        self.first_cost: float | None = None
+        """Mean episode cost of the first epoch."""
         self.auto_weight: AutoWeight | None = None
         """The weight of the information with ``beta="auto"``."""
         if _init_setup_model:
@@ -303,13 +306,9 @@ class TDPG(EpisodicAlgorithm):
             self.auto_weight = None
             self.beta_schedule = FloatSchedule(cast("float | Schedule", self.beta))
             return
-        if self.cost_limit is None:
-            self.cost_limit = -reward_threshold(self.env)
-            self._limit_origin = " (minus the reward_threshold of the environment)"
-            if self.verbose >= 1:
-                print(f"Minimising the information under cost_limit={self.cost_limit:g}{self._limit_origin}")
+        self.cost_limit = DEFAULT_SHARE if self.cost_limit is None else self.cost_limit
         if self.auto_weight is None or self.auto_weight.cost_limit != self.cost_limit:
-            self.auto_weight = AutoWeight(self.cost_limit, by_slack=self.preset == "long")
+            self.auto_weight = AutoWeight(self.cost_limit, by_slack=self.preset == "long", first_cost=self.first_cost)
 
     @property
     def mi_coef(self) -> float:
@@ -339,9 +338,11 @@ class TDPG(EpisodicAlgorithm):
         mean_cost = batch.costs.sum(0).mean().item()
         information = 0.0 if self.information is None else float(self.information.sum())
         self._check_finite("costs", batch.costs)
+        if self.first_cost is None:
+            self.first_cost = mean_cost
         if self.auto_weight is not None:  # the dual step of beta="auto"
             self._check_finite("information", th.tensor(information))
-            self.auto_weight.update(mean_cost, information)
+            self.auto_weight.update(mean_cost, information, self._current_progress_remaining)
         mi_coef = self.mi_coef
         clip_range = self.clip_range(self._current_progress_remaining)
 
@@ -406,7 +407,7 @@ class TDPG(EpisodicAlgorithm):
         self.logger.record("train/objective", mean_cost + mi_coef * information)
         self.logger.record("train/mi_coef", mi_coef)
         if self.auto_weight is not None:
-            self.logger.record("train/cost_limit", self.auto_weight.cost_limit)
+            self.logger.record("train/cost_limit", self.auto_weight.limit)
         self.logger.record("train/trv_std", whole.stds.mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
@@ -463,7 +464,7 @@ class TDPG(EpisodicAlgorithm):
         finally:
             TDPGProgressBar.close()
             if self.auto_weight is not None and self.epoch > 0:
-                self.auto_weight.warn_if_never_met(self._limit_origin)
+                self.auto_weight.warn_if_never_met()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]

@@ -41,10 +41,6 @@ ARGUMENTS = {
     "beta negative": (dict(beta=-1.0), "beta=-1.0", "positive number"),
     "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
     "beta a string": (dict(beta="0.1"), "beta='0.1'", "positive number"),
-    "beta auto without a limit": (dict(beta="auto"), "beta='auto'", "cost_limit=", "reward_threshold", "inf"),
-    "depth image without beta or limit": (
-        dict(env=toy_vec_env(observation_space=DEPTH)), "beta='auto'", "cost_limit=", "reward_threshold"
-    ),
     "nuisance unknown": (dict(nuisance="fog"), "'fog' is unknown", "vector_noise"),
     "nuisance of another kind": (dict(nuisance="contrast"), "'contrast' does not apply", "images"),
     "nuisance a number": (dict(nuisance=3), "nuisance=3 must be None, 'auto'", "a function of the observations"),
@@ -52,6 +48,8 @@ ARGUMENTS = {
     "nuisance_level unknown": (dict(nuisance="vector_noise", nuisance_level="all"), "nuisance_level='all'", "trv"),
     "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
     "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
+    "cost_limit of all": (dict(cost_limit="100%"), "cost_limit='100%'", "between 0 and 100 %", "'95%'"),
+    "cost_limit a text": (dict(cost_limit="0.95"), "cost_limit='0.95'", "'95%'"),
     "cost_limit beside a number for beta": (
         dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"
     ),

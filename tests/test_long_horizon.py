@@ -427,10 +427,9 @@ def test_the_kind_of_problem_decides_the_defaults():
 
 
 def test_a_limit_that_no_epoch_meets_is_told_at_the_end():
-    with pytest.warns(UserWarning, match=r"no epoch met cost_limit=-475 \(minus the reward_threshold .*no penalty"):
-        tiny(beta="auto").learn(400)
+    with pytest.warns(UserWarning, match=r"no epoch met cost_limit=-475, .*no penalty"):
+        tiny(cost_limit=-475).learn(400)
 
 
-def test_a_limit_that_comes_from_the_environment_is_told(capsys):
-    tiny(beta="auto", verbose=1)
-    assert "cost_limit=-475 (minus the reward_threshold" in capsys.readouterr().out
+def test_the_threshold_of_the_registration_decides_nothing():
+    assert tiny(beta="auto").cost_limit == "95%"

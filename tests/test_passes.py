@@ -1,4 +1,4 @@
-"""Passes over an epoch's rollouts, the weight that follows a cost limit, and the defaults of arguments left out."""
+"""Passes over an epoch's rollouts, and the defaults of arguments left out."""
 
 import math
 
@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
-from small_problems import parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+from small_problems import parameters, tiny_tdpg, toy_vec_env, train_epochs
 
-from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingDivergedError
-from sb3_tdpg.auto_weight import AutoWeight
+from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import BALL_CATCH
 from sb3_tdpg.evaluation import evaluate_scenarios
@@ -116,58 +114,6 @@ def test_the_clip_range_may_follow_the_progress():
     assert asked == sorted(asked, reverse=True)
 
 
-# -- the weight that follows a cost limit -----------------------------------------------------------------------------
-
-
-def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
-    weight = AutoWeight(cost_limit=10.0)
-    for _ in range(5):
-        weight.update(cost=30.0, information=4.0)
-        assert weight.value == 0.0
-    weight.update(cost=9.0, information=4.0)
-    start = weight.value
-    assert start * 4.0 == pytest.approx(10.0)
-    weight.update(cost=5.0, information=4.0)
-    assert weight.value > start
-    larger = weight.value
-    weight.update(cost=12.0, information=4.0)
-    assert 0 < weight.value < larger
-    weight.update(cost=10.0, information=4.0)
-    at_the_limit = weight.value
-    weight.update(cost=1e9, information=4.0)
-    assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
-
-
-def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_one():
-    for limit, best, above in ((-475.0, -500.0, -450.0), (-200.0, -500.0, 100.0)):
-        weight = AutoWeight(cost_limit=limit, by_slack=True)
-        weight.update(cost=best, information=4.0)
-        start = weight.value
-        assert start * 4.0 == pytest.approx(limit - best)
-        weight.update(cost=best, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
-        weight.update(cost=(best + limit) / 2, information=4.0)  # the aim
-        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
-        weight.update(cost=above, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5)))
-        weight.update(cost=1e9, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5 - 3)))
-
-
-def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
-    weight = AutoWeight(cost_limit=10.0)
-    for _ in range(500):
-        weight.update(cost=0.0, information=0.0)
-    assert weight.value == pytest.approx(10.0 * 1000.0)
-
-
-def test_costs_that_are_not_finite_leave_the_weight_alone():
-    model = tiny_tdpg(toy_vec_env(n_envs=4, nan_cost_in_episode=3), n_episodes=4, beta="auto", cost_limit=1e3)
-    with pytest.raises(TrainingDivergedError, match="costs"):
-        train_epochs(model, 10)
-    assert math.isfinite(model.mi_coef)
-
-
 def test_equal_costs_do_not_blow_up_the_penalty():
     model = tiny_tdpg(toy_vec_env(n_envs=4), n_episodes=4, beta=1.0, normalize_advantage=True)
     _, callback = model._setup_learn(1)
@@ -175,61 +121,6 @@ def test_equal_costs_do_not_blow_up_the_penalty():
     model.rollout_buffer.costs[:] = 1.0
     model.train()
     assert model.logger.name_to_value["train/grad_norm"] < 100
-
-
-def test_the_weight_follows_a_limit_below_zero():
-    """Costs are negative returns, and many environments pay rewards."""
-    weight = AutoWeight(cost_limit=-400.0)
-    weight.update(cost=-100.0, information=1.0)
-    assert weight.value == 0.0
-    weight.update(cost=-450.0, information=1.0)
-    start = weight.value
-    assert start > 0
-    weight.update(cost=-490.0, information=1.0)
-    assert weight.value > start
-
-
-def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
-    arguments = dict(n_episodes=200, encoder_gradient="pathwise", n_epochs=4, clip_range=0.2, learning_rate=5e-3)
-    costs, information = [], []
-    for beta in ("auto", 1e6):
-        model = tiny_tdpg(beta=beta, cost_limit=40.0 if beta == "auto" else None, **arguments)
-        train_epochs(model, 150)
-        costs.append(model.rollout_buffer.episode_costs.mean())
-        information.append(model.information.sum())
-    assert costs[1] < 25 < costs[0] < 50
-    assert information[0] < 0.7 * information[1]
-
-
-def test_the_weight_is_saved_and_goes_on_where_it_was(tmp_path):
-    model = tiny_tdpg(beta="auto", cost_limit=1e4)
-    train_epochs(model, 3)
-    assert model.mi_coef > 0
-    model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), device="cpu")
-    assert loaded.mi_coef == model.mi_coef
-    train_epochs(loaded, 1, reset_num_timesteps=False)
-    assert loaded.mi_coef > model.mi_coef
-    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), cost_limit=5.0, device="cpu").mi_coef == 0
-    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), beta=0.5, device="cpu").mi_coef == 2
-
-
-def test_a_policy_gradient_model_may_go_on_with_a_cost_limit(tmp_path):
-    model = tiny_tdpg(beta=math.inf)
-    train_epochs(model, 1)
-    model.save(tmp_path / "pg")
-    loaded = TDPG.load(tmp_path / "pg", env=BatchedVecEnv(LavaEnv(), 20), beta="auto", cost_limit=1e4, device="cpu")
-    train_epochs(loaded, 1)
-    assert loaded.mi_coef > 0
-
-
-def test_a_cost_limit_given_to_load_asks_for_the_weight_too(tmp_path):
-    model = tiny_tdpg(beta=math.inf)
-    model.save(tmp_path / "pg")
-    loaded = TDPG.load(tmp_path / "pg", cost_limit=8.0, device="cpu")
-    assert (loaded.beta, loaded.cost_limit) == ("auto", 8.0)
-    with pytest.raises(ValueError, match=r"cost_limit=8.0.*beta=0.5"):
-        TDPG.load(tmp_path / "pg", beta=0.5, cost_limit=8.0, device="cpu")
 
 
 def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
@@ -240,24 +131,7 @@ def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
         assert model._minibatches(model.rollout_buffer.episode_batch()) == [slice(None)]
 
 
-def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():
-    """The selection compares epochs by it."""
-    trained = []
-    for arguments in (dict(beta="auto", cost_limit=1e-3), dict(beta=math.inf)):
-        model = tiny_tdpg(**arguments)
-        selection = SelectionCallback(cost_limit=1e6)
-        train_epochs(model, 2, callback=selection)
-        trained.append(parameters(model.policy))
-        assert (model.information is None) == (arguments["beta"] == math.inf)
-    assert same_parameters(*trained)
-
-
 # -- what is left out -------------------------------------------------------------------------------------------------
-
-
-def with_threshold(env, threshold):
-    env.envs[0].unwrapped.spec = EnvSpec("Toy-v0", reward_threshold=threshold)
-    return env
 
 
 def test_vectors_are_learnt_from_as_in_the_paper():
@@ -271,9 +145,9 @@ def test_vectors_are_learnt_from_as_in_the_paper():
 def test_images_are_learnt_from_with_ppos_passes_and_without_a_penalty_on_what_is_known_of_the_state():
     model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
     assert (model.beta, model.nuisance, model.nuisance_level) == (math.inf, {"images": {"held": False}}, "rollouts")
-    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 40, 0.2)
+    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 1000, 0.2)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
-    assert (model.baseline, model.policy.features_extractor.cnn[0].out_channels) == ("value", 12)
+    assert (model.baseline, model.policy.features_extractor.features_dim) == ("value", 256)
     assert model.env.num_envs == 160
 
 
@@ -283,18 +157,13 @@ def test_every_default_may_be_overruled():
         "TRVPolicy", env, beta=0.5, n_episodes=8, n_epochs=1, clip_range=math.inf, normalize_advantage=False,
         encoder_gradient="score", mi_estimator="loo", device="cpu",
     )  # fmt: skip
-    assert (model.beta, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (0.5, 1, 8, math.inf)
+    assert (model.beta, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (0.5, 1, 8 * 3, math.inf)
     assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("score", "loo", False)
     train_epochs(model, 1)
 
 
 def test_a_cost_limit_alone_asks_for_the_weight_that_keeps_it():
     assert tiny_tdpg(cost_limit=30.0).beta == "auto"
-
-
-def test_the_threshold_of_the_registration_is_the_default_limit():
-    model = TDPG("TRVPolicy", with_threshold(toy_vec_env(observation_space=IMAGE), 3.0), n_episodes=8, beta="auto")
-    assert model.cost_limit == -3.0
 
 
 def test_learning_without_a_number_of_steps_takes_the_default(monkeypatch):
@@ -319,21 +188,11 @@ def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping
     """Two epochs of real grasps, from the line that the documentation shows."""
     model = TDPG("TRVPolicy", "PandaGrasp-v0", n_episodes=16, device="cpu").learn(2 * 16)
     assert model.epoch == 2
-    assert (model.beta, model.cost_limit, model.mi_estimator) == ("auto", 0.03, "logdet")
+    assert (model.beta, model.cost_limit, model.mi_estimator) == ("auto", "95%", "logdet")
     assert (model.n_epochs, model.batch_size, model.clip_range(1.0), model.policy.trv_dim) == (4, 16, 0.2, 16)
     model.env.close()
     model = TDPG("TRVPolicy", "PandaGrasp-v0", device="cpu")
     assert (model.n_episodes, model.batch_size, model.env.num_envs) == (400, 200, 400)
-
-
-def test_the_weight_falls_at_most_by_twice_the_rate():
-    weight = AutoWeight(cost_limit=10.0)
-    weight.update(10.0, 1.0)
-    before = weight.value
-    weight.update(1e6, 1.0)
-    assert weight.value == pytest.approx(before * math.exp(-0.6))
-    weight.update(-1e6, 1.0)
-    assert weight.value == pytest.approx(before * math.exp(-0.6 + 0.3))
 
 
 def test_an_epoch_logs_what_it_did():

@@ -54,13 +54,14 @@ def step_through(policy, observations, deterministic):
 # -- predict and the batched pass ------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("gate", [True, False], ids=["gate", "no gate"])
 @pytest.mark.parametrize("time_varying", [True, False])
 @pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("observation_space", [VECTOR, CHW, DEPTH], ids=["vector", "image", "depth"])
 def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
-    observation_space, deterministic, time_varying
+    observation_space, deterministic, time_varying, gate
 ):
-    policy = make_policy(observation_space, time_varying=time_varying)
+    policy = make_policy(observation_space, time_varying=time_varying, gate=gate)
     observations = np.stack([[observation_space.sample() for _ in range(N)] for _ in range(T)])
     actions, trvs, steps = step_through(policy, observations, deterministic)
     noise = th.stack([step.noise for step in steps])
@@ -130,6 +131,23 @@ def test_the_memory_matters_and_is_cleared_where_an_episode_starts():
     np.testing.assert_array_equal(mixed_state[0][start], fresh_state[0][start])
     assert (np.abs(mixed_state[0] - fresh_state[0])[~start] > 1e-5).all()
     assert mixed_state[1].tolist() == [1, 2] * 3
+
+
+def test_a_gate_keeps_the_last_trvs_where_it_is_closed_and_replaces_them_where_it_is_open():
+    policy = make_policy(gate=True, trv_dim=2)
+    prev_trv = th.tensor([[0.9, -5.0]])
+    candidate, log_var = th.tensor([[0.3, -0.4]]), th.zeros(1, 2)
+
+    def means(gate):
+        parameters = th.cat([candidate, log_var, th.full((1, 2), gate)], dim=1)
+        return policy._encoder_density(parameters, th.zeros(1, 3), prev_trv)[0]
+
+    th.testing.assert_close(means(-30.0), prev_trv)
+    th.testing.assert_close(means(30.0), th.tanh(candidate))
+    th.testing.assert_close(means(0.0), (prev_trv + th.tanh(candidate)) / 2)
+    assert make_policy(gate=False, trv_dim=2).encoder.sizes[-1] == 4
+    with pytest.raises(ValueError, match="gate=True and skip=True"):
+        make_policy(gate=True, skip=True, trv_dim=3)
 
 
 def test_the_state_that_is_passed_in_is_not_changed():
@@ -259,10 +277,14 @@ def test_sizes_and_activations_are_those_of_the_policy_kwargs():
     assert isinstance(policy.encoder.mlp.activation, th.nn.Tanh)
 
 
-def test_the_paper_s_convolutions_stand_before_the_encoder_of_images():
+def test_the_paper_s_convolutions_stand_before_the_encoder_of_small_images_and_of_the_preset_paper():
+    big = spaces.Box(0, 255, (3, 64, 64), np.uint8)
+    for space, preset, channels in ((CHW, None, [6, 6]), (big, "paper", [6, 6]), (big, None, [16, 32, 32])):
+        policy = make_policy(space, preset=preset)
+        convolutions = [layer for layer in policy.features_extractor.cnn if isinstance(layer, th.nn.Conv2d)]
+        assert [layer.out_channels for layer in convolutions] == channels
+        assert (policy.trv_dim, policy.gate, policy.time_varying) == ((8, False, True) if preset else (32, True, False))
     policy = make_policy(CHW)
-    assert policy.trv_dim == 8
-    assert [layer.out_channels for layer in policy.features_extractor.cnn if isinstance(layer, th.nn.Conv2d)] == [6, 6]
     dark, bright = (
         policy.predict(np.full((1, *CHW.shape), value, np.uint8), deterministic=True)[1][0] for value in (0, 255)
     )

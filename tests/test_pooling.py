@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import tiny_tdpg
+from small_problems import ToyEnv
+from stable_baselines3 import PPO
+from torch import nn
 from torch.nn.functional import avg_pool2d
 
-from sb3_tdpg import make_episodes_env
 from sb3_tdpg.features import TRVCnn
 
 
@@ -40,10 +41,21 @@ def test_small_images_are_not_pooled():
     assert TRVCnn(spaces.Box(0, 255, (3, 20, 40), np.uint8), pool=2).pool == 2
 
 
-def test_a_model_of_an_early_version_keeps_its_encoder(tmp_path):
-    model = tiny_tdpg(make_episodes_env("BallCatch-v0", 20, env_kwargs=dict(renderer="fast")), policy_kwargs={})
-    assert model.policy.features_extractor.pool == 2
-    model.preset = None
-    model.policy_kwargs = {}
-    model._setup_model()  # as in a file that knows of no preset
-    assert model.policy.features_extractor.pool == 1
+def test_a_last_linear_layer_gives_the_number_of_features_that_was_asked_for():
+    space = spaces.Box(0, 255, (3, 20, 40), np.uint8)
+    cnn = TRVCnn(space, layers=((4, 4, 2), (8, 3, 1)), activation_fn=nn.ReLU, features_dim=7, pool=2)
+    features = cnn(th.as_tensor(np.stack([space.sample() for _ in range(5)])) / 255.0)
+    assert (cnn.features_dim, features.shape) == (7, (5, 7))
+    assert (features >= 0).all()
+    assert [m.out_channels for m in cnn.cnn if isinstance(m, nn.Conv2d)] == [4, 8]
+
+
+def test_images_smaller_than_the_layers_are_refused():
+    with pytest.raises(ValueError, match=r"\(9, 9\) pixels are too small for layers=.*10 a side"):
+        TRVCnn(spaces.Box(0, 255, (3, 9, 9), np.uint8))
+
+
+def test_the_convolutions_can_stand_in_sb3s_own_policies():
+    """SB3 initialises weights orthogonally, which needs them contiguous."""
+    env = ToyEnv(spaces.Box(0, 255, (3, 20, 16), np.uint8))
+    PPO("CnnPolicy", env, policy_kwargs=dict(features_extractor_class=TRVCnn), n_steps=8, batch_size=8).learn(8)

@@ -18,6 +18,8 @@ from torch.nn.functional import interpolate
 
 PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
 
+PATTERN_GROUP = 16  # images whose patterns have cells of one size
+
 Drawn = dict[str, th.Tensor]  # what was drawn for N images or episodes, with a leading dimension of N
 
 
@@ -28,9 +30,9 @@ class ImageMixture:
 
     1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, with rows
        divided by their sums (or by 0.3, if that is more);
-    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p (the size of its cells, and
-       whether they have edges, are drawn once for all N); a is uniform up to ``pattern``, 0 for three images of ten,
-       and 1 in a rectangle with sides uniform up to ``patch`` of the image's sides;
+    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p, of 2 to 64 cells a side, with
+       edges or without (the same for 16 images side by side); a is uniform up to ``pattern``, 0 for three images of
+       ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's sides;
     3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
        [0, 1];
     4. noise: Gaussian at every pixel, with a standard deviation uniform up to ``noise``.
@@ -65,16 +67,24 @@ class ImageMixture:
 
         mixing = th.eye(channels) + self.color * th.randn(n, channels, channels)
         amount = self.pattern * uniform() * (uniform() < 0.7)
-        size = PATTERN_SIZES[int(th.randint(len(PATTERN_SIZES), ()))]
-        mode = ("nearest", "bilinear")[int(th.randint(2, ()))]
         return dict(
             mixing=mixing / mixing.sum(dim=2, keepdim=True).clamp(min=0.3),
-            pattern=interpolate(th.rand(n, channels, size, size), size=(height, width), mode=mode),
+            pattern=self._patterns(n, channels, height, width),
             amount=th.maximum(amount, self._patches(n, height, width)),
             scale=1 - self.contrast * uniform(),
             offset=uniform(),
             noise=self.noise * uniform(),
         )
+
+    def _patterns(self, n: int, channels: int, height: int, width: int) -> th.Tensor:
+        """Draw random coloured cells: ``(N, C, H, W)``."""
+        parts = []
+        for start in range(0, n, PATTERN_GROUP):
+            size = PATTERN_SIZES[int(th.randint(len(PATTERN_SIZES), ()))]
+            mode = ("nearest", "bilinear")[int(th.randint(2, ()))]
+            cells = th.rand(min(PATTERN_GROUP, n - start), channels, size, size)
+            parts.append(interpolate(cells, size=(height, width), mode=mode))
+        return th.cat(parts) if parts else th.empty(0, channels, height, width)
 
     def _patches(self, n: int, height: int, width: int) -> th.Tensor:
         """Draw rectangles with sides uniform up to ``patch`` of the image's: ``(N, 1, H, W)``, 1 inside."""

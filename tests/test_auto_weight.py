@@ -1,0 +1,226 @@
+"""The weight that follows a cost limit, a number or a share of the improvement: ``beta="auto"``."""
+
+import math
+
+import numpy as np
+import pytest
+from small_problems import parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+
+from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingDivergedError
+from sb3_tdpg.auto_weight import LEVEL_EPOCHS, WINDOW, AutoWeight, share_of
+from sb3_tdpg.envs.lava import LavaEnv
+
+
+def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
+    weight = AutoWeight(cost_limit=10.0)
+    for _ in range(5):
+        weight.update(cost=30.0, information=4.0)
+        assert weight.value == 0.0
+    weight.update(cost=9.0, information=4.0)
+    start = weight.value
+    assert start * 4.0 == pytest.approx(10.0)
+    weight.update(cost=5.0, information=4.0)
+    assert weight.value > start
+    larger = weight.value
+    weight.update(cost=12.0, information=4.0)
+    assert 0 < weight.value < larger
+    weight.update(cost=10.0, information=4.0)
+    at_the_limit = weight.value
+    weight.update(cost=1e9, information=4.0)
+    assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
+
+
+def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_one():
+    for limit, best, above in ((-475.0, -500.0, -450.0), (-200.0, -500.0, 100.0)):
+        weight = AutoWeight(cost_limit=limit, by_slack=True)
+        weight.update(cost=best, information=4.0)
+        start = weight.value
+        assert start * 4.0 == pytest.approx(limit - best)
+        weight.update(cost=best, information=4.0)
+        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
+        weight.update(cost=(best + limit) / 2, information=4.0)  # the aim
+        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
+        weight.update(cost=above, information=4.0)
+        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5)))
+        weight.update(cost=1e9, information=4.0)
+        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5 - 3)))
+
+
+def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
+    weight = AutoWeight(cost_limit=10.0)
+    for _ in range(500):
+        weight.update(cost=0.0, information=0.0)
+    assert weight.value == pytest.approx(10.0 * 1000.0)
+
+
+def test_costs_that_are_not_finite_leave_the_weight_alone():
+    model = tiny_tdpg(toy_vec_env(n_envs=4, nan_cost_in_episode=3), n_episodes=4, beta="auto", cost_limit=1e3)
+    with pytest.raises(TrainingDivergedError, match="costs"):
+        train_epochs(model, 10)
+    assert math.isfinite(model.mi_coef)
+
+
+def test_the_weight_follows_a_limit_below_zero():
+    """Costs are negative returns, and many environments pay rewards."""
+    weight = AutoWeight(cost_limit=-400.0)
+    weight.update(cost=-100.0, information=1.0)
+    assert weight.value == 0.0
+    weight.update(cost=-450.0, information=1.0)
+    start = weight.value
+    assert start > 0
+    weight.update(cost=-490.0, information=1.0)
+    assert weight.value > start
+
+
+def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
+    arguments = dict(n_episodes=200, encoder_gradient="pathwise", n_epochs=4, clip_range=0.2, learning_rate=5e-3)
+    costs, information = [], []
+    for beta in ("auto", 1e6):
+        model = tiny_tdpg(beta=beta, cost_limit=40.0 if beta == "auto" else None, **arguments)
+        train_epochs(model, 150)
+        costs.append(model.rollout_buffer.episode_costs.mean())
+        information.append(model.information.sum())
+    assert costs[1] < 25 < costs[0] < 50
+    assert information[0] < 0.7 * information[1]
+
+
+def test_the_weight_is_saved_and_goes_on_where_it_was(tmp_path):
+    model = tiny_tdpg(beta="auto", cost_limit=1e4)
+    train_epochs(model, 3)
+    assert model.mi_coef > 0
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), device="cpu")
+    assert loaded.mi_coef == model.mi_coef
+    train_epochs(loaded, 1, reset_num_timesteps=False)
+    assert loaded.mi_coef > model.mi_coef
+    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), cost_limit=5.0, device="cpu").mi_coef == 0
+    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), beta=0.5, device="cpu").mi_coef == 2
+
+
+def test_a_policy_gradient_model_may_go_on_with_a_cost_limit(tmp_path):
+    model = tiny_tdpg(beta=math.inf)
+    train_epochs(model, 1)
+    model.save(tmp_path / "pg")
+    loaded = TDPG.load(tmp_path / "pg", env=BatchedVecEnv(LavaEnv(), 20), beta="auto", cost_limit=1e4, device="cpu")
+    train_epochs(loaded, 1)
+    assert loaded.mi_coef > 0
+
+
+def test_a_cost_limit_given_to_load_asks_for_the_weight_too(tmp_path):
+    model = tiny_tdpg(beta=math.inf)
+    model.save(tmp_path / "pg")
+    loaded = TDPG.load(tmp_path / "pg", cost_limit=8.0, device="cpu")
+    assert (loaded.beta, loaded.cost_limit) == ("auto", 8.0)
+    with pytest.raises(ValueError, match=r"cost_limit=8.0.*beta=0.5"):
+        TDPG.load(tmp_path / "pg", beta=0.5, cost_limit=8.0, device="cpu")
+
+
+def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():
+    """The selection compares epochs by it."""
+    trained = []
+    for arguments in (dict(beta="auto", cost_limit=1e-3), dict(beta=math.inf)):
+        model = tiny_tdpg(**arguments)
+        selection = SelectionCallback(cost_limit=1e6)
+        train_epochs(model, 2, callback=selection)
+        trained.append(parameters(model.policy))
+        assert (model.information is None) == (arguments["beta"] == math.inf)
+    assert same_parameters(*trained)
+
+
+def test_the_weight_falls_at_most_by_twice_the_rate():
+    weight = AutoWeight(cost_limit=10.0)
+    weight.update(10.0, 1.0)
+    before = weight.value
+    weight.update(1e6, 1.0)
+    assert weight.value == pytest.approx(before * math.exp(-0.6))
+    weight.update(-1e6, 1.0)
+    assert weight.value == pytest.approx(before * math.exp(-0.6 + 0.3))
+
+
+# -- a share of the improvement ---------------------------------------------------------------------------------------
+
+
+def costs_that_level_off(first, best, n_falling=20, n_level=20):
+    """Fall linearly, then stay."""
+    return [*np.linspace(first, best, n_falling), *[best] * n_level]
+
+
+@pytest.mark.parametrize(("first", "best"), [(200.0, 10.0), (-20.0, -500.0), (50.0, -50.0)])
+def test_a_share_is_of_the_improvement_of_costs_of_either_sign(first, best):
+    weight = AutoWeight("90%")
+    for cost in costs_that_level_off(first, best):
+        weight.update(cost, information=4.0)
+    assert weight.limit == pytest.approx(first - 0.9 * (first - best))
+    assert weight.first_cost == first
+
+
+def test_with_a_share_the_weight_starts_once_the_cost_has_levelled_off():
+    weight, values = AutoWeight("90%"), []
+    for cost in costs_that_level_off(100.0, 0.0):
+        weight.update(cost, information=4.0)
+        values.append(weight.value)
+    started = int(np.flatnonzero(values)[0])
+    # Not while it falls; and when a window of five epochs differs by less than the slack from one ten epochs before.
+    assert 20 < started < 20 + WINDOW + LEVEL_EPOCHS
+    assert weight.information_before == 4.0
+    assert values[started] == pytest.approx(0.1 * 100.0 / 4.0)  # the penalty equals the slack
+    assert values[started + 1] > values[started]
+    weight.update(1e3, information=4.0)
+    assert weight.value == pytest.approx(values[-1] * math.exp(-0.9))
+
+
+def test_with_a_share_the_weight_starts_in_the_middle_of_a_training_that_still_improves():
+    weight = AutoWeight("99%")
+    for i, cost in enumerate(np.linspace(100.0, 0.0, 40)):
+        weight.update(cost, information=4.0, progress_remaining=1 - i / 40)
+        assert (weight.value > 0.0) == (i >= 20), i
+
+
+def test_one_lucky_epoch_does_not_set_the_limit():
+    weight = AutoWeight("90%")
+    for cost in [100.0] + [10.0] * 8 + [-90.0] + [10.0] * 8:
+        weight.update(cost, information=4.0)
+    smoothed = (4 * 10.0 - 90.0) / WINDOW
+    assert weight.limit == pytest.approx(100.0 - 0.9 * (100.0 - smoothed))
+
+
+def test_too_short_a_training_is_told(recwarn):
+    tiny_tdpg(beta="auto", seed=0).learn(20 * 5 * (WINDOW - 1))
+    assert any("too short for cost_limit='95%'" in str(warning.message) for warning in recwarn)
+
+
+def test_the_default_share_needs_no_number_and_is_logged():
+    model = tiny_tdpg(beta="auto", n_episodes=100, encoder_gradient="pathwise", learning_rate=5e-3)
+    assert (model.cost_limit, model.auto_weight.share) == ("95%", 0.95)
+    train_epochs(model, 30)
+    assert model.mi_coef > 0
+    limit = model.logger.name_to_value["train/cost_limit"]
+    assert limit == model.auto_weight.limit
+    assert model.first_cost > limit > model.auto_weight._lowest
+
+
+def test_the_share_goes_on_where_it_was_after_a_save(tmp_path):
+    env = BatchedVecEnv(LavaEnv(), 20)
+    model = tiny_tdpg(cost_limit="80%")
+    train_epochs(model, 16)
+    model.save(tmp_path / "model")
+    loaded = TDPG.load(tmp_path / "model", env=env, device="cpu")
+    assert vars(loaded.auto_weight) == vars(model.auto_weight)
+    # Another share begins anew, but the improvement counts from the first epoch of all.
+    other = TDPG.load(tmp_path / "model", env=env, cost_limit="70%", device="cpu")
+    assert (other.mi_coef, other.auto_weight.first_cost) == (0.0, model.first_cost)
+
+
+def test_after_policy_gradient_the_improvement_counts_from_its_first_epoch(tmp_path):
+    model = tiny_tdpg(beta=math.inf)
+    train_epochs(model, 2)
+    model.save(tmp_path / "pg")
+    loaded = TDPG.load(tmp_path / "pg", env=BatchedVecEnv(LavaEnv(), 20), beta="auto", device="cpu")
+    assert (loaded.cost_limit, loaded.auto_weight.first_cost) == ("95%", model.first_cost)
+
+
+@pytest.mark.parametrize(
+    ("text", "share"), [("95%", 0.95), ("99.9%", 0.999), ("0%", None), ("100%", None), ("95", None), ("x%", None)]
+)
+def test_shares_are_read_from_text(text, share):
+    assert share_of(text) == (None if share is None else pytest.approx(share))
