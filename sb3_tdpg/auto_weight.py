@@ -70,6 +70,7 @@ class AutoWeight:
         """w = 1 / beta, in units of cost per nat."""
         self.information_before: float | None = None
         """Information in nats of the epoch in which the weight started."""
+        self._last = (math.nan, math.nan)  # cost and information
         self._start = 0.0
         self._lowest = math.inf
         self._costs: list[float] = []  # of the last WINDOW + LEVEL_EPOCHS epochs
@@ -82,6 +83,7 @@ class AutoWeight:
         :param information: Estimated information in nats, summed over time.
         :param progress_remaining: 1 at the beginning of the training, 0 at its end.
         """
+        self._last = (cost, information)
         is_ready = cost <= self.limit
         if self.share is None:
             self._lowest = min(self._lowest, cost)
@@ -113,6 +115,16 @@ class AutoWeight:
         self.limit = self._lowest + slack
         before = sum(self._costs[:WINDOW]) / WINDOW
         return len(self._costs) == WINDOW + LEVEL_EPOCHS and before - smoothed < slack
+
+    def kept(self) -> str | None:
+        """Say how much of the information the last epoch has, as in ``"12.1 of 20.3 nats kept, ..."``, if it can."""
+        if self.information_before is None:
+            return None
+        cost, information = self._last
+        return (
+            f"{information:.3g} of {self.information_before:.3g} nats kept, at a cost of {cost:.3g} "
+            f"(cost_limit {self.limit:.3g})"
+        )
 
     def warn_if_never_met(self) -> None:
         """Warn at the end of a training in which the weight never started."""

@@ -205,6 +205,8 @@ class TRVCnn(BaseFeaturesExtractor):
     :param layers: Output channels, kernel size and stride of each layer, in pixels.
     :param activation_fn: Nonlinearity after each layer.
     :param features_dim: Outputs of a last linear layer, as in SB3's ``NatureCNN``; None: the flattened convolutions.
+    :param layer_norm: Whether the outputs of that layer are standardised for each image before the nonlinearity, which
+        makes them less sensitive to the contrast.
     :param pool: Side of the squares in pixels; 1: no pooling, as in the paper. Images that would be too small for the
         layers are not pooled.
     :raises ValueError: if the images are too small for the layers.
@@ -216,6 +218,7 @@ class TRVCnn(BaseFeaturesExtractor):
         layers: Sequence[tuple[int, int, int]] = ((6, 4, 2), (6, 4, 2)),
         activation_fn: type[nn.Module] = nn.ELU,
         features_dim: int | None = None,
+        layer_norm: bool = False,
         pool: int = 1,
     ) -> None:
         super().__init__(observation_space, features_dim=1)
@@ -236,7 +239,8 @@ class TRVCnn(BaseFeaturesExtractor):
         with th.no_grad():
             self._features_dim = self.cnn(self.pooled(th.zeros(1, *observation_space.shape))).shape[1]
         if features_dim is not None:
-            self.cnn.extend([nn.Linear(self._features_dim, features_dim), activation_fn()])
+            norm = [nn.LayerNorm(features_dim)] if layer_norm else []
+            self.cnn.extend([nn.Linear(self._features_dim, features_dim), *norm, activation_fn()])
             self._features_dim = features_dim
 
     def pooled(self, images: th.Tensor) -> th.Tensor:

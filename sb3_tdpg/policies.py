@@ -135,7 +135,8 @@ class TRVPolicy(BasePolicy):
         elif features_extractor_class is None:
             features_extractor_class = defaults.features_extractor_class
             by_default = defaults.features_extractor_kwargs
-            if "layers" in by_default and min(observation_space.shape[1:]) < least_side(by_default["layers"]):
+            sides = (observation_space.shape or ())[1:]
+            if "layers" in by_default and min(sides) < least_side(by_default["layers"]):
                 by_default = {}  # the paper's layers, for smaller images
             features_extractor_kwargs = {**by_default, **(features_extractor_kwargs or {})}
         super().__init__(
@@ -378,6 +379,17 @@ class TRVPolicy(BasePolicy):
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions[:, 0]
         return self.episode_action_density(trvs).log_prob(actions).unflatten(0, trvs.shape[:2])
+
+    def stored_log_prob(self, batch: EpisodeBatch, encoder_gradient: str) -> th.Tensor:
+        """
+        Compute what :meth:`evaluate_episodes` does, for the policy that made the rollouts, from their densities.
+
+        :return: ``(T, N)``
+        """
+        log_prob = self.action_log_prob(batch.trvs, batch)
+        if encoder_gradient == "pathwise":
+            return log_prob
+        return log_prob + Normal(batch.means, batch.stds, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
 
     def rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> RebuiltTRVs:
         """

@@ -30,7 +30,6 @@ from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, horizon_of
 from sb3_tdpg.robustness.nuisance import resolved
 from sb3_tdpg.settings import (
-    DEFAULT_SHARE,
     DEFAULTS,
     Defaults,
     check_action_space,
@@ -306,9 +305,14 @@ class TDPG(EpisodicAlgorithm):
             self.auto_weight = None
             self.beta_schedule = FloatSchedule(cast("float | Schedule", self.beta))
             return
-        self.cost_limit = DEFAULT_SHARE if self.cost_limit is None else self.cost_limit
+        if self.cost_limit is None:
+            self.cost_limit = self._defaults.share
         if self.auto_weight is None or self.auto_weight.cost_limit != self.cost_limit:
             self.auto_weight = AutoWeight(self.cost_limit, by_slack=self.preset == "long", first_cost=self.first_cost)
+
+    @property
+    def _defaults(self) -> Defaults:
+        return DEFAULTS[self.preset or preset_of(self.observation_space, None)]
 
     @property
     def mi_coef(self) -> float:
@@ -359,9 +363,7 @@ class TDPG(EpisodicAlgorithm):
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
-                old_log_prob = th.empty_like(batch.costs)
-                for columns in self._minibatches(passes):
-                    old_log_prob[:, columns], _ = self._evaluate(passes.select(columns))
+                old_log_prob = self.policy.stored_log_prob(passes, self.encoder_gradient)
 
         for _ in range(self.n_epochs):
             for columns in self._minibatches(passes):
@@ -452,19 +454,18 @@ class TDPG(EpisodicAlgorithm):
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:
-            total_timesteps = (
-                DEFAULTS[self.preset or preset_of(self.observation_space, None)].total_epochs * self.epoch_size
-            )
+            total_timesteps = self._defaults.total_epochs * self.epoch_size
         warn_if_short(total_timesteps, self.epoch_size)
         try:
             with threads(self.n_threads):
-                return super().learn(
-                    total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-                )
+                super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
             TDPGProgressBar.close()
             if self.auto_weight is not None and self.epoch > 0:
                 self.auto_weight.warn_if_never_met()
+        if self.verbose >= 1 and self.auto_weight is not None and (kept := self.auto_weight.kept()) is not None:
+            print(f"Information: {kept}")
+        return self
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]

@@ -219,6 +219,17 @@ def test_after_policy_gradient_the_improvement_counts_from_its_first_epoch(tmp_p
     assert (loaded.cost_limit, loaded.auto_weight.first_cost) == ("95%", model.first_cost)
 
 
+def test_what_was_kept_is_told_at_the_end_of_a_training(capsys):
+    weight = AutoWeight(10.0)
+    assert weight.kept() is None
+    for cost, information in ((20.0, 5.0), (9.0, 8.4), (1.5, 3.1)):
+        weight.update(cost, information)
+    assert weight.kept() == "3.1 of 8.4 nats kept, at a cost of 1.5 (cost_limit 10)"
+    for verbose in (0, 1):
+        train_epochs(tiny_tdpg(cost_limit=1e4, verbose=verbose), 2)
+        assert ("nats kept, at a cost of" in capsys.readouterr().out) == bool(verbose)
+
+
 @pytest.mark.parametrize(
     ("text", "share"), [("95%", 0.95), ("99.9%", 0.999), ("0%", None), ("100%", None), ("95", None), ("x%", None)]
 )

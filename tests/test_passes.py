@@ -142,12 +142,15 @@ def test_vectors_are_learnt_from_as_in_the_paper():
     assert model.env.num_envs == 500
 
 
-def test_images_are_learnt_from_with_ppos_passes_and_without_a_penalty_on_what_is_known_of_the_state():
+def test_images_are_learnt_from_with_ppos_passes_a_nuisance_and_a_bottleneck():
     model = TDPG("TRVPolicy", "BallCatch-v0", device="cpu")
-    assert (model.beta, model.nuisance, model.nuisance_level) == (math.inf, {"images": {"held": False}}, "rollouts")
-    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 1000, 0.2)
-    assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("pathwise", "logdet", True)
-    assert (model.baseline, model.policy.features_extractor.features_dim) == ("value", 256)
+    assert (model.beta, model.cost_limit, model.mi_estimator) == ("auto", "99.8%", "logdet")
+    assert (model.nuisance, model.nuisance_level) == ({"images": {"held": False}}, "rollouts")
+    assert (model.n_episodes, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (160, 4, 40 * 25, 0.2)
+    assert (model.encoder_gradient, model.normalize_advantage, model.baseline) == ("pathwise", True, "value")
+    policy = model.policy
+    assert (policy.features_dim, policy.trv_dim, policy.gate, policy.time_varying) == (256, 32, True, False)
+    assert any(isinstance(layer, th.nn.LayerNorm) for layer in policy.features_extractor.cnn)
     assert model.env.num_envs == 160
 
 

@@ -221,6 +221,8 @@ def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: 
                 with closing(scenario_env(row.scenario, model, n_episodes=N_INFORMATION)) as env:
                     report = information_report(model, env, N_INFORMATION, plan.seed, at_end=progress.update)
                 known.append(_knowledge(label, report, out, f"information-{number}"))
+                if model.auto_weight is not None and (kept := model.auto_weight.kept()) is not None:
+                    known[-1].text += f" By the estimate of the training, {kept}."
             except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
                 known.append(Knowledge(label, f"not measured: {e}."))
     return known
