@@ -40,7 +40,8 @@ class AutoWeight:
     **A share of the improvement** s needs no number: C = first - s * (first - best), with the cost of the first epoch
     and the lowest mean cost of five successive epochs so far. The weight starts once this mean has levelled off (it
     falls by less than C - best in ten epochs), and at the latest in the middle of the training: before that it would
-    change what is attainable. Costs may have either sign. ``by_slack`` applies.
+    change what is attainable. In the second half of the training it grows more and more slowly, so that the last policy
+    has settled. Costs may have either sign. ``by_slack`` applies.
 
     :param cost_limit: C, or a share such as ``"95%"``.
     :param by_slack: See above.
@@ -95,6 +96,8 @@ class AutoWeight:
         if self.by_slack:
             scale = max(self.limit - self._lowest, LEAST_SLACK * scale)
             aim, low, high = self.limit - scale / 2, -3.0, 0.3
+        if self.share is not None:
+            high *= min(1.0, progress_remaining / LATEST_START)
         if self.value > 0.0:
             self.value *= math.exp(self.rate * min(max((aim - cost) / scale, low), high))
             self.value = min(self.value, self.max_growth * self._start)

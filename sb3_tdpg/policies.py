@@ -43,20 +43,21 @@ class TRVPolicy(BasePolicy):
     next time step, ``(n_envs,)``.
 
     Four defaults are for the presets "vector", "image" (uint8), "depth" (images of floats) and "long" (vectors over a
-    long horizon, see :mod:`sb3_tdpg.settings`). The network sizes of the first three are the paper's.
+    long horizon, see :mod:`sb3_tdpg.settings`). The network sizes of "vector" and "depth" are the paper's; the preset
+    "paper" has those of its ball catching.
 
     :param observation_space: A vector, or an image with channels first.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: Number of time steps T; the algorithm passes the environment's.
     :param preset: Which defaults to use; the algorithm passes that of the problem. ``None``: by the observation alone.
-    :param trv_dim: Number of TRVs Z; default: 2, 8, 16, and as many more than the features as
+    :param trv_dim: Number of TRVs Z; default: 2, 32, 16, and as many more than the features as
         there are, but at least 16.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
         ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``, ``[64, 64]`` and ``[64, 64]``.
     :param activation_fn: Nonlinearity of the hidden layers; default: ELU, tanh, tanh (encoder) and ELU (head), tanh.
     :param time_varying: Whether each time step has its own weights; default: up to a horizon of 50, but not with the
-        preset "long". The feature extractor is always shared.
+        presets "image" and "long". The feature extractor is always shared.
     :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
         store an observation before the action head can use it; default: no, no, no, yes if there are enough TRVs.
     :param skip_changes: Whether the next TRVs get the change of the features since the last step, as far as it says
@@ -82,8 +83,8 @@ class TRVPolicy(BasePolicy):
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above; default:
         1e-3, 1e-3, 1e-3, 1e-5.
     :param action_var_floor: Smallest variance of an action, likewise.
-    :param features_extractor_class: Network in front of the encoder; default: flatten for vectors, the paper's two
-        convolutional layers for images (:class:`~sb3_tdpg.features.TRVCnn`).
+    :param features_extractor_class: Network in front of the encoder; default: flatten for vectors,
+        :class:`~sb3_tdpg.features.TRVCnn` for images.
     :param features_extractor_kwargs: Keywords of the feature extractor.
     :param normalize_images: Whether to divide uint8 images by 255.
     :param optimizer_class: Optimiser of the policy.

@@ -75,9 +75,9 @@ class TDPG(EpisodicAlgorithm):
     :param env: A registered id, an environment or a ``VecEnv``.
     :param beta: Weight of the cost against the information: a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
-        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, inf, inf.
+        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, auto, inf.
     :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training to keep,
-        ``"90%"``; default: ``"95%"``.
+        ``"90%"``; default: ``"95%"``, for images of bytes ``"99.8%"``.
     :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
         linearly; default: ``"lin_2e-3_2e-5"``, ``"lin_1e-3_5e-5"``, ``"lin_1e-3_1e-4"``.
     :param n_episodes: Episodes N of a policy epoch; default: 500, 160, none.

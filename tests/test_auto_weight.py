@@ -176,6 +176,18 @@ def test_with_a_share_the_weight_starts_in_the_middle_of_a_training_that_still_i
         assert (weight.value > 0.0) == (i >= 20), i
 
 
+def test_with_a_share_the_weight_grows_more_slowly_towards_the_end():
+    growth = []
+    for progress in (1.0, 0.5, 0.25, 0.0):
+        weight = AutoWeight("90%")
+        for cost in [100.0] * 5 + [0.0] * 15:
+            weight.update(cost, information=4.0)
+        before = weight.value
+        weight.update(0.0, 4.0, progress)
+        growth.append(math.log(weight.value / before))
+    assert growth == pytest.approx([0.09, 0.09, 0.045, 0.0])
+
+
 def test_one_lucky_epoch_does_not_set_the_limit():
     weight = AutoWeight("90%")
     for cost in [100.0] + [10.0] * 8 + [-90.0] + [10.0] * 8:
