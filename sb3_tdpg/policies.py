@@ -195,7 +195,7 @@ class TRVPolicy(BasePolicy):
         if self.shared_action_noise and isinstance(self.action_dist, DiagGaussianDistribution):
             self.action_log_var = nn.Parameter(th.zeros(self.action_dist.action_dim))
         if self.scale_actions and isinstance(action_space, spaces.Box):
-            bounds = th.as_tensor(np.stack([action_space.low, action_space.high]).reshape(2, -1))
+            bounds = th.as_tensor(np.stack([action_space.low, action_space.high]).reshape(2, -1), dtype=th.float32)
             self.register_buffer("action_middle", bounds.mean(0), persistent=False)
             self.register_buffer("action_range", (bounds[1] - bounds[0]) / 2, persistent=False)
         self.optimizer = self.optimizer_class(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import AtEveryEpoch, CountdownEnv, ToyEnv, assert_same_parameters, parameters
+from small_problems import AtEveryEpoch, CountdownEnv, ToyEnv, assert_same_parameters, parameters, toy_vec_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -433,3 +433,11 @@ def test_a_limit_that_no_epoch_meets_is_told_at_the_end():
 
 def test_the_threshold_of_the_registration_decides_nothing():
     assert tiny(beta="auto").cost_limit == "95%"
+
+
+def test_actions_in_double_precision_are_learnt_and_stay_in_their_bounds():
+    space = spaces.Box(np.array([0.0, -5.0]), np.array([0.1, 3.0]), dtype=np.float64)
+    model = tiny(toy_vec_env(action_space=space, horizon=50), epoch_steps=100).learn(200)
+    action, _ = model.predict(model.observation_space.sample())
+    assert space.contains(action.astype(np.float64))
+    assert model.policy.action_range.dtype == th.float32  # everything is computed in single precision
