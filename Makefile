@@ -78,10 +78,10 @@ reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying reprodu
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
 
-reproduce-ball: $(STAMP) ## reproduce Table II: policy gradient and TDPG on ball catching
-	$(PY) -m sb3_tdpg reproduce ball --no-controls --out results/ball_catch
+reproduce-ball: $(STAMP) ## reproduce Table II: TDPG, policy gradient and RecurrentPPO on ball catching
+	$(PY) -m sb3_tdpg reproduce ball --no-controls --out results/ball_catch --publish docs/results/ball_catch
 
-reproduce-ball-controls: $(STAMP) ## add the ablations, PPO and RecurrentPPO
+reproduce-ball-controls: $(STAMP) ## add the ablations, PPO, and RecurrentPPO with our encoder
 	$(PY) -m sb3_tdpg reproduce ball --out results/ball_catch --publish docs/results/ball_catch
 
 reproduce-ball-varying: $(STAMP) ## the same where the launch varies, a scenario of our own
