@@ -59,6 +59,7 @@ class Experiment(NamedTuple):
 EXPERIMENTS = {
     "lava": Experiment("lava:reproduce_lava", "lava_reproduction", flags=("n_paper_seeds",)),
     "ball": Experiment("ball:reproduce_ball", "ball_catch", flags=("controls",)),
+    "ball-paper": Experiment("ball_paper:reproduce_ball_paper", "ball_catch_paper"),
     "ball-varying": Experiment("ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)),
     "grasp": Experiment("grasp:reproduce_grasp", "panda_grasp"),
     "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
@@ -260,14 +261,14 @@ def _make_parser() -> argparse.ArgumentParser:
     add("experiment", choices=tuple(EXPERIMENTS))
     add("--out", type=Path, help="folder for the results (default: one in results/ for each experiment)")
     add("--publish", type=Path, help="copy everything except the runs to this folder")
-    add("--n-seeds", type=_positive, help="training seeds of each method (default: lava 10, others 5)")
+    add("--n-seeds", type=_positive, help="training seeds of each method (default: lava and ball 10, others 5)")
     add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: 3)")
     add(
         "--n-grasp-seeds",
         type=int,
         help="baselines: training seeds on grasping (0: none; default: 1); --n-seeds: on lava",
     )
-    text = "ball: train PG and TDPG without the ablations; a later call without this flag adds them"
+    text = "ball: train TDPG, PG and RecurrentPPO only; a later call without this flag adds the others"
     add("--no-controls", action="store_false", dest="controls", default=None, help=text)
 
     for program, text in ZOO_PROGRAMS.items():

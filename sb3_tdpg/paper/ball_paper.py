@@ -1,0 +1,154 @@
+"""Table II by the paper's own algorithm: does the penalty beat policy gradient, and policy gradient trained further?"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sb3_tdpg.callbacks import TDPGCallback
+from sb3_tdpg.common.provenance import write_frame_atomically
+from sb3_tdpg.envs.scenarios import BALL_CATCH
+from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure
+from sb3_tdpg.experiments.runs import complete_runs, read_progress
+from sb3_tdpg.paper import common
+from sb3_tdpg.paper.ball import BACKGROUND_ROWS, GROUPS, NOISE_ROWS, group_rows, with_groups
+from sb3_tdpg.paper.common import Method
+from sb3_tdpg.paper.figures import robustness_curves
+
+FIRST_SEED = 400
+# Costs of policy gradient from which TDPG starts: the paper's limit for TDPG, the paper's own policy gradient, and
+# policy gradient that is trained further.
+LEVELS = (24.0, 8.7, 5.0)
+PAPERS_LEVEL = 8.7
+PRICES = (16, 22, 28, 34, 40)  # 1 / beta; the paper has every even number between
+ENV = dict(renderer="fast")
+KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "test backgrounds": BACKGROUND_ROWS}
+
+
+class StopAtCost(TDPGCallback):
+    """
+    Stop the training once the mean cost of five successive epochs is at most a limit.
+
+    :param cost: The limit.
+    """
+
+    WINDOW = 5
+
+    def __init__(self, cost: float) -> None:
+        super().__init__()
+        self.cost = cost
+        self._costs: list[float] = []
+
+    def _on_rollout_end(self) -> None:
+        self._costs = [*self._costs, float(self.tdpg.rollout_buffer.episode_costs.mean())][-self.WINDOW :]
+
+    def _on_step(self) -> bool:
+        return len(self._costs) < self.WINDOW or sum(self._costs) / self.WINDOW > self.cost
+
+
+def methods() -> tuple[Method, ...]:
+    """
+    List policy gradient at each of the levels, and TDPG from each with each price.
+
+    Each level of policy gradient goes on from the one before.
+    """
+    found: list[Method] = []
+    start = None
+    for level in LEVELS:
+        pg = f"PG to {level:g}"
+        stop = {"sb3_tdpg.paper.ball_paper.StopAtCost": dict(cost=level)}
+        overrides = dict(env_kwargs=ENV, callback=[stop])
+        found.append(Method(pg, "BallCatch-v0-paper-pg", start, overrides=overrides))
+        found += [
+            Method(f"TDPG {price} from {level:g}", "BallCatch-v0-paper", pg, overrides=dict(beta=1 / price))
+            for price in PRICES
+        ]
+        start = pg
+    return tuple(found)
+
+
+def select(runs: pd.DataFrame, records: pd.DataFrame) -> pd.DataFrame:
+    """
+    Select a policy by the paper's rule: for each seed and level, the price with the lowest information under the limit.
+
+    :param runs: ``model``, ``train_seed`` and ``information`` (NaN where no epoch met the limit) of each run of TDPG.
+    :param records: Episodes of all runs.
+    :return: the records of policy gradient and of the selected policies, which are called ``TDPG from <level>``
+    """
+    kept = [records[records["model"].str.startswith("PG")]]
+    level = runs["model"].str.split(" from ").str[1]
+    met = runs.assign(level=level).dropna(subset="information")
+    for (of_level, seed), candidates in met.groupby(["level", "train_seed"], sort=False):
+        best = candidates.loc[candidates["information"].idxmin()]
+        chosen = records[(records["model"] == best["model"]) & (records["train_seed"] == seed)]
+        kept.append(chosen.assign(model=f"TDPG from {of_level}", price=best["model"].split()[1]))
+    return pd.concat(kept, ignore_index=True)
+
+
+def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
+    """
+    Train by the paper's algorithm from policy gradient at several costs; write tables, a figure and records.
+
+    :param out: Folder for ``summary.md``, ``runs.csv``, ``seeds.csv``, ``robustness.png``, ``config.json``, ``runs/``.
+    :param n_seeds: Training seeds of each method.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`; 200 episodes a row by default.
+    :return: the summary, as Markdown
+    """
+    given = common.Options(**{"n_eval_episodes": 200, **options})
+    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
+    everything = [(method, seed) for seed in seeds for method in methods()]
+    rows = [row.with_kwargs(**ENV) for row in BALL_CATCH]
+    tasks = common.make_tasks("BallCatch-v0", out / "runs", everything, lambda _: rows, given.overrides)
+    complete_runs(tasks, **given.of_runs)
+    folders = common.folders_of(tasks)
+
+    records = common.read_records(tasks)
+    training = records[records["scenario"] == "Training"].groupby(["model", "train_seed"])["cost"].mean()
+    runs = pd.DataFrame(
+        dict(model=m.label, train_seed=seed, cost=training[m.label, seed], **_progress(folders[m.label, seed]))
+        for m, seed in everything
+    )
+    write_frame_atomically(runs, out / "runs.csv")
+    chosen = select(runs[runs["model"].str.startswith("TDPG")], records)
+    table = with_groups(chosen)
+    by_seed = table.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
+    write_frame_atomically(by_seed, out / "seeds.csv")
+    save_figure(robustness_curves(chosen, NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
+
+    cost_rows = [*rows, *group_rows(rows)]
+    names = {f"PG to {PAPERS_LEVEL:g}": "PG", f"TDPG from {PAPERS_LEVEL:g}": "TDPG"}
+    of_paper = table[table["model"].isin(list(names)) & table["scenario"].isin([row.name for row in cost_rows])]
+    shown = chosen[chosen["model"].str.startswith("TDPG")].groupby(["model", "train_seed"])["price"].first()
+    pairs = [(f"TDPG from {level:g}", f"PG to {other:g}") for level in LEVELS for other in LEVELS if other <= level]
+    return common.write_results(
+        out,
+        "ball_paper.md",
+        tasks,
+        "make reproduce-ball-paper",
+        given.publish,
+        cost=comparison_markdown(aggregate_seeds(of_paper.assign(model=of_paper["model"].map(names))), cost_rows),
+        comparisons=common.comparisons_table(table, pairs, KINDS),
+        groups=list(GROUPS),
+        runs=common.markdown_table(_runs_table(runs)),
+        chosen=common.markdown_table(shown.unstack().reset_index().rename(columns=dict(model="policy"))),
+    )
+
+
+def _progress(folder: Path) -> Mapping[str, float]:
+    """Return the number of epochs of a run, and the information of its selected epoch: NaN if there is none."""
+    path = folder / "selected.json"
+    information = pd.read_json(path, typ="series")["information"] if path.exists() else math.nan
+    return dict(epochs=len(read_progress(folder)), information=information)
+
+
+def _runs_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Average over seeds; and count the runs in which an epoch met the limit."""
+    groups = runs.groupby("model", sort=False)
+    means = groups[["epochs", "cost", "information"]].mean().round(1).astype(str)
+    return (
+        means.assign(selected=groups["information"].count().astype(str))
+        .reset_index()
+        .rename(columns=dict(model="method"))
+    )
