@@ -272,7 +272,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     if not 0.0 <= settings["gae_lambda"] <= 1.0:
         raise ValueError(f"gae_lambda={settings['gae_lambda']} must be in [0, 1]; 1 leaves the gradient unbiased")
     if not settings["max_grad_norm"] > 0:
-        raise ValueError(f"max_grad_norm={settings['max_grad_norm']} must be positive, or None for no clipping")
+        raise ValueError(f"max_grad_norm={settings['max_grad_norm']} must be positive; float('inf') turns the clipping off")
 
 
 def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) -> None:

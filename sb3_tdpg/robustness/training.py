@@ -118,7 +118,6 @@ class VecImagePerturbation(VecEnvWrapper):
 
     The true state does not change. The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound
     the information about everything in the image, so what an encoder keeps of these changes counts as information.
-    TDPG's ``nuisance`` removes it without changing the images of the rollouts.
 
     :param venv: Environments with images of bytes, channels first or last.
     :param held: Whether an episode keeps what was drawn at its beginning, but for the noise; else every image has its
