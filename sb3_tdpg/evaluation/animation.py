@@ -7,7 +7,6 @@ Dimension key: T time steps of an episode, Z TRVs.
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from itertools import cycle, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,7 @@ MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of 
 PANEL_HEIGHT = 190  # pixels of the plot of the TRVs
 LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # pixels around the axes; the legend is at the right
 HOLD = 1.0  # s: how long the last frame of an episode stays
-LINE_STYLES = ("-", (0, (4, 1.5)), (0, (1, 1)))
+MAX_LINES = 8  # more TRVs are rows of an image
 
 
 class Episode(NamedTuple):
@@ -106,27 +105,52 @@ class _Video:
         self._axes = axes = self.figure.add_axes((
             LEFT / width, BOTTOM / total, (width - LEFT - RIGHT) / width, (PANEL_HEIGHT - TOP - BOTTOM) / total
         ))  # fmt: skip
-        # All frames share the limits, so only the lines move.
+        axes.set_xlabel("time step $t$", fontsize=9)
+        axes.locator_params(axis="x", integer=True)
+        tidy(axes)
+        # All frames share the limits.
         trvs = np.concatenate([episode.trvs for episode in episodes])
+        self._lines: list[Any] = []
+        self._rows: Any = None
+        if trvs.shape[1] <= MAX_LINES:
+            self._draw_lines(trvs, horizon)
+        else:
+            self._draw_rows(trvs, horizon)
+        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
+
+    def _draw_lines(self, trvs: np.ndarray, horizon: int) -> None:
+        """Draw a line for each TRV: ``(n, Z)``."""
+        axes = self._axes
         low, high = float(trvs.min()), float(trvs.max())
         margin = 0.05 * (high - low) or 1.0
         axes.set(xlim=(0, horizon), ylim=(low - margin, high + margin))
-        axes.locator_params(axis="x", integer=True)
         axes.grid(alpha=0.25)
-        tidy(axes)
-        axes.set_xlabel("time step $t$", fontsize=9)
         axes.set_ylabel(r"TRVs $\tilde{x}_t$", fontsize=9)
-        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
-        styles = cycle(product(LINE_STYLES, PALETTE))
         looks: dict[str, Any] = dict(linewidth=1.3, marker="o", markersize=2.5, clip_on=False)
         self._lines = [
-            axes.plot([], [], label=str(i + 1), linestyle=style, color=color, **looks)[0]
-            for i, (style, color) in zip(range(trvs.shape[1]), styles, strict=False)
+            axes.plot([], [], label=str(i + 1), color=color, **looks)[0]
+            for i, color in zip(range(trvs.shape[1]), PALETTE, strict=False)
         ]
         axes.legend(
             title="TRV", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7, title_fontsize=8,
-            ncols=-(-len(self._lines) // 8), handlelength=1.2, labelspacing=0.2, columnspacing=0.6,
+            handlelength=1.2, labelspacing=0.2,
         )  # fmt: skip
+
+    def _draw_rows(self, trvs: np.ndarray, horizon: int) -> None:
+        """Draw a row of colours for each TRV: ``(n, Z)``."""
+        n_trvs = trvs.shape[1]
+        largest = float(np.abs(trvs).max()) or 1.0
+        self._rows = self._axes.imshow(
+            np.full((n_trvs, horizon), np.nan), aspect="auto", interpolation="nearest", cmap="RdBu_r",
+            vmin=-largest, vmax=largest, extent=(-0.5, horizon - 0.5, n_trvs + 0.5, 0.5),
+        )  # fmt: skip
+        self._axes.set_xlim(-0.5, horizon + 0.5)  # the last picture is of the end, after the last TRVs
+        self._axes.set_ylabel("TRV", fontsize=9)
+        box = self._axes.get_position()
+        bar = self.figure.add_axes((box.x1 + 0.012, box.y0, 0.012, box.height))
+        self.figure.colorbar(self._rows, cax=bar)
+        bar.tick_params(labelsize=7, length=2)
+        bar.set_title(r"$\tilde{x}_t$", fontsize=9)
 
     def frames(self) -> Iterator[bool]:
         """Set the figure to one frame after the other; yield whether it is the last one of its episode."""
@@ -136,8 +160,12 @@ class _Video:
                 t = int(time)
                 self._picture.set_data(self._enlarged(picture))
                 self._now.set_xdata([time, time])
-                for line, values in zip(self._lines, episode.trvs.T, strict=True):
+                for line, values in zip(self._lines, episode.trvs.T, strict=False):
                     line.set_data(np.arange(len(values))[: t + 1], values[: t + 1])
+                if self._rows is not None:
+                    shown = np.full(self._rows.get_array().shape, np.nan)
+                    shown[:, : min(t + 1, len(episode.trvs))] = episode.trvs[: t + 1].T
+                    self._rows.set_data(shown)
                 self._axes.set_title(
                     f"episode {number}, step {t}: cost so far {cost_so_far[t]:.2f}", loc="left", fontsize=9, color=INK
                 )

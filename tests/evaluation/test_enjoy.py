@@ -181,6 +181,20 @@ def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
     assert frames_of(tmp_path / "film.gif")[1] == [20, 20, 20, 1000]
 
 
+def test_few_trvs_are_lines_and_many_are_rows_of_colours_up_to_the_present_step(tmp_path):
+    pictures = [np.full((40, 500, 3), 255, np.uint8)] * 4
+    for n_trvs, is_coloured in ((8, False), (9, True)):
+        path = tmp_path / f"{n_trvs}.gif"
+        save_animation([Episode(pictures, np.full((3, n_trvs), 5.0), np.ones(3))], path, horizon=3, fps=10)
+        panels = [frame[40 + 26 : -42, 62:-76].astype(int) for frame in frames_of(path)[0]]
+        # The largest value is dark red, and so is the whole row up to the present step.
+        red = [((x[..., 0] > x[..., 1] + 60) & (x[..., 0] > x[..., 2] + 60)).mean() for x in panels]
+        assert (red[2] > 0.5) == is_coloured
+        if is_coloured:
+            assert red[0] < red[1] < red[2]
+            assert red[0] == pytest.approx(red[2] / 3, abs=0.05)
+
+
 def test_a_film_that_could_not_be_written_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):
     pictures = [np.zeros((40, 500, 3), np.uint8)] * 4
     episodes, path = [Episode(pictures, np.zeros((3, 2)), np.ones(3))], tmp_path / "film.gif"
