@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from functools import partial
+from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -223,10 +225,23 @@ OF_PPO = dict(
 )
 
 
-def refuse_others(others: Mapping[str, Any]) -> None:
-    """Raise a ``TypeError`` for arguments that TDPG does not have; it names the equivalent of PPO's."""
+def nearest_name(name: str, names: Iterable[str]) -> str:
+    """Return a question after the name that was probably meant, ``": did you mean ...?"``, or nothing."""
+    found = get_close_matches(name, list(names), n=1)
+    return f": did you mean {found[0]!r}?" if found else ""
+
+
+def refuse_others(others: Mapping[str, Any], names: Iterable[str]) -> None:
+    """
+    Raise a ``TypeError`` for arguments that TDPG does not have; it names the equivalent of PPO's, or the nearest name.
+
+    :param others: The arguments.
+    :param names: Those that TDPG has.
+    """
     for name in others:
-        hint = f": use {OF_PPO[name]} (see 'Coming from PPO' in the docs)" if name in OF_PPO else ""
+        hint = (
+            f": use {OF_PPO[name]} (see 'Coming from PPO' in the docs)" if name in OF_PPO else nearest_name(name, names)
+        )
         raise TypeError(f"TDPG has no argument {name!r}{hint}")
 
 
@@ -402,11 +417,17 @@ def nearest_multiples(n: int, divisor: int) -> str:
 
 
 def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
-    """Call with keywords of the user, or raise a ``ValueError`` that names their argument."""
+    """Call with keywords of the user, or raise a ``ValueError`` that names their argument and the nearest keyword."""
+    what = f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}"
+    if not isinstance(kwargs, dict):
+        raise ValueError(what)
     try:
         return make(**kwargs)
     except TypeError as e:
-        raise ValueError(f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}: {e}") from e
+        # An estimator hands the keywords that it does not have to its base class.
+        known = {key for cls in make.func.__mro__[:-1] for key in signature(cls).parameters}  # type: ignore[attr-defined]
+        hints = (nearest_name(key, known) for key in kwargs if key not in known)
+        raise ValueError(f"{what}: {e}{next(filter(None, hints), '')}") from e
 
 
 def default(value: Any, otherwise: Any) -> Any:

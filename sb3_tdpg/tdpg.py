@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
+from inspect import signature
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch as th
@@ -167,7 +168,7 @@ class TDPG(EpisodicAlgorithm):
         **others: Any,
     ) -> None:
         given = {name: value for name, value in locals().items() if name in Defaults._fields}
-        refuse_others(others)
+        refuse_others(others, signature(TDPG).parameters)
         for name, count in (("n_episodes", n_episodes), ("epoch_steps", epoch_steps), ("n_envs", n_envs)):
             if count is not None:
                 check_count(name, count)

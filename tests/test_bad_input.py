@@ -165,6 +165,22 @@ def test_a_foreign_policy_is_refused_with_the_mend(policy, fragments):
         assert re.search(fragment, str(error.value)), error.value
 
 
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        (dict(n_episods=3), "no argument 'n_episods': did you mean 'n_episodes'"),
+        (dict(n_step=3), "no argument 'n_step': use epoch_steps"),
+        (dict(xyz=3), "no argument 'xyz'$"),
+        (dict(policy_kwargs=dict(trv_dims=3)), "'trv_dims': did you mean 'trv_dim'"),
+        (dict(mi_estimator="mine", mi_kwargs=dict(batchsize=3)), "'batchsize': did you mean 'batch_size'"),
+        (dict(policy_kwargs=3), "policy_kwargs=3 must be a dict of keywords of TRVPolicy$"),
+    ],
+)
+def test_an_unknown_keyword_is_told_with_the_nearest_name(keywords, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        TDPG("TRVPolicy", "Lava-v0", **keywords)
+
+
 @pytest.mark.parametrize(("given", "equivalent"), [
     (dict(n_steps=2048), "use epoch_steps"),
     (dict(ent_coef=0.0), "action_log_var_init"),
