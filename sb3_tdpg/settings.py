@@ -239,9 +239,8 @@ def refuse_others(others: Mapping[str, Any], names: Iterable[str]) -> None:
     :param names: Those that TDPG has.
     """
     for name in others:
-        hint = (
-            f": use {OF_PPO[name]} (see 'Coming from PPO' in the docs)" if name in OF_PPO else nearest_name(name, names)
-        )
+        of_ppo = next(iter(get_close_matches(name, OF_PPO, n=1, cutoff=0.85)), None)
+        hint = f": use {OF_PPO[of_ppo]} (see 'Coming from PPO' in the docs)" if of_ppo else nearest_name(name, names)
         raise TypeError(f"TDPG has no argument {name!r}{hint}")
 
 

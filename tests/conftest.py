@@ -16,6 +16,14 @@ def one_thread():
     th.set_num_threads(1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def log_folder(tmp_path_factory):
+    """Keep the folder that SB3 makes for every training without a log of its own out of the temporary folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("sb3")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def seeded_torch():
     """Make every test draw the same numbers, whichever ran before it."""
