@@ -8,7 +8,7 @@ from small_problems import tiny_tdpg, toy_vec_env, train_epochs
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.robustness.training import VecImagePerturbation
+from sb3_tdpg.robustness.training import PATTERN_GROUP, PATTERN_SIZES, ImageMixture, VecImagePerturbation
 
 IMAGES = spaces.Box(0, 255, (3, 16, 16), np.uint8)
 OFF = dict(color=0.0, pattern=0.0, patch=0.0, contrast=0.0, noise=0.0)
@@ -151,3 +151,17 @@ def test_the_strength_of_the_noise_is_drawn_for_each_image():
     assert stds.min() < 0.02
     assert 0.15 < stds.max() < 0.21
     assert 0.08 < stds.mean() < 0.12
+
+
+def test_images_that_are_drawn_together_have_patterns_of_several_sizes():
+    """Of changes that are held for an episode all episodes of an epoch are drawn together."""
+    th.manual_seed(0)
+    n = 12 * PATTERN_GROUP + 3
+    patterns = ImageMixture().draw(n, 1, 64, 64)["pattern"].numpy()
+    assert patterns.shape == (n, 1, 64, 64)
+    n_colours = np.array([len(np.unique(pattern)) for pattern in patterns])
+    with_edges = {size**2 for size in PATTERN_SIZES} & set(n_colours)
+    assert len(with_edges) >= 3
+    for start in range(0, n, PATTERN_GROUP):  # side by side of one size; bilinear colours coincide here and there
+        part = n_colours[start : start + PATTERN_GROUP]
+        assert np.ptp(part) <= 0.02 * part.max()
