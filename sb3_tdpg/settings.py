@@ -280,6 +280,12 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
                 f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
                 "returns one; float('inf') turns the clipping off"
             )
+    for name in ("gamma", "gae_lambda", "max_grad_norm"):
+        if not isinstance(settings[name], (int, float, np.number)):
+            raise ValueError(f"{name}={settings[name]!r} must be a number")
+    seed = settings["seed"]
+    if not (seed is None or (isinstance(seed, (int, np.integer)) and 0 <= seed < 2**32)):
+        raise ValueError(f"seed={seed!r} must be an integer from 0 to 2**32 - 1, or None")
     encoder_gradient = settings["encoder_gradient"]
     if encoder_gradient not in ENCODER_GRADIENTS:
         raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
@@ -305,6 +311,11 @@ def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) ->
     why, least = "all time steps share their weights", MIN_BATCH_STEPS
     if unit == "episodes":
         why, least = "each time step has weights of its own (policy_kwargs: time_varying)", 2
+    if unit == "episodes" and epoch_size < 2:
+        raise ValueError(
+            f"epoch_steps={settings['epoch_steps']} is less than two episodes, and {why}: give n_episodes=2 or "
+            "more, or more steps"
+        )
     if batch_size is not None and not min(least, epoch_size) <= batch_size <= epoch_size:
         raise ValueError(
             f"batch_size={batch_size} must be between {least} and {epoch_size}, the {unit} of an epoch: it counts "

@@ -190,7 +190,7 @@ class TDPG(EpisodicAlgorithm):
         # The defaults of the paper's problems, and models of early versions, count episodes always.
         self._counts_episodes = not is_new or (batch_size is None and self.preset != "long")
         check_policy(policy, self.policy_aliases)
-        check_arguments(settings)
+        check_arguments({**settings, "seed": seed})
         super().__init__(
             policy=policy,
             env=env,

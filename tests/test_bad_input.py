@@ -93,6 +93,19 @@ ARGUMENTS = {
     "unknown encoder gradient": (
         dict(encoder_gradient="sore"), "encoder_gradient='sore'", r"\['score', 'pathwise'\]"
     ),
+    "gamma a text": (dict(gamma="1"), "gamma='1' must be a number"),
+    "gae_lambda a text": (dict(gae_lambda="1"), "gae_lambda='1' must be a number"),
+    "seed a fraction": (dict(seed=1.5), "seed=1.5", "integer"),
+    "seed negative": (dict(seed=-1), "seed=-1", "integer from 0"),
+    "epoch_steps less than two episodes": (
+        dict(n_episodes=None, epoch_steps=9), "epoch_steps=9", "two episodes", "n_episodes=2"
+    ),
+    "nuisance without scenes": (dict(nuisance={"env_kwargs": []}), r"'env_kwargs': \[\]", "hold keywords"),
+    "nuisance with a number for scenes": (dict(nuisance={"env_kwargs": 3}), "'env_kwargs': 3", "a list of such"),
+    "nuisance that only redraws": (dict(nuisance={"redraw": ["d"]}), "'redraw' needs 'env_kwargs'"),
+    "nuisance with three severities": (
+        dict(nuisance={"vector_noise": [1, 2, 3]}), r"\[1, 2, 3\]", "the lowest and the highest"
+    ),
     "gamma zero": (dict(gamma=0.0), "gamma=0.0", r"\(0, 1\]"),
     "gamma above one": (dict(gamma=1.01), "gamma=1.01", r"\(0, 1\]"),
     "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),

@@ -314,6 +314,8 @@ def make_nuisance(declared: Any, space: spaces.Space, env: VecEnv) -> Nuisance |
             f"nuisance={declared!r} must be None, 'auto', the name of a perturbation, a dict of names and severities "
             "such as {'noise': (1, 3), 'contrast': 2}, or a function of the observations and a random generator"
         )
+    if set(declared) == {"redraw"}:
+        raise ValueError(f"nuisance={declared!r}: 'redraw' needs 'env_kwargs', the scenes that draw something anew")
     families: list[Nuisance] = []
     for name, value in declared.items():
         if name == "redraw":
@@ -365,7 +367,10 @@ def _named(name: str, value: Any, space: spaces.Space, env: VecEnv | None) -> li
             raise ValueError(f"nuisance={{{IMAGES!r}: {value!r}}} must hold keywords of MixtureNuisance: {e}") from e
     if (objection := find(name).objection(space)) is not None:
         raise ValueError(f"the nuisance {name!r} does not apply: {objection}")
-    low, high = value if isinstance(value, (tuple, list)) else (value, value)
+    low, *others = value if isinstance(value, (tuple, list)) and value else (value,)
+    high = others[0] if others else low
+    if len(others) > 1:
+        raise ValueError(f"nuisance={{{name!r}: {value!r}}} must be a severity, or the lowest and the highest one")
     for severity in (low, high):
         find(name).value(severity)
     if low > high:
@@ -399,6 +404,10 @@ def _scenes(env_kwargs: Any, redraw: Sequence[str], env: VecEnv) -> Nuisance:
         raise ValueError(f"redraw={unknown} are no components of the state: use some of {names}")
     own = {} if inner.spec is None else inner.spec.kwargs
     given = [env_kwargs] if isinstance(env_kwargs, Mapping) else env_kwargs
+    if not (isinstance(given, Sequence) and given and all(isinstance(kwargs, Mapping) for kwargs in given)):
+        raise ValueError(
+            f"nuisance={{'env_kwargs': {env_kwargs!r}}} must hold keywords of the environment, or a list of such"
+        )
     scenes = [type(inner)(**{**own, **kwargs}) for kwargs in given]
     for scene in scenes:
         if scene.observation_space != inner.observation_space:
