@@ -409,7 +409,7 @@ class TDPG(EpisodicAlgorithm):
         self._n_updates += self.n_epochs
         self.logger.record("train/objective", mean_cost + mi_coef * information)
         self.logger.record("train/mi_coef", mi_coef)
-        if self.auto_weight is not None:
+        if self.auto_weight is not None and math.isfinite(self.auto_weight.limit):
             self.logger.record("train/cost_limit", self.auto_weight.limit)
         self.logger.record("train/trv_std", whole.stds.mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -204,6 +204,8 @@ def test_too_short_a_training_is_told(recwarn):
 def test_the_default_share_needs_no_number_and_is_logged():
     model = tiny_tdpg(beta="auto", n_episodes=100, encoder_gradient="pathwise", learning_rate=5e-3)
     assert (model.cost_limit, model.auto_weight.share) == ("95%", 0.95)
+    train_epochs(model, 1)
+    assert "train/cost_limit" not in model.logger.name_to_value, "one epoch says nothing of the improvement"
     train_epochs(model, 30)
     assert model.mi_coef > 0
     limit = model.logger.name_to_value["train/cost_limit"]
