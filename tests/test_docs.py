@@ -95,7 +95,7 @@ def run_in_order(blocks, source):
         warnings.simplefilter("error")  # what a page shows must not warn
         # Not of the page's making: tqdm.rich, which SB3's progress bar uses, calls itself experimental.
         # A training that was cut short may not have met its cost limit.
-        warnings.filterwarnings("ignore", message="no epoch met cost_limit")
+        warnings.filterwarnings("ignore", message="no epoch met cost_limit|the training was too short")
         warnings.filterwarnings("ignore", message="rich is experimental")
         warnings.filterwarnings("ignore", module=r"torch\.")
         for line, code in blocks:
