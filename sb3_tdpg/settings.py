@@ -135,7 +135,7 @@ class PolicyDefaults(NamedTuple):
 
 
 # SB3's NatureCNN with half the channels and a layer norm, behind means of 2 x 2 pixels. Three layers and a linear one
-# generalise to walls that were never seen; the paper's two do not, and with ELU the worst walls cost twice as much.
+# generalise better to walls that were never seen than the paper's two (docs/results/ball_catch.md).
 IMAGE_ENCODER = dict(
     pool=2, layers=((16, 4, 2), (32, 4, 2), (32, 3, 1)), activation_fn=nn.ReLU, features_dim=256, layer_norm=True
 )
