@@ -1,5 +1,7 @@
 """Make a report: check the arguments, run the missing rows, aggregate, draw, write."""
 
+import sys
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from importlib import import_module
@@ -7,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from gymnasium import spaces
 from tqdm import tqdm
 
@@ -17,20 +20,23 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import InformationReport, information_report, save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
+from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.report.figures import comparison_figure, degradation_curves, own_rows_figure, vector_examples
 from sb3_tdpg.report.models import Source, fingerprint, load_all
 from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, write_page
-from sb3_tdpg.report.records import Models, Plan, complete_rows
+from sb3_tdpg.report.records import Models, Plan, complete_rows, default_episodes, missing_rows, seconds_of_a_row
 from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.scale import default_scale
-from sb3_tdpg.robustness.sensor import horizon_of, kind_of
+from sb3_tdpg.robustness.sensor import kind_of
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
 N_INFORMATION = 500  # episodes
+N_STEPS = 10_000  # of each model in each row
+PAUSE = 9  # between two unfinished pages, as a multiple of the time that one takes to write
 DPI = 110
 
 
@@ -44,6 +50,8 @@ def robustness_report(
     severities: Sequence[int] = (1, 2, 3, 4, 5),
     scenarios: Sequence[Scenario] | None = None,
     n_episodes: int | None = None,
+    n_steps: int = N_STEPS,
+    information: bool = False,
     seed: int = 0,
     deterministic: bool = False,
     jobs: int = 1,
@@ -55,8 +63,9 @@ def robustness_report(
     ``out`` then contains ``report.md`` and ``report.html`` (one file with its pictures), ``figures/``,
     ``episodes.csv.xz`` (every episode), ``levels.csv``, ``perturbations.csv`` and ``comparisons.csv`` (the numbers of
     the page, see :class:`~sb3_tdpg.report.numbers.Numbers`), ``config.json`` (settings, versions, commit) and
-    ``rows/``, from which an interrupted call continues. A later call may ask for other perturbations or severities:
-    finished rows are not run again.
+    ``rows/``, from which an interrupted call continues. While rows are missing, the page is written again and again
+    with those that are finished. A later call may ask for other perturbations or severities: finished rows are not run
+    again.
 
     :param models: Models by method: one model or a list with one model for each training seed. A model is a file
         (:class:`~pathlib.Path` or text) or a model of TDPG, Stable-Baselines3 or sb3-contrib. All methods are compared
@@ -67,7 +76,11 @@ def robustness_report(
     :param perturbations: Perturbations of the sensor and of the scene; default: all that apply.
     :param severities: Severities from 1 to 5.
     :param scenarios: Test rows of the environment; default: the test rows of the paper's table, if there are any.
-    :param n_episodes: Episodes of each model in each row; default: 100 with images, 500 with vectors.
+    :param n_episodes: Episodes of each model in each row; default: as many as ``n_steps`` allows, at most 100 with
+        images and 500 with vectors.
+    :param n_steps: Steps of each model in each row, at most: the budget that sets ``n_episodes``.
+    :param information: Also measure the information in the TRVs of the first TDPG model of each method. With long
+        episodes this takes much longer than the rest of the report.
     :param seed: Seed of environments, policies, perturbations and bootstrap.
     :param deterministic: Act without noise.
     :param jobs: Number of processes, if all models are files.
@@ -83,7 +96,12 @@ def robustness_report(
     if not isinstance(env_id, str):
         raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
     kwargs = default_env_kwargs(env_id, env_kwargs)
-    for name, value, least in (("n_episodes", n_episodes, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
+    for name, value, least in (
+        ("n_episodes", n_episodes, 1),
+        ("n_steps", n_steps, 1),
+        ("seed", seed, 0),
+        ("jobs", jobs, 1),
+    ):
         if value is not None and (not isinstance(value, (int, np.integer)) or value < least):
             raise ValueError(f"{name}={value!r} must be an integer of at least {least}")
     if jobs > 1 and not all(isinstance(source, Path) for of_method in sources.values() for source in of_method):
@@ -94,7 +112,7 @@ def robustness_report(
     )
     loaded = load_all(sources, env_id, kwargs)
     _check_fit(loaded, rows)
-    n_episodes = n_episodes or (100 if kind_of(space) == "image" else 500)
+    n_episodes = n_episodes or default_episodes(kind_of(space), horizon, n_steps)
     plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
@@ -104,20 +122,74 @@ def robustness_report(
     if not (out / "config.json").exists():
         write_run_config(out / "config.json", config)
 
-    records = complete_rows(plan, rows, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar)
-    numbers = make_numbers(records, seed=seed)
-    figures = _draw(numbers, plan, rows, loaded, space, out)
-    knowledge = _measure_all(plan, rows[0], loaded, out, progress_bar)
-    how = provenance()
-    page = Page(plan, rows, names, figures, knowledge, how_made(how["command"], how))
-    write_frame_atomically(numbers.levels, out / "levels.csv")
-    write_frame_atomically(numbers.groups, out / "perturbations.csv")
-    write_frame_atomically(numbers.comparisons, out / "comparisons.csv")
+    writer = _Writer(plan, rows, names, loaded, space, out)
+    if progress_bar:
+        _say_how_long(plan, rows, loaded, horizon, out, jobs)
+    records = complete_rows(
+        plan, rows, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar, at_row=writer.write_unfinished
+    )
+    text = writer.write(rows, records)
     write_frame_atomically(records, out / "episodes.csv.xz")
-    text = write_page(numbers, page)
-    write_atomically(out / "report.md", text)
-    write_atomically(out / "report.html", to_html(text, out, f"Robustness in {env_id}"))
+    if information:
+        text = writer.write(rows, records, _measure_all(plan, rows[0], loaded, out, progress_bar))
     return text
+
+
+class _Writer:
+    """Write the page and its files, for all rows or for those that are finished."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        rows: Sequence[Row],
+        names: Mapping[str, Sequence[str]],
+        models: Models,
+        space: spaces.Space,
+        out: Path,
+    ) -> None:
+        self.plan, self.rows, self.names, self.models, self.space, self.out = plan, rows, names, models, space, out
+        self.how = provenance()
+        self.not_before = 0.0
+
+    def write_unfinished(self, records: Mapping[Row, pd.DataFrame]) -> None:
+        """Write the page of the finished rows, unless the last one was written just now."""
+        began = time.monotonic()
+        if self.rows[0] not in records or len(records) == len(self.rows) or began < self.not_before:
+            return
+        # A mean over the mild severities alone would look better than it is.
+        open_names = {row.perturbation for row in self.rows if row not in records and row.kind != "own"}
+        rows = [row for row in self.rows if row in records and row.perturbation not in open_names]
+        self.write(rows, pd.concat([records[row] for row in rows], ignore_index=True))
+        self.not_before = time.monotonic() + PAUSE * (time.monotonic() - began)
+
+    def write(self, rows: Sequence[Row], records: pd.DataFrame, knowledge: Sequence[Knowledge] = ()) -> str:
+        """Write the page of some rows, and return it as Markdown."""
+        out, numbers = self.out, make_numbers(records, seed=self.plan.seed)
+        is_finished = len(rows) == len(self.rows)
+        figures = _draw(numbers, self.plan, rows if is_finished else (), self.models, self.space, out)
+        made = how_made(self.how["command"], self.how)
+        page = Page(self.plan, rows, self.names, figures, knowledge, made, n_rows=len(self.rows))
+        write_frame_atomically(numbers.levels, out / "levels.csv")
+        write_frame_atomically(numbers.groups, out / "perturbations.csv")
+        write_frame_atomically(numbers.comparisons, out / "comparisons.csv")
+        text = write_page(numbers, page)
+        write_atomically(out / "report.md", text)
+        html = to_html(text, out, f"Robustness in {self.plan.env_id}", reload=not is_finished)
+        write_atomically(out / "report.html", html)
+        return text
+
+
+def _say_how_long(plan: Plan, rows: Sequence[Row], models: Models, horizon: int | None, out: Path, jobs: int) -> None:
+    """Print an estimate of the time before the rows run."""
+    if not (missing := missing_rows(rows, out / "rows")):
+        return
+    minutes = seconds_of_a_row(plan, rows[0], models, horizon) * len(missing) / min(jobs, len(missing)) / 60
+    how_long = f"about {minutes:.0f} minutes" if minutes > 1.5 else f"about {60 * minutes:.0f} seconds"
+    print(
+        f"{len(missing)} rows of {plan.n_episodes} episodes of each model: {how_long} with {jobs} "
+        f"process{'es' * (jobs > 1)}; the finished rows are in {out / 'report.html'}",
+        file=sys.stderr,
+    )
 
 
 def _import_extra() -> None:
@@ -184,7 +256,7 @@ def _check_different(fingerprints: Mapping[str, Sequence[str]], names: Mapping[s
 def _draw(
     numbers: Numbers, plan: Plan, rows: Sequence[Row], models: Models, space: spaces.Space, out: Path
 ) -> dict[str, str]:
-    """Draw the figures that this report has, and return their files by name."""
+    """Draw the figures that this report has, with examples of some rows, and return their files by name."""
     figures = {}
     if numbers.perturbations:
         figures["degradation"] = degradation_curves(numbers)
@@ -193,7 +265,7 @@ def _draw(
     if numbers.has_probabilities:
         figures["comparison"] = comparison_figure(numbers)
     of_sensor = [row for row in rows if row.kind == "sensor"]
-    if kind_of(space) == "image" and numbers.perturbations:
+    if rows and kind_of(space) == "image" and numbers.perturbations:
         names = numbers.perturbations
         figures["examples"] = perturbation_gallery(plan.env_id, names, env_kwargs=plan.env_kwargs, seed=plan.seed)
     elif of_sensor:

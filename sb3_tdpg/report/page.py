@@ -37,6 +37,7 @@ class Page:
     figures: Mapping[str, str]  # files: degradation, own_rows, comparison, examples
     knowledge: Sequence[Knowledge]
     made: str  # the last sentence
+    n_rows: int  # also those that are missing
 
 
 def write_page(numbers: Numbers, page: Page) -> str:

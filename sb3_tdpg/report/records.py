@@ -1,8 +1,11 @@
 """Run the episodes of a report: every model in every row, in parallel, with a file for each finished row."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
+from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +17,22 @@ from tqdm import tqdm
 from sb3_tdpg.common.processes import process_pool
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.evaluation.records import run_episodes
+from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
+from sb3_tdpg.evaluation.records import MAX_PARALLEL_EPISODES, run_episodes
+from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.models import Source, load_all
 from sb3_tdpg.report.rows import Row
 from sb3_tdpg.robustness import PerturbedVecEnv
 
 COLUMNS = ("episode", "cost", "length", "failure")
 """The columns of :func:`~sb3_tdpg.evaluation.records.run_episodes` that are kept; ``failure`` only if it is known."""
+
+SIDE_BY_SIDE = 50  # environments that are not of this package
+UNKNOWN_LENGTH = 1_000  # steps of an episode without a time limit
+N_TIMED = 20  # steps
+MAX_EPISODES = {"image": 100}  # by kind of observation
+MAX_EPISODES_OF_OTHERS = 500
 
 Models = Mapping[str, Sequence[Any]]
 """The models of each method."""
@@ -62,24 +74,77 @@ def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
     return records[[name for name in (*keys, *COLUMNS) if name in records]]
 
 
+def default_episodes(kind: str | None, horizon: int | None, n_steps: int) -> int:
+    """
+    Return how many episodes a budget of steps allows.
+
+    :param kind: of the observations
+    :param horizon: The longest episode, if there is a limit.
+    :param n_steps: The budget.
+    """
+    most = MAX_EPISODES.get(kind or "", MAX_EPISODES_OF_OTHERS)
+    n = max(1, min(most, n_steps // (horizon or UNKNOWN_LENGTH)))
+    # Each environment runs the same number of episodes: 53 of them would run one after the other.
+    return n if n <= SIDE_BY_SIDE else n - n % SIDE_BY_SIDE
+
+
+def seconds_of_a_row(plan: Plan, row: Row, models: Models, horizon: int | None) -> float:
+    """Estimate how long a row takes at most, from some steps of the first model of each method."""
+    total = 0.0
+    with threads(1):
+        for first, *others in models.values():
+            n_parallel = min(plan.n_episodes, MAX_PARALLEL_EPISODES)
+            with closing(scenario_env(row.scenario, first, n_episodes=n_parallel)) as env:
+                steps = rollout(first, env, seeds=evaluation_seeds(plan.seed), deterministic=plan.deterministic)
+                next(steps)
+                began = time.perf_counter()
+                n_timed = len(list(islice(steps, N_TIMED)))
+                steps.close()  # restores the random generators
+                n_steps = -(-plan.n_episodes // env.num_envs) * (horizon or UNKNOWN_LENGTH)
+                total += (time.perf_counter() - began) / n_timed * n_steps * (1 + len(others))
+    return total
+
+
+def missing_rows(rows: Sequence[Row], folder: Path) -> list[Row]:
+    """Return the rows that have no file in a folder yet."""
+    return [row for row in rows if not (folder / row.file_name).exists()]
+
+
 def complete_rows(
-    plan: Plan, rows: Sequence[Row], models: Models, folder: Path, *, jobs: int = 1, progress_bar: bool = True
+    plan: Plan,
+    rows: Sequence[Row],
+    models: Models,
+    folder: Path,
+    *,
+    jobs: int = 1,
+    progress_bar: bool = True,
+    at_row: Callable[[Mapping[Row, pd.DataFrame]], Any] = lambda records: None,
 ) -> pd.DataFrame:
-    """Run the rows that have no file in a folder yet, and return the records of all rows."""
-    missing = [row for row in rows if not (folder / row.file_name).exists()]
-    with tqdm(total=len(rows), initial=len(rows) - len(missing), unit="row", disable=not progress_bar) as progress:
+    """
+    Run the rows that have no file in a folder yet, and return the records of all rows.
+
+    :param at_row: Called with the records of the finished rows whenever a row is finished.
+    """
+    missing = missing_rows(rows, folder)
+    finished = {row: _read_row(row, folder) for row in rows if row not in missing}
+    with tqdm(total=len(rows), initial=len(finished), unit="row", disable=not progress_bar) as progress:
         try:
             for row, records in _completed(plan, missing, models, min(jobs, len(missing))):
                 write_frame_atomically(records, folder / row.file_name)
+                finished[row] = _read_row(row, folder)
                 progress.set_postfix_str(row.title, refresh=False)
                 progress.update()
+                at_row(finished)
         except BaseException:
             progress.write("stopped; finished rows are kept, and the same command continues from them")
             raise
+    return pd.concat([finished[row] for row in rows], ignore_index=True)
+
+
+def _read_row(row: Row, folder: Path) -> pd.DataFrame:
     # "1" or "None" may be the name of a method or of a row.
     names = dict.fromkeys(("model", "perturbation", "kind"), str)
-    frames = [pd.read_csv(folder / r.file_name, dtype=names, keep_default_na=False, na_values=[""]) for r in rows]
-    return pd.concat(frames, ignore_index=True)
+    return pd.read_csv(folder / row.file_name, dtype=names, keep_default_na=False, na_values=[""])
 
 
 def _completed(plan: Plan, rows: Sequence[Row], models: Models, jobs: int) -> Iterator[tuple[Row, pd.DataFrame]]:

@@ -20,7 +20,7 @@ FAST: Mapping[str, Mapping[str, Any]] = {"BallCatch-v0": dict(renderer="fast")}
 """Keywords that save time and hardly change the results, by environment; the user's keywords take precedence."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
     """One condition in which every model is run."""
 
