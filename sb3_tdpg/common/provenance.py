@@ -58,10 +58,10 @@ def provenance() -> dict[str, Any]:
 def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str] = ()) -> str:
     """Say how a summary was made: the command that makes it again, its :func:`provenance`, the commits of its runs."""
     versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
-    git: Mapping[str, Any] = how["git"] or dict(commit="outside a checkout", dirty=False)
-    commit = git["commit"] + " with uncommitted changes" * git["dirty"]
+    git: Mapping[str, Any] | None = how["git"]  # none for an installed package: then its version says it
+    commit = f" at commit {git['commit']}{' with uncommitted changes' * git['dirty']}" if git else ""
     runs = f"runs at {', '.join(commits)}; " if commits else ""
-    return f"Made by `{command}` at commit {commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
+    return f"Made by `{command}`{commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
 
 
 def write_run_config(path: Path, config: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,7 +26,7 @@ from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.information.loo import log_density_matrix
-from sb3_tdpg.measurement import InformationInterval, TrustBadge, information_interval, trust_checks
+from sb3_tdpg.measurement import InformationInterval, TrustBadge, TrustCheck, information_interval, trust_checks
 from sb3_tdpg.measurement.density_critic import Regression
 from sb3_tdpg.measurement.interval import component_estimates
 from sb3_tdpg.measurement.interval_bounds import MAX_TRAINING
@@ -61,9 +61,10 @@ class InformationReport:
     interval: InformationInterval
     """Interval for I[x_t; x~_t] at each time step."""
     knowledge: pd.DataFrame
-    """Information about each component of the state: see :func:`~sb3_tdpg.evaluation.state_knowledge`."""
+    """Information about each component of the state, at most the upper limit of the interval: see
+    :func:`~sb3_tdpg.evaluation.state_knowledge`."""
     badge: TrustBadge
-    """Checks of the interval."""
+    """Checks of the interval and of the components."""
     costs: np.ndarray
     """Costs of the episodes, ``(N,)``."""
 
@@ -123,7 +124,20 @@ def information_report(
     at_end()
     badge = trust_checks(batch, interval, seed=seed)
     at_end()
+    known, check = within(known, interval)
+    badge = replace(badge, checks=(*badge.checks, check))
     return InformationReport(interval, known, badge, np.concatenate(costs)[:n_episodes])
+
+
+def within(known: pd.DataFrame, interval: InformationInterval) -> tuple[pd.DataFrame, TrustCheck]:
+    """Limit what is known about each component by the upper limit of the whole state, and check that it fits."""
+    upper = interval.upper[known["t"]]
+    excess = (known["nats_lower"] - upper).max()
+    meaning = "nats by which the lower limit of a component of the state is above the upper limit of the whole state"
+    # Without a component that varies nothing exceeds the limit.
+    check = TrustCheck("components", max(0.0, float(excess)), 0.0, meaning)
+    limited = {name: np.minimum(known[name], upper) for name in ("nats", "nats_lower")}
+    return known.assign(**limited), check
 
 
 @threads(1)

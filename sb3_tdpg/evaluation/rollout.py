@@ -5,7 +5,7 @@ Dimension key: E environments, X state, Z TRVs, ``*obs`` and ``*action`` as in t
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ def rollout(
     problem: Problem | None = None,
     encode: bool = False,
     observe: Callable[[Any], Any] | None = None,
-) -> Iterator[Step]:
+) -> Generator[Step, None, None]:
     """
     Run a policy and yield every step.
 

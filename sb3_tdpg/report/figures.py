@@ -14,7 +14,7 @@ from gymnasium import spaces
 from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, legend_above, log_axis, new_panels
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
-from sb3_tdpg.report.numbers import CLEAR, Numbers
+from sb3_tdpg.report.numbers import Numbers
 from sb3_tdpg.report.records import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
 from sb3_tdpg.robustness.core import Perturber
@@ -39,6 +39,8 @@ def degradation_curves(numbers: Numbers) -> Figure:
             curve = of_model[of_model["perturbation"].isin((UNPERTURBED, name))].sort_values("severity")
             axes.fill_between(curve["severity"], curve["low"], curve["high"], color=style["color"], alpha=0.2, lw=0)
             axes.plot(curve["severity"], curve["iqm"], **style, markersize=3.5, linewidth=1.3, label=label)
+            each = numbers.model_levels.query("model == @label and perturbation in (@UNPERTURBED, @name)")
+            axes.plot(each["severity"], each["cost"], ".", color=style["color"], markersize=3, alpha=0.6)
         axes.set_title(name, fontsize=9)
         axes.grid(alpha=0.25)
     panels[0, 0].set_xticks(sorted({0, *levels["severity"]}))
@@ -50,9 +52,9 @@ def degradation_curves(numbers: Numbers) -> Figure:
 
 
 def own_rows_figure(numbers: Numbers) -> Figure:
-    """Draw the cost of each method in the test rows of the environment, with its interval."""
+    """Draw the cost of each method in the test rows of the environment, with its interval and its models."""
     shown = numbers.levels[numbers.levels["kind"].isin(("unperturbed", "own"))]
-    figure, axes = _intervals(numbers, shown, ("iqm", "low", "high"))
+    figure, axes = _by_row(numbers, shown.assign(value=shown["iqm"]), numbers.model_levels)
     axes.grid(alpha=0.25, axis="x")
     _log_if_wide(axes, shown, "x")
     axes.set_xlabel("episode cost", fontsize=9)
@@ -61,29 +63,48 @@ def own_rows_figure(numbers: Numbers) -> Figure:
 
 
 def comparison_figure(numbers: Numbers) -> Figure:
-    """Draw the probability that a model of each method costs less than one of the first method."""
-    frame = numbers.comparisons[numbers.comparisons["p_cost"].notna()]
-    figure, axes = _intervals(numbers, frame, ("p_cost", "p_cost_low", "p_cost_high"))
+    """Draw in which share of the pairs a model of each method costs less than one of the first method."""
+    reference = numbers.models[0]
+    frame = numbers.comparisons[[numbers.can_be_clear(label) for label in numbers.comparisons["model"]]]
+    costs = numbers.model_groups.pivot(index=["model", "train_seed"], columns="perturbation", values="cost")
+    theirs = costs.loc[reference]
+    shares = [((row < theirs) + 0.5 * (row == theirs)).mean().rename(key) for key, row in costs.iterrows()]
+    dots = pd.concat(shares, axis=1).rename_axis(columns=["model", "train_seed"]).stack([0, 1], future_stack=True)
+    is_clear = frame["cost"] != "undecided"
+    figure, axes = _by_row(
+        numbers, frame.assign(value=frame["p_cost"], is_filled=is_clear), dots.reset_index(name="cost")
+    )
     axes.axvline(0.5, color=INK, linewidth=1)
-    for edge in (1 - CLEAR, CLEAR):
-        axes.axvline(edge, color=INK, linewidth=0.8, linestyle=(0, (3, 3)), alpha=0.6)
     axes.set_xlim(-0.02, 1.02)
-    text = f"probability of a lower cost than {numbers.models[0]} (dashed: {1 - CLEAR:.2g} and {CLEAR:.2g})"
-    axes.set_xlabel(text, fontsize=9)
+    axes.xaxis.set_major_formatter("{x:.0%}")
+    axes.set_xlabel(f"pairs of models with a lower cost than {reference} (filled: clear)", fontsize=9)
     legend_above(figure, axes, 4)
     return figure
 
 
-def _intervals(numbers: Numbers, frame: pd.DataFrame, columns: Sequence[str]) -> tuple[Figure, Axes]:
-    """Draw an interval for each perturbation (rows) and method; the columns hold the value and the two ends."""
+def _by_row(numbers: Numbers, frame: pd.DataFrame, of_models: pd.DataFrame) -> tuple[Figure, Axes]:
+    """
+    Draw a value for each perturbation (rows) and method, with a dot for each model.
+
+    :param frame: ``perturbation``, ``model``, ``value``, and either the ends of intervals or ``is_filled``.
+    :param of_models: ``perturbation``, ``model``, ``cost``.
+    """
     names, labels = list(frame["perturbation"].unique()), list(frame["model"].unique())
     figure, ((axes,),) = new_panels(WIDTH, 1.1 + 0.24 * len(names))
     for i, label in enumerate(labels):
         style = _styles(numbers)[label]
-        value, low, high = (frame[frame["model"] == label].set_index("perturbation").loc[names, c] for c in columns)
-        at = np.arange(len(names)) + 0.22 * (i - (len(labels) - 1) / 2)
-        axes.hlines(at, low, high, color=style["color"], linewidth=2, alpha=0.5)
-        axes.plot(value, at, style["marker"], color=style["color"], markersize=4.5, label=label)
+        color = style["color"]
+        rows = frame[frame["model"] == label].set_index("perturbation").loc[names]
+        at = pd.Series(np.arange(len(names)) + 0.22 * (i - (len(labels) - 1) / 2), names)
+        if "low" in rows:
+            axes.hlines(at, rows["low"], rows["high"], color=color, linewidth=2, alpha=0.5)
+        filled = rows.get("is_filled", pd.Series(True, names)).astype(bool)
+        for fill, chosen in ((color, filled), ("white", ~filled)):
+            style_of_points = dict(color=color, markerfacecolor=fill, markersize=4.5)
+            axes.plot(rows["value"][chosen], at[chosen], style["marker"], **style_of_points)
+        axes.plot([], [], style["marker"], color=color, markersize=4.5, label=label)
+        dots = of_models[(of_models["model"] == label) & of_models["perturbation"].isin(names)]
+        axes.plot(dots["cost"], at.loc[dots["perturbation"]], ".", color=color, markersize=3, alpha=0.6)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     return figure, axes

@@ -262,7 +262,7 @@ def _draw(
         figures["degradation"] = degradation_curves(numbers)
     if (numbers.groups["kind"] == "own").any():
         figures["own_rows"] = own_rows_figure(numbers)
-    if numbers.has_probabilities:
+    if any(map(numbers.can_be_clear, numbers.models[1:])):
         figures["comparison"] = comparison_figure(numbers)
     of_sensor = [row for row in rows if row.kind == "sensor"]
     if rows and kind_of(space) == "image" and numbers.perturbations:

@@ -6,19 +6,17 @@ Dimension key: S models of a method, R rows, E episodes, G groups of rows (a per
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.statistics import interquartile_means, probabilities_of_improvement
+from sb3_tdpg.evaluation.statistics import interquartile_means
 from sb3_tdpg.report.rows import ALL, UNPERTURBED
 
-CLEAR = 0.95
-"""A comparison is clear from this probability on."""
-
-MIN_CLEAR = 3
-"""With fewer models of a method no comparison is clear: two beat two others by chance in one case of six."""
+CLEAR = 0.05
+"""A difference is clear up to this p-value."""
 
 
 @dataclass(frozen=True)
@@ -30,28 +28,44 @@ class Numbers:
     ``low``, ``high``."""
     groups: pd.DataFrame
     """The mean over the severities of each perturbation, for each method: the same columns without ``severity``, and
-    ``added``, ``added_low``, ``added_high``, the cost above the unperturbed cost."""
+    ``added``, ``added_low``, ``added_high``, the cost above the unperturbed cost, and whether the cost is clearly the
+    ``lowest``: below that of every other method, and their intervals do not overlap."""
     comparisons: pd.DataFrame
-    """Each method compared with the first one (``reference``), with a row for each perturbation: the probabilities
-    ``p_cost`` that one of its models costs less, and ``p_added`` that the perturbation adds less to its cost, with
-    ``..._low`` and ``..._high``; NaN if a method has a single model. ``cost`` and ``added`` are the verdicts:
-    ``"less"`` from a probability of 0.95 on, ``"more"`` up to 0.05, ``"undecided"`` between them and with fewer than
-    three models of a method."""
+    """Each method compared with the first one (``reference``), with a row for each perturbation: the share ``p_cost``
+    of the pairs of models in which its model costs less, and ``p_added`` in which the perturbation adds less to its
+    cost; ``pvalue_...`` of the exact Mann-Whitney test, two-sided. ``cost`` and ``added`` are the verdicts: ``"less"``
+    or ``"more"`` up to a p-value of 0.05, else ``"undecided"``."""
+    model_levels: pd.DataFrame
+    """The mean cost of each model in each row: ``model``, ``train_seed``, ``perturbation``, ``severity``, ``cost``."""
+    model_groups: pd.DataFrame
+    """The mean of each model over the severities of each perturbation: ``model``, ``train_seed``, ``perturbation``,
+    ``cost``, ``added``."""
 
     @property
     def models(self) -> list[str]:
         """The methods, in the given order."""
         return list(self.levels["model"].unique())
 
-    @property
-    def has_probabilities(self) -> bool:
-        """Whether there are probabilities, which need several models of two methods."""
-        return not self.comparisons.empty and bool(self.comparisons["p_cost"].notna().any())
+    def can_be_clear(self, label: str) -> bool:
+        """Whether any difference from the first method could be clear, with so many models of each."""
+        n, of_reference = self.n_models(label), self.n_models(self.models[0])
+        return p_value(np.arange(n), n + np.arange(of_reference)) <= CLEAR
+
+    def n_models(self, label: str) -> int:
+        """Count the models of a method."""
+        return int(self.levels.loc[self.levels["model"] == label, "n_seeds"].iloc[0])
 
     @property
     def perturbations(self) -> list[str]:
         """The perturbations with severities."""
         return list(self.groups.loc[self.groups["kind"].isin(("sensor", "scene")), "perturbation"].unique())
+
+
+def p_value(costs: np.ndarray, of_others: np.ndarray) -> float:
+    """Return the p-value of a difference between the models of two methods."""
+    from scipy.stats import mannwhitneyu
+
+    return float(mannwhitneyu(costs, of_others).pvalue)
 
 
 def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
@@ -74,7 +88,7 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
     plain = rows.index[rows["kind"] == "unperturbed"]
     how = dict(level=level, n_bootstrap=n_bootstrap, seed=seed)
 
-    levels, summaries, by_seed = [], [], {}
+    levels, summaries, by_seed, by_row = [], [], {}, {}
     for label, of_model in records.groupby("model", sort=False):
         cube = _cube(of_model, rows)
         # An episode begins in the same state in every row, and is averaged with itself.
@@ -85,15 +99,42 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
         levels.append(rows.assign(**method, **_interval_columns(cube, how, is_share)))
         intervals = {**_interval_columns(cost, how, is_share), **_interval_columns(added, how, prefix="added")}
         summaries.append(keys.assign(**method, **intervals))
+        by_row[str(label)] = dict(cost=cube.mean(axis=2))
         by_seed[str(label)] = dict(cost=cost.mean(axis=2), added=added.mean(axis=2))
 
     first = ["model", "perturbation", "severity", "kind", "n_seeds"]
-    comparisons = [_compare(label, by_seed, keys, how) for label in list(by_seed)[1:]]
+    comparisons = [_compare(label, by_seed, keys) for label in list(by_seed)[1:]]
+    summary = _with_first([name for name in first if name != "severity"], pd.concat(summaries, ignore_index=True))
     return Numbers(
         _with_first(first, pd.concat(levels, ignore_index=True)),
-        _with_first([name for name in first if name != "severity"], pd.concat(summaries, ignore_index=True)),
+        summary.assign(lowest=_lowest(summary, by_seed)),
         pd.concat(comparisons, ignore_index=True) if comparisons else pd.DataFrame(),
+        _long(by_row, rows[["perturbation", "severity"]]),
+        _long(by_seed, keys[["perturbation"]]),
     )
+
+
+def _long(by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
+    """Turn arrays ``(S, rows)`` by method and name into a frame with a row for each model and row."""
+    frames = [
+        keys.assign(model=label, train_seed=number, **{name: values[number] for name, values in arrays.items()})
+        for label, arrays in by_seed.items()
+        for number in range(len(arrays["cost"]))
+    ]
+    return _with_first(["model", "train_seed"], pd.concat(frames, ignore_index=True))
+
+
+def _lowest(summary: pd.DataFrame, by_seed: Mapping[str, Mapping[str, np.ndarray]]) -> np.ndarray:
+    """Tell for each method and group whether its cost is clearly lower than that of every other method."""
+    n_groups = len(summary) // len(by_seed)
+    low, high = (summary[name].to_numpy().reshape(len(by_seed), n_groups) for name in ("low", "high"))
+    costs = [arrays["cost"] for arrays in by_seed.values()]
+    result = np.full(low.shape, len(costs) > 1)
+    for (one, group), (other, of_other) in product(np.ndindex(low.shape), enumerate(costs)):
+        if one != other:
+            is_below = high[one, group] < low[other, group]
+            result[one, group] &= is_below and p_value(costs[one][:, group], of_other[:, group]) <= CLEAR
+    return result.ravel()
 
 
 def _with_first(names: list[str], frame: pd.DataFrame) -> pd.DataFrame:
@@ -144,19 +185,15 @@ def _mean_of_one(costs: np.ndarray, level: float, is_share: bool) -> tuple[np.nd
     return mean, *(np.clip((center + sign * half) / (1 + z**2 / trials), 0.0, 1.0) for sign in (-1, 1))
 
 
-def _compare(
-    label: str, by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame, how: Mapping[str, Any]
-) -> pd.DataFrame:
+def _compare(label: str, by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
     """Compare a method with the first one."""
     reference = next(iter(by_seed))
     frame = keys.assign(model=label, reference=reference)
-    n_models = min(len(by_seed[name]["cost"]) for name in (label, reference))
     for name, costs in by_seed[label].items():
-        columns = (np.full(len(keys), np.nan),) * 3
-        if n_models > 1:
-            columns = probabilities_of_improvement(costs, by_seed[reference][name], **how)
-        frame = frame.assign(**dict(zip((f"p_{name}", f"p_{name}_low", f"p_{name}_high"), columns, strict=True)))
-        p, is_enough = frame[f"p_{name}"], n_models >= MIN_CLEAR
-        frame[name] = np.select([(p >= CLEAR) & is_enough, (p <= 1 - CLEAR) & is_enough], ["less", "more"], "undecided")
-    frame.loc[frame["perturbation"] == UNPERTURBED, ["p_added", "p_added_low", "p_added_high"]] = np.nan
+        theirs = by_seed[reference][name]
+        share = ((costs[:, None] < theirs) + 0.5 * (costs[:, None] == theirs)).mean(axis=(0, 1))
+        p = np.array([p_value(*pair) for pair in zip(costs.T, theirs.T, strict=True)])
+        verdict = np.select([(p <= CLEAR) & (share > 0.5), (p <= CLEAR) & (share < 0.5)], ["less", "more"], "undecided")
+        frame = frame.assign(**{f"p_{name}": share, f"pvalue_{name}": p, name: verdict})
+    frame.loc[frame["perturbation"] == UNPERTURBED, ["p_added", "pvalue_added"]] = np.nan
     return frame

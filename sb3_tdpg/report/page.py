@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdpg.common.markdown import escaped, fill_template, markdown_table
-from sb3_tdpg.report.numbers import CLEAR, MIN_CLEAR, Numbers
+from sb3_tdpg.report.numbers import CLEAR, Numbers
 from sb3_tdpg.report.records import Plan
 from sb3_tdpg.report.rows import ALL, UNPERTURBED, Row
 from sb3_tdpg.robustness.registry import find
@@ -55,7 +55,7 @@ def write_page(numbers: Numbers, page: Page) -> str:
     )
     verdicts = [_verdict(numbers, label) for label in numbers.models[1:]]
     few = [label for label, names in page.sources.items() if 1 < len(names) < MIN_SEEDS]
-    limits = dict(few=few, min_seeds=MIN_SEEDS, clear=CLEAR, min_clear=MIN_CLEAR)
+    limits = dict(few=few, min_seeds=MIN_SEEDS, clear=CLEAR)
     return fill_template(
         "sb3_tdpg.report", "report.md", page=page, numbers=numbers, costs=costs, tables=tables, verdicts=verdicts,
         all=ALL if has_all else None, unperturbed=UNPERTURBED, **limits,
@@ -101,11 +101,10 @@ class Costs:
         models = self.numbers.models
         rows = []
         for name in names:
-            lowest = min(self.groups.loc[(model, name), "iqm"] for model in models)
             row = {title: escaped(name)}
             for model in models:
                 group = self.groups.loc[(model, name)]
-                bold = "**" if len(models) > 1 and group["iqm"] == lowest else ""
+                bold = "**" if group["lowest"] else ""
                 row[f"{escaped(model)}: cost"] = f"{bold}{self.cell(group)}{bold}"
                 row[f"{escaped(model)}: added cost"] = "" if name == UNPERTURBED else self.cell(group, "added")
             rows.append(row)
@@ -125,20 +124,14 @@ class Costs:
 
 def _verdict(numbers: Numbers, label: str) -> dict[str, Any]:
     """Say where a method is better than the first one."""
-    frame = numbers.comparisons[numbers.comparisons["model"] == label].set_index("perturbation")
     reference, names = numbers.models[0], numbers.perturbations
     ours, theirs = escaped(label), escaped(reference)
-    result: dict[str, Any] = dict(title=f"{ours} compared with {theirs}", ours=ours, theirs=theirs)
-    if frame["p_cost"].isna().all():
-        cost = numbers.groups.set_index(["model", "perturbation"])["iqm"]
-        lower = [name for name in names if cost[label, name] < cost[reference, name]]
-        return {**result, **(dict(lower=lower, n=len(names)) if names else {})}
-    if names:
-        result.update(cost=_by_word(frame.loc[names, "cost"]), added=_by_word(frame.loc[names, "added"]))
-    if ALL in frame.index:
-        result["probability"] = _probability(frame.loc[ALL], "p_cost")
-    if (frame["kind"] == "own").any():
-        result["own"] = _by_word(frame.loc[frame["kind"] == "own", "cost"])
+    sizes = [numbers.n_models(each) for each in (label, reference)]
+    result: dict[str, Any] = dict(ours=ours, theirs=theirs, sizes=sizes, can_be_clear=numbers.can_be_clear(label))
+    frame = numbers.comparisons[numbers.comparisons["model"] == label].set_index("perturbation")
+    result["of"] = frame.loc[ALL if ALL in frame.index else names[0] if names else UNPERTURBED].to_dict()
+    result["cost"] = _by_word(frame.loc[names, "cost"])
+    result["own"] = _by_word(frame.loc[frame["kind"] == "own", "cost"])
     return result
 
 
@@ -146,23 +139,22 @@ def _by_word(words: pd.Series) -> dict[str, list[str]]:
     return {word: list(words.index[words == word]) for word in ("less", "more", "undecided")}
 
 
-def _probability(row: Mapping[str, Any] | pd.Series, name: str) -> str:
-    if np.isnan(row[name]):
-        return ""
-    return f"{row[name]:.2f} [{row[f'{name}_low']:.2f}, {row[f'{name}_high']:.2f}]"
-
-
 def _comparisons_table(numbers: Numbers) -> str:
-    """Make a table of the probabilities that a method is better than the first one; empty if there are none."""
-    if not numbers.has_probabilities:
-        return ""
-    columns = ["perturbation", "method", "probability of a lower cost", "probability of a lower added cost"]
+    """Make a table of how often a model is better than one of the first method; empty if nothing can be clear."""
     rows = []
     for row in numbers.comparisons.to_dict("records"):
-        lower = {"less": row["model"], "more": row["reference"]}.get(row["cost"], "")
-        names = [escaped(name) for name in (row["perturbation"], row["model"], lower)]
-        rows.append([*names[:2], _probability(row, "p_cost"), _probability(row, "p_added"), names[2]])
-    return markdown_table(rows, [*columns, "clearly lower cost"])
+        if numbers.can_be_clear(row["model"]):
+            lower = {"less": row["model"], "more": row["reference"]}.get(row["cost"], "")
+            names = [escaped(name) for name in (row["perturbation"], row["model"], lower)]
+            rows.append([*names[:2], _share(row, "cost"), _share(row, "added"), names[2]])
+    columns = ["perturbation", "method", "lower cost", "lower added cost", "clearly lower cost"]
+    return markdown_table(rows, columns) if rows else ""
+
+
+def _share(row: Mapping[str, Any], name: str) -> str:
+    """Write a share of the pairs of models, with its p-value."""
+    share, p = row[f"p_{name}"], row[f"pvalue_{name}"]
+    return "" if np.isnan(share) else f"{share:.0%} (p = {p:.2g})"
 
 
 def _severities_table(page: Page) -> str:

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import BatchedVecEnv, InformationCallback, SelectionCallback, make_episodes_env
 from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.evaluation import information as information_module
 from sb3_tdpg.evaluation import (
     information_report,
     information_timeline,
@@ -92,6 +93,19 @@ def test_the_report_on_a_policy_has_frames_a_badge_and_figures(tmp_path):
     again = information_report(model, env, n_episodes=50, seed=3, names=("d", "v"))
     pd.testing.assert_frame_equal(report.frame, again.frame)
     env.close()
+
+
+def test_a_component_is_never_known_better_than_the_whole_state(monkeypatch):
+    def too_much(batch, names, *, seed):
+        frame = state_knowledge(batch, names, seed=seed)
+        return frame.assign(nats=350.0, nats_lower=300.0)
+
+    monkeypatch.setattr(information_module, "state_knowledge", too_much)
+    report = information_report(tiny_tdpg(PROBLEM), make_episodes_env(PROBLEM, n_episodes=50), n_episodes=50, seed=3)
+    for name in ("nats", "nats_lower"):
+        np.testing.assert_allclose(report.knowledge[name], report.interval.upper[report.knowledge["t"]])
+    assert not report.badge.passed
+    assert "components FAILED" in str(report)
 
 
 class CalledEnv(LavaEnv):

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from gymnasium import spaces
-from scipy.stats import binomtest, mannwhitneyu, trim_mean
+from scipy.stats import mannwhitneyu, trim_mean
 from small_problems import tiny_tdpg
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -20,7 +20,6 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
 from sb3_tdpg.report.models import label_of
-from sb3_tdpg.report.numbers import make_numbers
 from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
 
@@ -58,20 +57,21 @@ def test_the_page_and_its_files(report):
     for words in (
         "3 models of **PG** and 3 models of **tdpg**",
         "## In short",
-        "**tdpg compared with PG**",
+        "**tdpg compared with PG**: undecided. With 3 and 3 models no difference can be clear",
         "vector_delay",
     ):
         assert words in page
+    assert "probability" not in page
     assert "What the policies know" not in page
     assert "Unfinished" not in page
     for words in ("Sensor noise 1e0", "pg-seed2/model.zip", "Made by `"):
         assert words in page
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", page)
-    assert {"figures/degradation.png", "figures/examples.png", "figures/comparison.png"} < set(pictures)
+    assert {"figures/degradation.png", "figures/examples.png"} < set(pictures)
     assert all((out / picture).stat().st_size > 1000 for picture in pictures)
     assert not list(out.rglob("*.partial"))
     assert "| vector_noise | Add noise to every component | standard deviation, scales | 0.1 | 0.8 |" in page
-    assert "A scale is the standard deviation of a component" in page
+    assert "A scale is the standard deviation of a component of the observations: with finite bounds, that of" in page
 
 
 def test_the_html_needs_no_other_file(report):
@@ -181,37 +181,13 @@ def test_one_model_is_not_taken_for_a_method(tmp_path):
         severities=[3], n_episodes=30, scenarios=(), progress_bar=False,
     )  # fmt: skip
     assert "about this model" in text
-    assert "give several" in text
+    assert "With 1 and 1 model no difference can be clear" in text
     assert "Which is more robust" not in text
     levels = pd.read_csv(tmp_path / "levels.csv")
     costs = pd.read_csv(tmp_path / "episodes.csv.xz").query("model == 'A' and severity == 3")["cost"]
     row = levels.query("model == 'A' and severity == 3").iloc[0]
     assert row["iqm"] == pytest.approx(costs.mean())
     assert row["high"] - row["low"] == pytest.approx(2 * 1.96 * costs.sem(), rel=1e-3)
-
-
-def made_up(n_seeds, control=10.0, method=8.0):
-    """Records of two methods of which the second is cheaper, whatever the seed, and suffers more."""
-    rows = [
-        dict(model=m, train_seed=s, perturbation=p, severity=v, kind=k, episode=e, cost=c + v * slope + 0.1 * s)
-        for m, c, slope in (("A", control, 1.0), ("B", method, 1.2))
-        for s in range(n_seeds)
-        for p, v, k in (("unperturbed", 0, "unperturbed"), ("x", 1, "sensor"), ("x", 2, "sensor"))
-        for e in range(2)
-    ]
-    return pd.DataFrame(rows)
-
-
-def test_cheaper_and_more_robust_are_two_things():
-    (row,) = make_numbers(made_up(4), n_bootstrap=50).comparisons.query("perturbation == 'x'").to_dict("records")
-    assert (row["p_cost"], row["cost"]) == (1.0, "less")
-    assert (row["p_added"], row["added"]) == (0.0, "more")
-
-
-def test_nothing_is_clear_of_two_models():
-    comparisons = make_numbers(made_up(2), n_bootstrap=50).comparisons
-    assert (comparisons["p_cost"] == 1.0).all()
-    assert set(comparisons["cost"]) == set(comparisons["added"]) == {"undecided"}
 
 
 def test_models_are_grouped_by_label_or_folder(tmp_path):
@@ -383,23 +359,3 @@ def test_a_report_of_other_models_is_refused(report, folder, capsys):
     arguments, _ = report
     assert main([arguments[0], *arguments[2:]]) == 2
     assert re.search(r"models.PG: \[.*\] there, not here: choose", capsys.readouterr().err)
-
-
-def test_of_one_policy_that_fails_or_not_the_share_has_wilsons_interval():
-    failures = np.random.default_rng(0).random((3, 40)) < np.array([[0.0], [0.2], [0.4]])
-    rows = [("unperturbed", 0, "unperturbed"), ("x", 1, "sensor"), ("x", 2, "sensor")]
-    records = pd.DataFrame(
-        dict(model="A", train_seed=0, perturbation=p, severity=v, kind=k, episode=e, cost=float(failures[i, e]))
-        for i, (p, v, k) in enumerate(rows)
-        for e in range(40)
-    )
-    numbers = make_numbers(records)
-    for fails, row in zip(failures, numbers.levels.to_dict("records"), strict=True):
-        expected = binomtest(int(fails.sum()), 40).proportion_ci(0.95, "wilson")
-        assert (row["low"], row["high"]) == pytest.approx(tuple(expected))
-    # The mean of two rows is known better than one row, and never below 0.
-    group = numbers.groups.set_index("perturbation").loc["x"]
-    assert 0 < group["low"] < group["iqm"] < group["high"]
-    assert group["high"] - group["low"] < (numbers.levels["high"] - numbers.levels["low"]).iloc[1:].min()
-    records["cost"] += 0.5  # no shares any more
-    assert make_numbers(records).levels["low"][0] == 0.5
