@@ -89,7 +89,7 @@ EARLIER_ENCODER = dict(
 
 def methods(launch: str) -> tuple[Method, ...]:
     """List the methods; each differs from the user's one line in what its name says, and takes as many steps."""
-    env_kwargs = dict(renderer="fast", **LAUNCHES[launch])
+    env_kwargs = LAUNCHES[launch]
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:
         return Method(label, BLOCK, renderer=renderer, overrides={**overrides, "env_kwargs": env_kwargs})

@@ -23,7 +23,6 @@ FIRST_SEED = 400
 LEVELS = (24.0, 8.7, 5.0)
 PAPERS_LEVEL = 8.7
 PRICES = (16, 22, 28, 34, 40)  # 1 / beta; the paper has every even number between
-ENV = dict(renderer="fast")
 KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "test backgrounds": BACKGROUND_ROWS}
 
 
@@ -59,7 +58,7 @@ def methods() -> tuple[Method, ...]:
     for level in LEVELS:
         pg = f"PG to {level:g}"
         stop = {"sb3_tdpg.paper.ball_paper.StopAtCost": dict(cost=level)}
-        overrides = dict(env_kwargs=ENV, callback=[stop])
+        overrides = dict(callback=[stop])
         found.append(Method(pg, "BallCatch-v0-paper-pg", start, overrides=overrides))
         found += [
             Method(f"TDPG {price} from {level:g}", "BallCatch-v0-paper", pg, overrides=dict(beta=1 / price))
@@ -99,7 +98,7 @@ def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
     given = common.Options(**{"n_eval_episodes": 200, **options})
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     everything = [(method, seed) for seed in seeds for method in methods()]
-    rows = [row.with_kwargs(**ENV) for row in BALL_CATCH]
+    rows = list(BALL_CATCH)
     tasks = common.make_tasks("BallCatch-v0", out / "runs", everything, lambda _: rows, given.overrides)
     complete_runs(tasks, **given.of_runs)
     folders = common.folders_of(tasks)

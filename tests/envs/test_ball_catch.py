@@ -22,10 +22,6 @@ READINGS = {"text": {}, "published": BALL_PUBLISHED_READING}
 IMAGE = (3, 64, 64)
 
 
-def fast_env(**kwargs):
-    return BallCatchEnv(**{"renderer": "fast", **kwargs})
-
-
 def ball_pixels(image):
     """Where an image (3, 64, 64) shows the green ball."""
     red, green, blue = image.astype(int)
@@ -52,7 +48,7 @@ def run_episode(env, controls, seed=0):
     ("published", (0.2, 0.1), (7.85 - 9.8 / 15, 7.85 - 2 * 9.8 / 15)),
 ])  # fmt: skip
 def test_two_steps_have_the_states_computed_by_hand(reading, robot, fall):
-    env = fast_env(robot_range=(0.0, 0.0), **READINGS[reading])
+    env = BallCatchEnv(robot_range=(0.0, 0.0), **READINGS[reading])
     states, _, costs = run_episode(env, [2.0, -1.0])
     expected = [
         [0.0, 8.0, 1.0, -4.5, 7.85],
@@ -68,7 +64,7 @@ def test_two_steps_have_the_states_computed_by_hand(reading, robot, fall):
     ("published", 24, 0.8, 1.5387),
 ])  # fmt: skip
 def test_the_ball_goes_from_eight_metres_to_where_the_reading_has_it_at_the_end(reading, steps, lands, height):
-    env = fast_env(robot_range=(-1.0, -1.0), **READINGS[reading])
+    env = BallCatchEnv(robot_range=(-1.0, -1.0), **READINGS[reading])
     assert env.horizon == steps
     states, _, costs = run_episode(env, [0.0] * steps)
     np.testing.assert_allclose(states[0, 1:3], [8.0, 1.0])
@@ -79,25 +75,25 @@ def test_the_ball_goes_from_eight_metres_to_where_the_reading_has_it_at_the_end(
 
 
 def test_a_robot_that_drives_straight_to_the_landing_point_pays_for_its_controls_only():
-    env = fast_env(robot_range=(-2.0, -2.0))
+    env = BallCatchEnv(robot_range=(-2.0, -2.0))
     _, _, costs = run_episode(env, [1.5] * 25)
     np.testing.assert_allclose(costs, 0.015, atol=1e-9)
 
 
 def test_an_action_out_of_bounds_counts_as_the_bound():
-    states, _, costs = run_episode(fast_env(robot_range=(0, 0), max_action=3.0, dt=0.1), [50.0])
+    states, _, costs = run_episode(BallCatchEnv(robot_range=(0, 0), max_action=3.0, dt=0.1), [50.0])
     assert states[1, 0] == pytest.approx(0.3)
     assert costs[0] == pytest.approx(0.03)
 
 
 def test_an_episode_starts_with_the_robot_anywhere_in_its_range_and_the_ball_at_its_launch():
-    states = fast_env()._initial_state(20_000)
+    states = BallCatchEnv()._initial_state(20_000)
     np.testing.assert_allclose(np.quantile(states[:, 0], [0, 0.25, 0.5, 0.75, 1]), [-2, -1, 0, 1, 2], atol=0.05)
     np.testing.assert_array_equal(states[:, 1:], np.tile([8.0, 1.0, -4.5, 7.85], (20_000, 1)))
 
 
 def test_a_launch_that_varies_fills_its_ranges_and_moves_the_landing_point():
-    env = fast_env(**BALL_VARYING_LAUNCH)
+    env = BallCatchEnv(**BALL_VARYING_LAUNCH)
     states = env._initial_state(20_000)
     np.testing.assert_allclose(states[:, [1, 3]].min(axis=0), [7.0, -5.0], atol=0.01)
     np.testing.assert_allclose(states[:, [1, 3]].max(axis=0), [9.0, -4.0], atol=0.01)
@@ -161,7 +157,7 @@ def test_the_renderer_changes_neither_states_nor_costs():
     controls = np.random.default_rng(0).normal(size=25)
     for keywords in ({}, dict(pixel_noise_std=0.1)):
         states, _, costs = run_episode(BallCatchEnv(renderer="pybullet", **keywords), controls)
-        fast_states, _, fast_costs = run_episode(BallCatchEnv(renderer="fast", **keywords), controls)
+        fast_states, _, fast_costs = run_episode(BallCatchEnv(**keywords), controls)
         np.testing.assert_array_equal(fast_states, states)
         np.testing.assert_array_equal(fast_costs, costs)
 
@@ -169,8 +165,8 @@ def test_the_renderer_changes_neither_states_nor_costs():
 # -- perturbations -------------------------------------------------------------------------------------------
 
 VECTORISE = {
-    "DummyVecEnv": lambda **kwargs: DummyVecEnv([lambda: fast_env(**kwargs)]),
-    "BatchedVecEnv": lambda **kwargs: BatchedVecEnv(fast_env(**kwargs), 1),
+    "DummyVecEnv": lambda **kwargs: DummyVecEnv([lambda: BallCatchEnv(**kwargs)]),
+    "BatchedVecEnv": lambda **kwargs: BatchedVecEnv(BallCatchEnv(**kwargs), 1),
 }
 
 
@@ -197,8 +193,8 @@ def test_a_perturbation_reaches_the_image_in_every_episode_and_never_the_true_st
 
 
 def test_pixel_noise_has_the_standard_deviation_that_was_asked_for():
-    clean = fast_env(robot_range=(0, 0), texture=np.full((4, 4, 3), 128, np.uint8)).reset(seed=0)[0]
-    env = fast_env(
+    clean = BallCatchEnv(robot_range=(0, 0), texture=np.full((4, 4, 3), 128, np.uint8)).reset(seed=0)[0]
+    env = BallCatchEnv(
         robot_range=(0, 0), texture=np.full((4, 4, 3), 128, np.uint8), pixel_noise_std=0.05, noise_mode="clip"
     )
     difference = (env.reset(seed=0)[0].astype(float) - clean) / 255
@@ -208,13 +204,13 @@ def test_pixel_noise_has_the_standard_deviation_that_was_asked_for():
 
 def test_minmax_spreads_each_image_over_the_whole_range_and_clip_leaves_its_contrast():
     images = {
-        mode: BatchedVecEnv(fast_env(pixel_noise_std=0.25, noise_mode=mode), 5).reset().astype(float)
+        mode: BatchedVecEnv(BallCatchEnv(pixel_noise_std=0.25, noise_mode=mode), 5).reset().astype(float)
         for mode in ("minmax", "clip")
     }
     for image in images["minmax"]:
         assert (image.min(), image.max()) == (0, 255)
         assert ((image == 0) | (image == 255)).sum() < 10
-    clean = BatchedVecEnv(fast_env(), 5).reset().astype(float)
+    clean = BatchedVecEnv(BallCatchEnv(), 5).reset().astype(float)
 
     def contrast(images):
         return (images[:, :, :3] - images[:, :, 30:40].mean(axis=2, keepdims=True)).mean()  # sky minus wall
@@ -281,8 +277,9 @@ def test_subprocesses_give_the_same_numbers_as_a_loop():
 
 def test_two_environments_in_one_process_do_not_disturb_each_other():
     controls = np.random.default_rng(0).normal(size=6)
-    _, alone, _ = run_episode(BallCatchEnv(), controls)
-    env, other = BallCatchEnv(), BallCatchEnv(texture="blue_tiles", ball_color=(1, 1, 0))
+    _, alone, _ = run_episode(BallCatchEnv(renderer="pybullet"), controls)
+    env = BallCatchEnv(renderer="pybullet")
+    other = BallCatchEnv(renderer="pybullet", texture="blue_tiles", ball_color=(1, 1, 0))
     assert env._renderer.client.client_id != other._renderer.client.client_id
     observation, _ = env.reset(seed=0)
     beside = [observation]
@@ -296,7 +293,7 @@ def test_two_environments_in_one_process_do_not_disturb_each_other():
 
 
 def test_closing_twice_is_fine_and_a_closed_environment_says_so():
-    env = BallCatchEnv(render_mode="rgb_array")
+    env = BallCatchEnv(renderer="pybullet", render_mode="rgb_array")
     env.reset(seed=0)
     env.render()
     env.close()
@@ -306,16 +303,16 @@ def test_closing_twice_is_fine_and_a_closed_environment_says_so():
 
 
 def test_bullet_clients_are_given_back():
-    first = BallCatchEnv()._renderer.client.client_id  # collected at once
+    first = BallCatchEnv(renderer="pybullet")._renderer.client.client_id  # collected at once
     for _ in range(30):
-        env = BallCatchEnv()
+        env = BallCatchEnv(renderer="pybullet")
         env.close()
-    assert BallCatchEnv()._renderer.client.client_id == first
+    assert BallCatchEnv(renderer="pybullet")._renderer.client.client_id == first
 
 
 def test_thousands_of_resets_leak_neither_memory_nor_clients():
     resource = pytest.importorskip("resource")
-    env = BallCatchEnv()
+    env = BallCatchEnv(renderer="pybullet")
     bodies = env._renderer.client.getNumBodies()
     for _ in range(200):
         env.reset()
@@ -327,7 +324,7 @@ def test_thousands_of_resets_leak_neither_memory_nor_clients():
 
 
 def test_rendering_shows_the_scene_beside_the_camera_image_and_does_not_disturb_the_episode():
-    noisy = dict(pixel_noise_std=0.1, renderer="fast")
+    noisy = dict(pixel_noise_std=0.1)
     env, undisturbed = BallCatchEnv(render_mode="rgb_array", **noisy), BallCatchEnv(**noisy)
     for each in (env, undisturbed):
         each.reset(seed=0)
@@ -350,11 +347,11 @@ def test_the_camera_image_in_the_picture_is_the_observation():
 
 
 def test_without_a_render_mode_nothing_is_rendered_and_before_a_reset_there_is_nothing():
-    env = fast_env()
+    env = BallCatchEnv()
     env.reset(seed=0)
     assert env.render() is None
     with pytest.raises(ValueError, match="before the first reset"):
-        fast_env(render_mode="rgb_array").render()
+        BallCatchEnv(render_mode="rgb_array").render()
 
 
 def test_a_window_without_a_display_is_refused_with_the_mend(monkeypatch):
@@ -419,7 +416,10 @@ def test_with_a_wall_at_rest_only_the_ball_tells_where_the_robot_is(renderer):
 
 
 def test_processes_draw_the_same_images_and_end_with_the_environment():
-    alone, shared = (make_episodes_env("BallCatch-v0", 5, env_kwargs=dict(n_processes=n), seed=0) for n in (1, 2))
+    alone, shared = (
+        make_episodes_env("BallCatch-v0", 5, env_kwargs=dict(renderer="pybullet", n_processes=n), seed=0)
+        for n in (1, 2)
+    )
     np.testing.assert_array_equal(alone.reset(), shared.reset())
     for _ in range(2):
         np.testing.assert_array_equal(alone.step(np.ones((5, 1)))[0], shared.step(np.ones((5, 1)))[0])
@@ -431,6 +431,6 @@ def test_processes_draw_the_same_images_and_end_with_the_environment():
 
 
 def test_the_ray_caster_needs_no_processes():
-    assert BallCatchEnv(renderer="fast", n_processes=4).n_processes == 1
+    assert BallCatchEnv(n_processes=4).n_processes == 1
     with pytest.raises(ValueError, match="n_processes=0 must be"):
         BallCatchEnv(n_processes=0)

@@ -155,7 +155,7 @@ def settings_of(method):
 def test_a_method_differs_from_the_one_line_in_what_its_name_says(launch):
     tdpg, *others = ball.methods(launch)
     one_line = settings_of(tdpg)
-    assert one_line == {**load_hyperparams("BallCatch-v0"), "env_kwargs": {"renderer": "fast", **ball.LAUNCHES[launch]}}
+    assert one_line == {**load_hyperparams("BallCatch-v0"), "env_kwargs": ball.LAUNCHES[launch]}
     changed = {
         method.label: {key for key in settings_of(method) if settings_of(method)[key] != one_line.get(key)}
         for method in others
