@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_tdpg.common.files import kept_by_this_process
+from sb3_tdpg.common.trust import refuse_links, say_what_is_trusted
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -85,6 +86,7 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
 def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
     from sb3_tdpg.evaluation.enjoy import enjoy
 
+    say_what_is_trusted(model)
     enjoy(model, env, parse_keywords(env_kwargs), **options)
 
 
@@ -114,6 +116,7 @@ def _certify(
     from sb3_tdpg.certificates.lava import certify_lava
     from sb3_tdpg.certificates.nuisance import certify_nuisance
 
+    say_what_is_trusted(*models)
     if nuisance is not None:
         if options.pop("n_random_shifts"):
             raise ValueError("--random-shifts are those of Lava's sensor and start: leave them or --nuisance out")
@@ -142,14 +145,17 @@ def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Pat
 
     out = out or Path("results", f"report-{env.rpartition(':')[2]}")
     options["jobs"] = options["jobs"] or usable_cores()
+    methods = parse_models(models, env)
+    say_what_is_trusted(*(path for of_method in methods.values() for path in of_method))
     with kept_by_this_process(out):
-        robustness_report(parse_models(models, env), env, env_kwargs=parse_keywords(env_kwargs), out=out, **options)
+        robustness_report(methods, env, env_kwargs=parse_keywords(env_kwargs), out=out, **options)
     print(f"the report is {out / 'report.html'} (Markdown: {out / 'report.md'})")
 
 
 def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_episodes: int) -> None:
     from sb3_tdpg.hub import push_to_hub, write_model_card
 
+    refuse_links(folder)
     if not (folder / "README.md").exists():
         named = Path(os.path.abspath(folder))  # "." has no name
         card = card or named.with_name(f"{named.name}-hub")
@@ -218,11 +224,20 @@ def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
     return program in ZOO_PROGRAMS or (program == "enjoy" and not any(a.endswith(".zip") for a in arguments))
 
 
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
-    return value
+def _integer(least: int) -> Callable[[str], int]:
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{text} must be an integer of at least {least}")
+        return value
+
+    return read
+
+
+_positive = _integer(1)
 
 
 KEYWORDS: dict[str, Any] = dict(nargs="+", action="extend", default=[], metavar="KEY=VALUE")

@@ -3,11 +3,12 @@
 import contextlib
 import copy
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
@@ -35,6 +36,19 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
     if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
         env = VecTransposeImage(env)  # as SB3 wraps the environment that it trains on
     return env
+
+
+def load_statistics(path: Path, env: VecEnv) -> VecNormalize:
+    """
+    Normalise an environment as in a training, with the statistics that ``VecNormalize.save`` wrote.
+
+    :raises ValueError: if the file is damaged.
+    """
+    try:
+        return VecNormalize.load(str(path), env)
+    except Exception as e:  # damaged bytes lead to any error
+        reason = " ".join(str(e).split())[:200]
+        raise ValueError(f"{path} cannot be loaded ({reason}): it must be what VecNormalize.save() wrote") from e
 
 
 def check_models_fit(models: Mapping[str, Any], scenarios: Sequence[Scenario]) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_tdpg.common.trust import plain_name, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.experiments.runs import Run, complete_run
 
@@ -45,7 +46,7 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
         run = _RecordedRun(
             **{name: content[name] for name in ("method", "env_id", "block", "seed", "max_attempts")},
             overrides=with_numbers(content["settings"]),
-            start=None if start is None else config.parent / start,
+            start=None if start is None else config.parent / plain_name(start, f"start of {config}"),
         )
     except (OSError, KeyError, TypeError, json.JSONDecodeError) as e:
         raise ValueError(f"{config} does not describe a run ({e!r}): give the config.json of a run's folder") from e
@@ -54,6 +55,8 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
             f"the run started from the policy {content['start_policy']}, and {config.parent / start / 'model.zip'} is "
             f"{run.config['start_policy']}: put the run's own there"
         )
+    if run.start is not None:
+        say_what_is_trusted(run.start)
     return complete_run(run, Path(out), scenarios, n_eval_episodes=n_eval_episodes, progress_bar=progress_bar)
 
 

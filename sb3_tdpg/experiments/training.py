@@ -5,7 +5,7 @@ from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.tdpg import TDPG
@@ -39,7 +39,7 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     """
     settings = {**block, **overrides}
     n_timesteps = int(settings.pop("n_timesteps"))
-    callbacks: list[BaseCallback] = [_make(entry) for entry in settings.pop("callback", [])]
+    callbacks: list[BaseCallback] = [_make(BaseCallback, entry) for entry in settings.pop("callback", [])]
     env = take_env(env_id, settings)
     return Training(TDPG(settings.pop("policy"), env, **settings), callbacks, n_timesteps)
 
@@ -59,14 +59,17 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
         use_processes=False,  # runs are made side by side in processes of their own
     )
     for entry in settings.pop("vec_env_wrapper", []):
-        env = _make(entry, env)
+        env = _make(VecEnvWrapper, entry, env)
     normalize = settings.pop("normalize", None)
     return env if normalize is None else VecNormalize(env, **{**normalize, "gamma": settings.get("gamma", 0.99)})
 
 
-def _make(entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:
+def _make(kind: type, entry: str | Mapping[str, Mapping[str, Any]], *arguments: Any) -> Any:
     """Make a callback or a wrapper from ``{"package.module.Class": {keywords}}`` or ``"package.module.Class"``."""
     (path, keywords), *more = [(entry, {})] if isinstance(entry, str) else entry.items()
     if more:
         raise ValueError(f"a callback or a wrapper is one class with its keywords, not {entry}")
-    return resolve_name(path)(*arguments, **keywords)
+    cls = resolve_name(path)
+    if not (isinstance(cls, type) and issubclass(cls, kind)):  # settings may be another's: call no function
+        raise ValueError(f"{path} is not a subclass of {kind.__name__}")
+    return cls(*arguments, **keywords)

@@ -14,11 +14,12 @@ import pandas as pd
 import yaml
 from pandas.errors import EmptyDataError
 from stable_baselines3.common.monitor import get_monitor_files, load_results
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg.common.provenance import as_typed, jsonable
+from sb3_tdpg.common.trust import PlainLoader, plain_name, refuse_links, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.evaluation.environments import load_statistics
 from sb3_tdpg.experiments.rerun import scenarios_of, with_numbers
 from sb3_tdpg.experiments.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
@@ -77,8 +78,12 @@ def plain(value: Any) -> Any:
 
 def read_publication(folder: Path, **evaluation: Any) -> Publication:
     """Read the folder of a run (:func:`read_run`) or of rl-zoo3 (:func:`read_zoo_folder`), which is evaluated."""
+    refuse_links(folder)
     if (folder / "config.json").exists():
-        return read_run(folder)
+        try:
+            return read_run(folder)
+        except (AttributeError, KeyError, TypeError, json.JSONDecodeError) as e:
+            raise ValueError(f"{folder / 'config.json'} does not describe a run ({e!r}): give a run's folder") from e
     if next(folder.glob("*/args.yml"), None) is not None:
         return read_zoo_folder(folder, **evaluation)
     raise ValueError(
@@ -95,13 +100,15 @@ def read_run(folder: Path) -> Publication:
             "started it, or give the folder of one run"
         )
     config = json.loads((folder / "config.json").read_text())
-    settings, records = with_numbers(config["settings"]), _whole_records(folder / "episodes.csv", config)
+    settings, records = dict(with_numbers(config["settings"])), _whole_records(folder / "episodes.csv", config)
     files = {name: folder / name for name in ("config.json", "episodes.csv", "selected.json")}
     notes = [_selection_note(folder, settings)]
     if (attempts := int(records["attempts"].iloc[0])) > 1:
         notes.append(f"It comes from attempt {attempts} of at most {config['max_attempts']}, each with another seed.")
     start = config.get("start")
     if start is not None:
+        start = plain_name(start, f"start of {folder / 'config.json'}")
+        refuse_links(folder.parent / start)
         notes.append(f"The training started from the policy of another run, {start}.")
         files[f"{start}/model.zip"] = folder.parent / start / "model.zip"
     # A run of an early version lacks its scenarios, and the policy that it started from may be gone.
@@ -158,10 +165,13 @@ def read_zoo_folder(
     if not (is_last := model_path.exists()) and not (model_path := folder / "best_model.zip").exists():
         raise ValueError(f"{folder} has neither {inner.name}.zip nor best_model.zip: let the training end first")
     args, settings = (_read_plain(inner / name) for name in ("args.yml", "config.yml"))
+    if missing := {"env", "seed"} - set(args):
+        raise ValueError(f"{inner / 'args.yml'} lacks {', '.join(sorted(missing))}: give a folder that rl-zoo3 wrote")
     env_kwargs = settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
+    say_what_is_trusted(folder)
     env_id, env = str(args["env"]), None
     if (inner / "vecnormalize.pkl").exists():
-        env = VecNormalize.load(str(inner / "vecnormalize.pkl"), make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
+        env = load_statistics(inner / "vecnormalize.pkl", make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
     model = TDPG.load(model_path, env=env, device="cpu")
     rows = PAPER_ROWS.get(env_id, [Scenario("Training", env_id)]) if scenarios is None else scenarios
     options: Any = dict(seed=seed, env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))
@@ -199,24 +209,10 @@ def read_zoo_folder(
     )
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """Reads the two Python types that rl-zoo3 writes, and runs nothing."""
-
-
-for _tag, _construct in (
-    ("object/apply:collections.OrderedDict", lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0])),
-    ("tuple", lambda loader, node: loader.construct_sequence(node, deep=True)),
-):
-    _PlainLoader.add_constructor(f"tag:yaml.org,2002:python/{_tag}", _construct)
-
-
 def _read_plain(path: Path) -> dict[str, Any]:
     """Read a file of rl-zoo3 as plain data."""
-    try:
-        return dict(yaml.load(path.read_text(), _PlainLoader))
-    except (yaml.YAMLError, TypeError, ValueError) as e:
-        reason = " ".join(str(e).split())
-        raise ValueError(f"{path} is not plain data that rl-zoo3 wrote, and is not read: {reason}") from e
+    with path.open() as file:
+        return dict(yaml.load(file, PlainLoader))
 
 
 def _typed_command(command: str) -> str | None:

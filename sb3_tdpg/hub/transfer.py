@@ -14,10 +14,12 @@ import huggingface_hub
 import pandas as pd
 import yaml
 from huggingface_hub.errors import HTTPError, LocalTokenNotFoundError
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.provenance import write_frame_atomically, write_run_config
+from sb3_tdpg.common.trust import refuse_links, say_what_is_trusted
 from sb3_tdpg.evaluation import save_figure, training_curves
 from sb3_tdpg.evaluation.enjoy import enjoy
 from sb3_tdpg.hub.model_card import ALGORITHM, model_card, model_name, results_with_intervals
@@ -52,6 +54,8 @@ def write_model_card(
     :raises ValueError: if ``out`` is not empty, the source is not finished, or the records are not of one policy with
         two or more episodes of each scenario.
     """
+    if film_episodes < 0:
+        raise ValueError(f"film_episodes={film_episodes} must be at least 0: the episodes in replay.mp4")
     out = _empty(out)
     publication = source if isinstance(source, Publication) else read_publication(Path(source), **evaluation)
     results = results_with_intervals(publication.records)
@@ -61,7 +65,7 @@ def write_model_card(
         if isinstance(publication.model, TDPG):
             publication.model.save(model_path)
         else:
-            TDPG.load(publication.model, device="cpu")  # refuses a damaged file
+            _check_model(publication.model)
             shutil.copyfile(publication.model, model_path)
         _write_records(publication, results, folder)
         if publication.progress is not None:
@@ -70,6 +74,8 @@ def write_model_card(
                 figure.axes[1].set_axis_off()  # it has no curve
             save_figure(figure, folder / "training.png")
         if film_episodes:
+            if isinstance(publication.model, Path):
+                say_what_is_trusted(publication.model)
             video = folder / "replay.mp4"
             enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=video)
         pictures = [path.name for path in folder.iterdir()]
@@ -101,6 +107,7 @@ def push_to_hub(
     folder = Path(folder)
     if not (folder / "README.md").exists():
         raise ValueError(f"{folder} has no README.md: let write_model_card write the folder first")
+    refuse_links(folder)
     api = huggingface_hub.HfApi(token=token, **LIBRARY)
     with _one_line_errors(repo_id, "written", f"; {folder} can be pushed again"):
         url = api.create_repo(repo_id, private=private, exist_ok=True)
@@ -176,6 +183,15 @@ def _empty(out: str | os.PathLike[str]) -> Path:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ValueError(f"{out} exists already: choose another folder, or remove it")
     return out
+
+
+def _check_model(path: Path) -> None:
+    """Refuse a damaged file, and unpickle nothing."""
+    try:
+        load_from_zip_file(path, device="cpu", load_data=False)[1]["policy"]
+    except Exception as e:  # damaged bytes lead to any error
+        reason = " ".join(str(e).split())[:200]
+        raise ValueError(f"{path} is not a model: the file is damaged, or another program made it ({reason})") from e
 
 
 def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -> None:

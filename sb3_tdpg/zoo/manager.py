@@ -24,12 +24,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from sb3_tdpg import hyperparams as yaml_files
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
 from sb3_tdpg.common.provenance import write_run_config
+from sb3_tdpg.common.trust import check_plain
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import batched_class, largest_divisor, make_episodes_env
 
 CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
 # A checkpoint resets the environments: rare enough not to matter, frequent enough to lose little.
 CHECKPOINT_EPOCHS = 10
+# Keys whose text the zoo evaluates.
+EVALUATED = {"monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
 # Keys that the zoo itself reads; all others are arguments of the algorithm.
 ZOO_KEYS = (
     "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps", "noise_std",
@@ -140,6 +143,10 @@ class TDPGExperimentManager(ExperimentManager):
         finally:
             self.env_name = env_name
         check_block(hyperparams, self.algo, f"block {block} of {self.config}")
+        if self.resume is not None:
+            for key in EVALUATED & set(hyperparams):
+                if isinstance(text := hyperparams[key], str):
+                    check_plain(text, f"{self.resume} was trained with {key}:")
         return hyperparams, saved
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import rl_zoo3.train
+import yaml
 from rl_zoo3.utils import StoreDict
 
+from sb3_tdpg.common.trust import PlainLoader, check_plain, say_what_is_trusted
 from sb3_tdpg.zoo.manager import CHECKPOINT, RECORD, TDPGExperimentManager, register
 
 # The information cannot be measured with five episodes, the zoo's default.
@@ -56,13 +58,24 @@ def run(program: str, arguments: Sequence[str]) -> None:
             _watch(program.replace("-", "_"), given, flags)
         else:
             dict(train=_train, tune=_tune, plot=_plot)[program](given, flags)
-    except AssertionError as e:  # the zoo refuses bad input with these
+    except (AssertionError, yaml.YAMLError) as e:  # the zoo refuses bad input with these
         raise ValueError(" ".join(str(e).split())) from e
     finally:
         sys.argv = argv
 
 
-def _split(program: str, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+class _PlainDict(StoreDict):
+    """Reads ``key:value``; the zoo evaluates the value, so it must be plain data."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        for text in values:
+            check_plain(text.partition(":")[2], f"{RECORD} has {option_string} {text.partition(':')[0]}:")
+        super().__call__(parser, namespace, values, option_string)
+
+
+def _split(
+    program: str, arguments: Sequence[str], keywords: type[StoreDict] = StoreDict
+) -> tuple[argparse.Namespace, list[str]]:
     """Return the values of our flags, and the remaining flags, which are the zoo's."""
     ours = argparse.ArgumentParser(f"sb3-tdpg {program}", add_help=False, allow_abbrev=False)
     for flag, options in FLAGS.get(program, {}).items():
@@ -74,8 +87,9 @@ def _split(program: str, arguments: Sequence[str]) -> tuple[argparse.Namespace, 
     shared = argparse.ArgumentParser(ours.prog, add_help=False, allow_abbrev=False)
     shared.add_argument("--algo", default="tdpg")
     shared.add_argument("-n", "--n-timesteps", type=int)
+    shared.add_argument("-f", "--folder", default="logs")
     for names in (["--env-kwargs"], ["--eval-env-kwargs"], ["-params", "--hyperparams"]):
-        shared.add_argument(*names, nargs="+", action=StoreDict)
+        shared.add_argument(*names, nargs="+", action=keywords)
     try:
         shared.parse_known_args(flags, given)
         if given.n_timesteps is not None and given.n_timesteps < 1:
@@ -89,9 +103,12 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
     if given.algo == "tdpg" and {"-optimize", "--optimize-hyperparameters"} & set(flags):
         raise ValueError("train does not tune TDPG: use `sb3-tdpg tune` with the same flags, but without -optimize")
     folder, seed = given.resume, []
+    rl_zoo3.train.StoreDict = StoreDict if folder is None else _PlainDict  # type: ignore[misc]
+    say_what_is_trusted(*(flag for flag in flags if flag.endswith(".zip")))  # of -i
     if folder is not None:
         record = _read_record(folder, bool(flags or given.block))
-        given, flags = _split("train", record["arguments"])
+        say_what_is_trusted(folder)
+        given, flags = _split("train", record["arguments"], _PlainDict)
         seed = ["--seed", str(record["seed"])]  # it was drawn if none was given
     typed = ["--block", given.block, *flags] if given.block else flags
 
@@ -114,9 +131,12 @@ def _read_record(folder: Path, has_flags: bool) -> dict[str, Any]:
     """Return how the training in a folder was started, if it can be resumed."""
     if not (folder / RECORD).exists():
         raise ValueError(f"--resume {folder} is not the folder of a training: it has no {RECORD}")
-    record: dict[str, Any] = json.loads((folder / RECORD).read_text())
-    if not {"arguments", "seed"} <= set(record):
-        raise ValueError(f"{folder / RECORD} does not say how its training was started: train anew")
+    try:
+        record: dict[str, Any] = dict(json.loads((folder / RECORD).read_text()))
+        record["arguments"] = [str(argument) for argument in record["arguments"]]
+        record["seed"] = int(record["seed"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise ValueError(f"{folder / RECORD} does not say how its training was started ({e!r}): train anew") from e
     if has_flags:
         raise ValueError(
             f"{folder} was started with `{' '.join(record['arguments'])}`, and other flags cannot change it: give "
@@ -142,8 +162,15 @@ def _tune(given: argparse.Namespace, flags: list[str]) -> None:
 def _watch(program: str, given: argparse.Namespace, flags: list[str]) -> None:
     """Find models where ``train`` saves them, and let TDPG act with the stochastic policy that it trained."""
     is_stochastic = given.algo == "tdpg" and "--deterministic" not in flags
+    say_what_is_trusted(given.folder)
     sys.argv += ["--algo", "tdpg", "-f", "logs", *(["--stochastic"] if is_stochastic else []), *flags]
-    runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
+    unsafe, yaml.UnsafeLoader = yaml.UnsafeLoader, PlainLoader  # the zoo's would run what a file says
+    try:
+        runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
+    except (EOFError, pickle.UnpicklingError) as e:
+        raise ValueError(f"a vecnormalize.pkl in {given.folder} is damaged ({e}): choose another training") from e
+    finally:
+        yaml.UnsafeLoader = unsafe
 
 
 def _plot(given: argparse.Namespace, flags: list[str]) -> None:
@@ -154,6 +181,8 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
     if given.save is not None:
         plt.switch_backend("agg")  # the plots end with plt.show(), which does nothing here
         warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
+    if given.kind == "from-file":
+        say_what_is_trusted(*(flag for flag in flags if Path(flag).is_file()))
     try:
         {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
     except (pickle.UnpicklingError, EOFError, LookupError, TypeError) as e:

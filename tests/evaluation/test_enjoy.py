@@ -99,7 +99,7 @@ def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(lava, cap
     printed = []
     for arguments in (["--seed", "1"], ["--seed", "1", "--n-episodes", "2"], ["--seed", "2"]):
         main(["enjoy", str(lava), "--env", "Lava-v0", *arguments])
-        printed.append(capsys.readouterr().out.splitlines()[0])
+        printed.append(capsys.readouterr().out.splitlines()[1])
     assert printed[0] == printed[1] != printed[2]
 
 

@@ -20,7 +20,7 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.rerun import rerun
-from sb3_tdpg.hub import pull_from_hub, write_model_card
+from sb3_tdpg.hub import pull_from_hub, push_to_hub, write_model_card
 from sb3_tdpg.hub.model_card import model_card, results_with_intervals
 from sb3_tdpg.hub.publication import Publication, read_run
 
@@ -217,3 +217,50 @@ def test_a_folder_that_is_not_empty_is_left_alone(card, runs, tmp_path):
         with pytest.raises(ValueError, match="exists already: choose another folder, or remove it"):
             refused()
     assert {path: path.read_bytes() for path in card.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "3", "{", '{"settings": 3}'])
+def test_a_record_that_describes_no_run_is_told_in_a_line(content, runs, tmp_path, capsys):
+    copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
+    (copy / "config.json").write_text(content)
+    assert main(["push", str(copy), "--repo-id", REPO_ID, "--dry-run", "--card", str(tmp_path / "card")]) == 2
+    message = capsys.readouterr().err.strip()
+    assert re.search(r"config\.json does not describe a run \(.*\): give a run's folder", message)
+    assert "\n" not in message
+    assert not (tmp_path / "card").exists()
+
+
+def test_a_negative_number_of_filmed_episodes_is_refused(runs, tmp_path):
+    with pytest.raises(ValueError, match="film_episodes=-1 must be at least 0"):
+        write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=-1)
+
+
+@pytest.mark.parametrize("start", ["../../evil", "/tmp", "..", 3])
+def test_a_start_that_leads_out_of_the_folder_is_refused(start, runs, tmp_path):
+    copy = shutil.copytree(runs / "tdpg-seed0", tmp_path / "runs" / "run")
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**config, "start": start}))
+    for refused in (
+        lambda: write_model_card(copy, tmp_path / "cards" / "card", REPO_ID),
+        lambda: rerun(copy / "config.json", tmp_path / "cards" / "again"),
+    ):
+        with pytest.raises(ValueError, match=r"start of .*config\.json is .*, without a path"):
+            refused()
+    assert not (tmp_path / "cards").exists()
+
+
+def test_a_symbolic_link_is_never_published(runs, card, tmp_path, capsys):
+    copy, ready = shutil.copytree(runs / "pg-seed0", tmp_path / "run"), shutil.copytree(card, tmp_path / "ready")
+    (copy / "progress_9.csv").symlink_to("/etc/hostname")
+    (ready / "secret").symlink_to("/etc/hostname")
+    for folder in (copy, ready):
+        assert main(["push", str(folder), "--repo-id", REPO_ID, "--dry-run", "--card", str(tmp_path / "card")]) == 2
+        assert "is a symbolic link" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="ready/secret is a symbolic link"):
+        push_to_hub(ready, REPO_ID)
+    assert not (tmp_path / "card").exists()
+
+
+def test_the_card_of_a_run_is_written_without_unpickling_its_model(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_tdpg.TDPG.load", lambda *args, **kwargs: pytest.fail("it unpickles the model"))
+    write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)

@@ -1,5 +1,6 @@
 """Repeat a published run with the command in its card."""
 
+import json
 import os
 import shlex
 import shutil
@@ -47,3 +48,13 @@ def test_a_rerun_without_the_policy_that_the_run_started_from_is_refused(card, r
     with pytest.raises(ValueError, match=r"nothing.json does not describe a run"):
         rerun(tmp_path / "nothing.json", tmp_path / "again")
     assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize("key", ["callback", "vec_env_wrapper"])
+def test_a_record_that_names_a_function_instead_of_a_class_runs_nothing(key, runs, tmp_path):
+    config, marker = json.loads((runs / "pg-seed0" / "config.json").read_text()), tmp_path / "marker"
+    config["settings"][key] = [{"os.system": {"command": f"touch {marker}"}}]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"os\.system is not a subclass of"):
+        rerun(tmp_path / "config.json", tmp_path / "again", progress_bar=False)
+    assert not marker.exists()

@@ -1,0 +1,88 @@
+"""
+Read the files of others: plain data where a file allows it, and a word of warning where only pickle can read it.
+
+docs/guide/trust.md says which command trusts which file.
+"""
+
+import ast
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+# Numbers with arithmetic as in 1/75, text, lists, dict(...), float("inf"), and the layers of torch.nn by name.
+_PLAIN_NODES = (
+    ast.Expression, ast.Constant, ast.Tuple, ast.List, ast.Dict, ast.UnaryOp, ast.USub, ast.BinOp, ast.Add, ast.Sub,
+    ast.Mult, ast.Div, ast.Load, ast.keyword,
+)  # fmt: skip
+
+
+def say_what_is_trusted(*paths: str | os.PathLike[str]) -> None:
+    """Say that loading the models in these files or folders can run code, before they are loaded."""
+    if not paths:
+        return
+    names = ", ".join(os.fspath(path) for path in paths[:3]) + f" and {len(paths) - 3} more" * (len(paths) > 3)
+    print(f"trusting whoever wrote {names}: loading a model unpickles it, which can run any code", flush=True)
+
+
+class PlainLoader(yaml.SafeLoader):
+    """Reads plain YAML and the two Python types that rl-zoo3 writes, and runs nothing."""
+
+    def get_single_data(self) -> Any:
+        """Return the only document, which has to be a mapping."""
+        try:
+            data = super().get_single_data()
+            if not isinstance(data, dict):
+                raise TypeError(f"expected a mapping, found {type(data).__name__}")
+        except (yaml.YAMLError, LookupError, TypeError, ValueError) as e:
+            reason = " ".join(str(e).split())
+            raise ValueError(f"{self.name} is not plain data that rl-zoo3 wrote, and is not read: {reason}") from e
+        if isinstance(normalize := data.get("normalize"), str):
+            check_plain(normalize, f"{self.name} has normalize:")  # the zoo evaluates it
+        return data
+
+
+for _tag, _construct in (
+    ("object/apply:collections.OrderedDict", lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0])),
+    ("tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True))),
+):
+    PlainLoader.add_constructor(f"tag:yaml.org,2002:python/{_tag}", _construct)
+
+
+def check_plain(text: str, where: str) -> None:
+    """
+    Refuse text in Python's notation that is more than plain data, before anyone evaluates it.
+
+    :param where: Begins the message: ``"run.json has -params"``.
+    :raises ValueError: if it calls or names anything else.
+    """
+    try:
+        nodes: Iterable[ast.AST] = ast.walk(ast.parse(text.strip(), mode="eval"))
+        is_plain = all(map(_is_plain, nodes))
+    except (SyntaxError, ValueError, RecursionError):
+        is_plain = False
+    if not is_plain:
+        raise ValueError(f"{where} {text}, which is not plain data and is not evaluated: write numbers, text or lists")
+
+
+def _is_plain(node: ast.AST) -> bool:
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Name)
+    if isinstance(node, ast.Attribute):
+        return isinstance(node.value, ast.Name) and node.value.id == "nn" and node.attr[0] != "_"
+    return isinstance(node, _PLAIN_NODES) or (isinstance(node, ast.Name) and node.id in ("dict", "float", "nn"))
+
+
+def plain_name(name: Any, where: str) -> str:
+    """Return the name of a file or a folder; a path, which could lead elsewhere, is refused."""
+    if not isinstance(name, str) or name in ("", ".", "..") or {"/", "\\", ":", "\0"} & set(name):
+        raise ValueError(f"{where} is {name!r}, which must be the name of a folder, without a path")
+    return name
+
+
+def refuse_links(folder: Path) -> None:
+    """Raise a ``ValueError`` if there is a symbolic link in a folder, since it could publish any file."""
+    if link := next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None):
+        raise ValueError(f"{link} is a symbolic link, which is not followed: put a copy of the file there")
