@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import io
 import os
-import pickle
 import sys
+import traceback
 import warnings
 from abc import abstractmethod
 from collections.abc import Collection, Iterable
@@ -178,7 +178,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
         Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
         would favour short ones. With ``epoch_steps`` an environment begins another episode as long as there are fewer
-        steps. All environments begin an epoch at t = 0.
+        steps; the last epoch of ``learn`` takes those that are left, but a tenth of an epoch at least. All environments
+        begin an epoch at t = 0.
 
         :param env: The training environments.
         :param callback: Called at each step, and at the beginning and the end.
@@ -196,6 +197,9 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
         n_envs = env.num_envs
+        size = self.epoch_size
+        if self.epoch > 0:  # fewer steps than a tenth of an epoch would make an update of noise
+            size = min(size, max(self.remaining_timesteps, size // 10))
         obs: Any = self._last_obs
         states = self._problem.initial_states(env, obs)  # (E, X)
         trvs = th.zeros(n_envs, self.policy.trv_dim, device=self.device)
@@ -256,7 +260,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 finished = dones & ~lost
             for i in np.flatnonzero(finished & (column >= 0)):
                 if self.n_episodes is None:
-                    column[i], n_columns = (n_columns, n_columns + 1) if n_stored < self.epoch_size else (-1, n_columns)
+                    column[i], n_columns = (n_columns, n_columns + 1) if n_stored < size else (-1, n_columns)
                 else:
                     column[i] = column[i] + n_envs if column[i] + n_envs < self.n_episodes else -1
             if (t[column >= 0] >= self.horizon).any():
@@ -382,9 +386,13 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 kwargs.setdefault(other, None)
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except (AssertionError, pickle.UnpicklingError) as e:
-            # "No data found in the saved file", "No params found ..."
-            if isinstance(e, AssertionError) and not str(e).startswith("No "):
+        except Exception as e:
+            # Damaged bytes lead to any error, but the arguments of this call to none while the file is read.
+            names = [frame.f_code.co_name for frame, _ in traceback.walk_tb(e.__traceback__)]
+            is_read = "load_from_zip_file" in names or ("set_parameters" in names and not kwargs)
+            # What SB3 itself finds missing: "No data found in the saved file", and keys of the data.
+            is_lacking = names[-1] == "load" and isinstance(e, (AssertionError, KeyError))
+            if isinstance(e, OSError) or not (is_read or is_lacking):
                 raise
             raise ValueError(
                 f"{path} is not a model of TDPG: the file is damaged, or another program made it "

@@ -16,6 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback, TRVPolicy
+from sb3_tdpg.cli import main
 from sb3_tdpg.envs.lava import LavaEnv
 
 IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
@@ -232,6 +233,65 @@ def text(path):
 def empty_archive(path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("readme.txt", "something else")
+
+
+def rewritten(change):
+    """Return a function that saves a model in which ``change(name, content)`` replaces each part; ``None`` drops it."""
+
+    def write(path):
+        tiny_tdpg().save(path)
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: change(name, archive.read(name)) for name in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in parts.items():
+                if content is not None:
+                    archive.writestr(name, content)
+
+    return write
+
+
+def part(wanted, content):
+    return rewritten(lambda name, old: content if name == wanted else old)
+
+
+DAMAGED = {
+    "half": corrupt,
+    "text": text,
+    "empty": lambda path: path.write_bytes(b""),
+    "no weights": part("policy.pth", None),
+    "half of the weights": rewritten(lambda name, old: old[: len(old) // 2] if name == "policy.pth" else old),
+    "no settings": part("data", None),
+    "settings that are no JSON": part("data", b"{]"),
+    "settings that are none": part("data", b"{}"),
+    "a list of settings": part("data", b"[]"),
+    "settings of another encoding": part("data", b"\xff"),
+    "damaged pickles": rewritten(
+        lambda name, old: re.sub(rb'(":serialized:": "[^"]{20})[^"]*', rb"\1", old) if name == "data" else old
+    ),
+}
+
+
+@pytest.mark.parametrize("write", DAMAGED.values(), ids=DAMAGED)
+def test_a_damaged_model_is_told_in_a_line_that_names_it(write, tmp_path, capsys):
+    path, out = tmp_path / "model.zip", tmp_path / "out"
+    write(path)
+    with pytest.raises(ValueError, match=r"model\.zip is not a model of TDPG: the file is damaged"):
+        TDPG.load(path, device="cpu")
+    for command in (
+        ["enjoy", str(path)],
+        ["certify", str(path), "--out", str(out)],
+        ["report", str(path), "--out", str(out)],
+    ):
+        assert main([*command, "--env", "Lava-v0"]) == 2
+        assert re.fullmatch(r"error: .*model\.zip .*\n", capsys.readouterr().err)
+        assert not out.exists()
+
+
+def test_an_argument_that_does_not_fit_is_not_taken_for_a_damaged_model(tmp_path):
+    tiny_tdpg().save(tmp_path / "model")
+    with pytest.raises(Exception) as error:
+        TDPG.load(tmp_path / "model", device="cpu", mi_estimator="mine")
+    assert "damaged" not in str(error.value)
 
 
 def saved_ppo(path):

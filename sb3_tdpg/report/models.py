@@ -4,7 +4,6 @@ import glob
 import hashlib
 import json
 import os
-import pickle
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -12,8 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecNormalize
-
+from sb3_tdpg.evaluation.environments import load_statistics
 from sb3_tdpg.vec_env import make_episodes_env
 
 # File names that any model may have: then the folder names the model.
@@ -114,8 +112,8 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            settings = json.loads(archive.read("data"))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+            settings = dict(json.loads(archive.read("data")))
+    except Exception as e:  # damaged bytes lead to any error
         raise ValueError(f"{path} cannot be read ({e}): give the .zip file that model.save() wrote") from e
     policy = settings.get("policy_class")
     module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
@@ -126,12 +124,15 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     package, name = known[0].split(":")
     try:
         model = getattr(import_module(package), name).load(path, device="cpu")
-    except (AttributeError, EOFError, ImportError, KeyError, RuntimeError, TypeError, pickle.UnpicklingError) as e:
-        raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {e}") from e
+    except Exception as e:
+        reason = " ".join(str(e).split())
+        if str(path) in reason:
+            raise ValueError(reason) from e
+        raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
     statistics = [path.parent / "vecnormalize.pkl", path.with_suffix("") / "vecnormalize.pkl"]
     if found := [each for each in statistics if each.is_file()]:
         env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
-        model.set_env(VecNormalize.load(str(found[0]), env))
+        model.set_env(load_statistics(found[0], env))
     return model
 
 
