@@ -82,7 +82,7 @@ def read_problem(env: VecEnv) -> Problem:
             f"TDPG needs a finite horizon, and the environment has none (horizon={horizon!r}): give it an integer "
             "attribute `horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
-    state_space = _attribute(env, "state_space")
+    state_space = attribute_of(env, "state_space")
     # POPGym's environments, which have this attribute, describe their state, too, but do not report it.
     is_observation = state_space is None or env.has_attr("observability_level")
     if is_observation and observation_kind(env.observation_space) != "vector":
@@ -98,17 +98,17 @@ def read_problem(env: VecEnv) -> Problem:
 
 def horizon_of(env: VecEnv | gym.Env) -> Any:
     """Return the horizon that an environment declares, or its time limit; ``None`` if it has neither."""
-    horizon = _attribute(env, "horizon")
+    horizon = attribute_of(env, "horizon")
     if horizon is None:
-        spec = _attribute(env, "spec")
+        spec = attribute_of(env, "spec")
         horizon = None if spec is None else spec.max_episode_steps
     # A TimeLimit that the user, or the function behind the id, has wrapped around it is not in the spec.
-    return _attribute(env, "_max_episode_steps") if horizon is None else horizon
+    return attribute_of(env, "_max_episode_steps") if horizon is None else horizon
 
 
 def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
     """Read the names of the components of the state, which are optional."""
-    names = _attribute(env, "state_names")
+    names = attribute_of(env, "state_names")
     if names is None:
         return tuple(f"x{k}" for k in range(state_dim))
     if isinstance(names, str) or len(names) != state_dim or len(set(names)) != state_dim:
@@ -119,7 +119,7 @@ def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
     return tuple(str(name) for name in names)
 
 
-def _attribute(env: VecEnv | gym.Env, name: str) -> Any:
+def attribute_of(env: VecEnv | gym.Env, name: str) -> Any:
     """Return an attribute of the first environment, or None."""
     if isinstance(env, gym.Env):
         return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None

@@ -30,6 +30,7 @@ class PictureEnv(gym.Env):
 
     def __init__(self, name=0, layout="HWC", side=24):
         self.lengths = 8 + name
+        self.horizon = 8  # of the shortest
         self.layout, self.side = layout, side
         shape = dict(HWC=(side, side, 3), CHW=(3, side, side), HW=(side, side))[layout]
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)

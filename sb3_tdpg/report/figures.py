@@ -10,16 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, legend_above, log_axis, new_panels
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
+from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.report.numbers import Numbers
 from sb3_tdpg.report.records import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import find
-from sb3_tdpg.vec_env import make_episodes_env
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -117,39 +121,69 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     The model acts on the unperturbed observations, so that the true episode is the same in all panels. The component is
     the one that varies most, in multiples of its scale.
     """
-    observations, space = _episode(plan, model)
-    flat = observations.reshape(len(observations), -1)
-    assert plan.scale is not None
-    scale = np.asarray(plan.scale, dtype=np.float64).ravel()
-    component = int(np.argmax(flat.std(axis=0) / np.where(scale > 0, scale, np.inf)))
+    observations, space, horizon = _episode(plan, model)
+    scales = plan.scale if isinstance(plan.scale, Mapping) else {"": plan.scale}
+    parts = {key: np.concatenate([_part(each, key) for each in observations]) for key in scales}  # (T, *obs)
+    spread = {
+        key: (parts[key].std(axis=0) / np.where(scale > 0, scale, np.inf)).ravel() for key, scale in scales.items()
+    }
+    key = max(spread, key=lambda key: spread[key].max())
+    component = int(np.argmax(spread[key]))
+    unperturbed = parts[key].reshape(len(observations), -1)[:, component]
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
     shades = import_matplotlib().colormaps["viridis_r"]
-    dots = "." if len(flat) <= 30 else ""
+    dots = "." if len(unperturbed) <= 30 else ""
     for axes, name in zip(panels.flat, names, strict=False):
         for row in (row for row in rows if row.perturbation == name):
-            perturber = Perturber(find(name), row.severity, space, 1, seed=plan.seed, scale=plan.scale)
-            seen = [perturber(observation[None]).ravel()[component] for observation in observations]
+            how: dict[str, Any] = dict(seed=plan.seed, scale=plan.scale, horizon=horizon)
+            perturber = Perturber(find(name), row.severity, space, 1, **how)
+            seen = [_part(perturber(observation), key).ravel()[component] for observation in observations]
             color = shades(0.1 + 0.8 * row.severity / 5)
             axes.plot(seen, dots + "-", color=color, linewidth=0.9, markersize=4, label=f"severity {row.severity}")
-        axes.plot(flat[:, component], dots + "-", color=INK, linewidth=1.6, markersize=5, label=UNPERTURBED, zorder=0)
+        axes.plot(unperturbed, dots + "-", color=INK, linewidth=1.6, markersize=5, label=UNPERTURBED, zorder=0)
         axes.set_title(name, fontsize=9)
     figure.supxlabel("time step $t$", fontsize=9)
-    figure.supylabel(f"component {component} of the observation", fontsize=9)
+    figure.supylabel(f"component {component} of {key or 'the observation'}", fontsize=9)
     legend_above(figure, panels[0, 0], 6)
     return figure
 
 
-def _episode(plan: Plan, model: Any) -> tuple[np.ndarray, spaces.Box]:
-    """Return the observations of an episode, ``(T, *obs)``, before they are normalised, and their space."""
-    normalize = model.get_vec_normalize_env()
-    observe = None if normalize is None else normalize.normalize_obs
-    with closing(make_episodes_env(plan.env_id, 1, env_kwargs=plan.env_kwargs, use_processes=False)) as env:
-        seeds = evaluation_seeds(plan.seed)
-        steps = rollout(model, env, 1, seeds=seeds, deterministic=plan.deterministic, observe=observe)
-        observations = [step.observations[0] for step in islice(steps, MAX_STEPS)]
-        assert isinstance(env.observation_space, spaces.Box)
-        return np.stack(observations), env.observation_space
+def _part(observation: Any, key: str) -> np.ndarray:
+    return np.asarray(observation[key] if key else observation)
+
+
+class _Recorder(VecEnvWrapper):
+    """Keep the observations before the wrappers of a model change them."""
+
+    def __init__(self, env: VecEnv) -> None:
+        super().__init__(env)
+        self.seen: list[Any] = []
+
+    def reset(self) -> Any:
+        self.seen = [self.venv.reset()]
+        return self.seen[-1]
+
+    def step_wait(self) -> VecEnvStepReturn:
+        step = self.venv.step_wait()
+        self.seen.append(step[0])
+        return step
+
+
+def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space, int]:
+    """Return the observations of an episode, each ``(1, *obs)``, their space, and the longest episode."""
+    recorders: list[_Recorder] = []
+
+    def sensor(env: VecEnv) -> VecEnv:
+        recorders.append(_Recorder(env))
+        return recorders[0]
+
+    scenario = Scenario(UNPERTURBED, plan.env_id, plan.env_kwargs, sensor=sensor)
+    with closing(scenario_env(scenario, model, n_episodes=1, n_envs=1)) as env:
+        steps = rollout(model, env, 1, seeds=evaluation_seeds(plan.seed), deterministic=plan.deterministic)
+        n_steps = len(list(islice(steps, MAX_STEPS)))
+        (recorder,) = recorders
+        return recorder.seen[:n_steps], recorder.observation_space, horizon_of(env) or n_steps
 
 
 def _grid(n: int) -> tuple[Figure, np.ndarray]:

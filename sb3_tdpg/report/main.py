@@ -29,6 +29,7 @@ from sb3_tdpg.report.records import Models, Plan, complete_rows, default_episode
 from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
+from sb3_tdpg.robustness.registry import find
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.sensor import kind_of
 from sb3_tdpg.tdpg import TDPG
@@ -106,10 +107,9 @@ def robustness_report(
             raise ValueError(f"{name}={value!r} must be an integer of at least {least}")
     if jobs > 1 and not all(isinstance(source, Path) for of_method in sources.values() for source in of_method):
         raise ValueError(f"jobs={jobs} needs models that are files; models in memory run in this process: use jobs=1")
-    space, horizon, scale = _look_at(env_id, kwargs)
-    rows = make_rows(
-        env_id, kwargs, space, horizon, perturbations=perturbations, severities=severities, scenarios=scenarios
-    )
+    space, action_space, horizon, scale = _look_at(env_id, kwargs)
+    which: dict[str, Any] = dict(perturbations=perturbations, severities=severities, scenarios=scenarios)
+    rows = make_rows(env_id, kwargs, space, horizon, action_space, **which)
     loaded = load_all(sources, env_id, kwargs)
     _check_fit(loaded, rows)
     n_episodes = n_episodes or default_episodes(kind_of(space), horizon, n_steps)
@@ -224,14 +224,15 @@ def _name(source: Source) -> str:
     return str(source) if isinstance(source, Path) else f"{type(source).__name__} in memory"
 
 
-def _look_at(env_id: str, env_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, int | None, np.ndarray | None]:
-    """Return the observation space, the horizon and the scale of the components of an environment."""
+def _look_at(env_id: str, env_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, spaces.Space, int | None, Any]:
+    """Return observation space, action space, horizon and the scale of the components of an environment."""
     try:
         env = make_episodes_env(env_id, 8, env_kwargs=env_kwargs, use_processes=False)
     except Exception as e:
         raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
     with closing(env):
-        return env.observation_space, horizon_of(env), default_scale(env.observation_space, env)
+        space = env.observation_space
+        return space, env.action_space, horizon_of(env), default_scale(space, env)
 
 
 def _check_fit(models: Models, rows: Sequence[Row]) -> None:
@@ -264,11 +265,14 @@ def _draw(
         figures["own_rows"] = own_rows_figure(numbers)
     if any(map(numbers.can_be_clear, numbers.models[1:])):
         figures["comparison"] = comparison_figure(numbers)
+    # One picture does not show the timing.
     of_sensor = [row for row in rows if row.kind == "sensor"]
-    if rows and kind_of(space) == "image" and numbers.perturbations:
-        names = numbers.perturbations
+    shown = [row for row in of_sensor if find(row.perturbation).kind == "image"]
+    shown += [row for row in rows if row.kind == "scene"]
+    if kind_of(space) == "image" and shown:
+        names = list(dict.fromkeys(row.perturbation for row in shown))
         figures["examples"] = perturbation_gallery(plan.env_id, names, env_kwargs=plan.env_kwargs, seed=plan.seed)
-    elif of_sensor:
+    elif of_sensor and plan.scale is not None:
         figures["examples"] = vector_examples(plan, of_sensor, next(iter(models.values()))[0])
     return {name: _save(figure, out, name) for name, figure in figures.items()}
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdpg.evaluation.statistics import interquartile_means
-from sb3_tdpg.report.rows import ALL, UNPERTURBED
+from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 
 CLEAR = 0.05
 """A difference is clear up to this p-value."""
@@ -58,7 +58,7 @@ class Numbers:
     @property
     def perturbations(self) -> list[str]:
         """The perturbations with severities."""
-        return list(self.groups.loc[self.groups["kind"].isin(("sensor", "scene")), "perturbation"].unique())
+        return list(self.groups.loc[self.groups["kind"].isin(PERTURBED), "perturbation"].unique())
 
 
 def p_value(costs: np.ndarray, of_others: np.ndarray) -> float:
@@ -150,7 +150,7 @@ def _cube(of_model: pd.DataFrame, rows: pd.DataFrame) -> np.ndarray:
 def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
     """Return the indices of the rows of each perturbation, by its name and kind."""
     groups = {key: group.index for key, group in rows.groupby(["perturbation", "kind"], sort=False)}
-    perturbed = rows[rows["kind"].isin(("sensor", "scene"))]
+    perturbed = rows[rows["kind"].isin(PERTURBED)]
     if perturbed["perturbation"].nunique() > 1:
         own = {key: groups.pop(key) for key in list(groups) if key[1] == "own"}
         groups.update({(ALL, "all"): perturbed.index, **own})

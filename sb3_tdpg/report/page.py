@@ -10,7 +10,7 @@ import pandas as pd
 from sb3_tdpg.common.markdown import escaped, fill_template, markdown_table
 from sb3_tdpg.report.numbers import CLEAR, Numbers
 from sb3_tdpg.report.records import Plan
-from sb3_tdpg.report.rows import ALL, UNPERTURBED, Row
+from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED, Row
 from sb3_tdpg.robustness.registry import find
 
 MIN_SEEDS = 5
@@ -91,7 +91,7 @@ class Costs:
         """Find the perturbation and the severity with the highest cost of a method."""
         levels = self.numbers.levels[self.numbers.levels["model"] == label]
         plain = levels.loc[levels["kind"] == "unperturbed", "iqm"].iloc[0]
-        perturbed = levels[levels["kind"].isin(("sensor", "scene"))]
+        perturbed = levels[levels["kind"].isin(PERTURBED)]
         worst = perturbed.loc[perturbed["iqm"].idxmax()]
         where = worst[["perturbation", "severity"]]
         return dict(**where, cost=self.cell(worst), unperturbed=self.number(plain))
@@ -160,10 +160,10 @@ def _share(row: Mapping[str, Any], name: str) -> str:
 def _severities_table(page: Page) -> str:
     """Make a table of what the perturbations do, with the parameter of each severity; empty if there are none."""
     lines = []
-    perturbed = [row for row in page.rows if row.kind in ("sensor", "scene")]
+    perturbed = [row for row in page.rows if row.kind in PERTURBED]
     for name in dict.fromkeys(row.perturbation for row in perturbed):
         rows = [row for row in perturbed if row.perturbation == name]
-        if rows[0].kind == "sensor":
+        if rows[0].kind != "scene":
             what, parameter = find(name).summary, find(name).parameter
             values = [f"{row.value:g}" for row in rows]
         else:

@@ -9,7 +9,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
@@ -48,7 +47,7 @@ class Plan:
     n_episodes: int  # of each model in each row
     seed: int  # of environments, policies and perturbations
     deterministic: bool
-    scale: np.ndarray | None  # of the components of a vector, the same for all models; None for images
+    scale: Any  # of the components of a vector, by key in a Dict, the same for all models; None for images
 
 
 def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
@@ -62,7 +61,7 @@ def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
     def sensor(env: VecEnv) -> VecEnv:
         return PerturbedVecEnv(env, row.perturbation, row.severity, seed=plan.seed, scale=plan.scale)
 
-    scenario = replace(row.scenario, sensor=sensor) if row.kind == "sensor" else row.scenario
+    scenario = replace(row.scenario, sensor=sensor) if row.kind in ("sensor", "plant") else row.scenario
     labels = dict(perturbation=row.perturbation, severity=row.severity, kind=row.kind)
     frames = []
     for label, of_method in models.items():

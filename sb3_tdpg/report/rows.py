@@ -15,6 +15,8 @@ from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS, find_appli
 
 UNPERTURBED = "unperturbed"
 ALL = "all perturbations"
+PERTURBED = ("sensor", "plant", "scene")
+"""The kinds of rows with severities: other observations, other actions, other keywords of the environment."""
 
 FAST: Mapping[str, Mapping[str, Any]] = {"BallCatch-v0": dict(renderer="fast")}
 """Keywords that save time and hardly change the results, by environment; the user's keywords take precedence."""
@@ -26,9 +28,9 @@ class Row:
 
     perturbation: str  # its name, or the title of a test row of the environment
     severity: int  # 1 to 5, and 0 if there are no severities
-    kind: str  # "unperturbed", "own" (a test row of the environment), "sensor" or "scene"
+    kind: str  # "unperturbed", "own" (a test row of the environment), or one of PERTURBED
     scenario: Scenario
-    value: float | None = None  # the parameter of a sensor perturbation
+    value: float | None = None  # the parameter of a perturbation of sensor or plant
 
     @property
     def title(self) -> str:
@@ -54,6 +56,7 @@ def make_rows(
     env_kwargs: Mapping[str, Any],
     space: spaces.Space,
     horizon: int | None,
+    action_space: spaces.Space | None = None,
     *,
     perturbations: Sequence[str] | None = None,
     severities: Sequence[int] = (1, 2, 3, 4, 5),
@@ -66,7 +69,7 @@ def make_rows(
         same name.
     """
     scenes = scene_perturbations(env_id)
-    known = [*applicable(space, horizon), *scenes]
+    known = [*applicable(space, horizon, action_space), *scenes]
     names = known if perturbations is None else list(dict.fromkeys(perturbations))
     severities = sorted(set(severities))
     if not severities or not set(severities) <= set(range(1, N_SEVERITIES + 1)):
@@ -76,13 +79,14 @@ def make_rows(
     for name in names:
         if name not in PERTURBATIONS and name not in scenes:
             raise ValueError(f"perturbation={name!r} is unknown; this environment has {known}")
-        sensor = None if name in scenes else find_applicable(name, space, horizon)
+        found = None if name in scenes else find_applicable(name, space, horizon, action_space)
         for severity in severities:
-            if sensor is None:
+            if found is None:
                 scenario = Scenario(name, env_id, {**env_kwargs, **scenes[name][severity - 1]})
                 rows.append(Row(name, severity, "scene", scenario))
             else:
-                rows.append(Row(name, severity, "sensor", plain, sensor.value(severity)))
+                kind = "plant" if found.kind == "action" else "sensor"
+                rows.append(Row(name, severity, kind, plain, found.value(severity)))
     # The first row of a table of the paper is the training row.
     for own in PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:] if scenarios is None else scenarios:
         rows.append(Row(own.name, 0, "own", Scenario(own.name, own.env_id, {**env_kwargs, **own.env_kwargs})))

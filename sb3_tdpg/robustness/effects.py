@@ -1,10 +1,10 @@
 """
 All perturbations, each a function of a batch of observations with its row of the registry above it.
 
-Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Lost and late
-observations (``raw``) are ``(n, *obs)`` in the units of their space.
+Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Perturbations
+of the timing get the time of each episode, ``(n,)``, and return which observation is shown.
 
-Dimension key: n episodes side by side, C channels, H and W rows and columns, D components, K steps of delay.
+Dimension key: n episodes side by side, C channels, H and W rows and columns, D components, G groups of components.
 """
 
 import functools
@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_tdpg.envs.noise import noisy_pixels
 from sb3_tdpg.envs.textures import random_texture
-from sb3_tdpg.robustness.registry import Episode, perturbation
+from sb3_tdpg.robustness.registry import KEEP, NOTHING, Episode, perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
 MIN_BLUR = 0.35  # pixels: a narrower Gaussian changes nothing
@@ -107,35 +107,23 @@ def evenly(number: np.ndarray, share: float, phase: np.ndarray) -> np.ndarray:
     return np.floor(share * (number + 1) + phase) > np.floor(share * number + phase)
 
 
-def draw_frames(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw where the count of lost frames starts, and allocate the last frame that arrived."""
-    return dict(phase=rng.random(n), last=np.empty((n, *sensor.space.shape), sensor.space.dtype))
+def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw where the count of lost readings starts."""
+    return dict(phase=rng.random(n))
 
 
-@perturbation("image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), draw=draw_frames, later_only=True, raw=True)
-def dropped_frames(observations: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+@perturbation(
+    "image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), draw=draw_phase, later_only=True, timing=True
+)
+def dropped_frames(t: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Show the last frame that arrived in place of lost ones."""
-    last, t = episode["last"], episode["t"]
-    arrived = (t == 0) | ~evenly(t - 1, share, episode["phase"])
-    last[arrived] = observations[arrived]
-    return last.copy()
+    return np.where((t > 0) & evenly(t - 1, share, episode["phase"]), KEEP, 0)
 
 
-def draw_delay(rng: np.random.Generator, n: int, steps: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Allocate the memory of late observations: ``(n, K, *obs)``."""
-    return dict(waiting=np.empty((n, int(steps), *sensor.space.shape), sensor.space.dtype))
-
-
-@perturbation("image", "steps", (1, 2, 3, 4, 5), draw=draw_delay, later_only=True, raw=True)
-def delay(observations: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+@perturbation("image", "steps", (1, 2, 3, 4, 5), later_only=True, timing=True)
+def delay(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Show the observation of some steps ago, and the first observation until then."""
-    waiting, t = episode["waiting"], episode["t"]
-    begins = t == 0
-    waiting[begins] = observations[begins][:, None]
-    at = np.arange(len(t)), t % int(steps)
-    late: np.ndarray = waiting[at]
-    waiting[at] = observations
-    return late
+    return np.full_like(t, int(steps))
 
 
 @functools.cache
@@ -201,11 +189,6 @@ def vector_scale(vectors: np.ndarray, factor: float, episode: Episode, rng: np.r
     return vectors * factor ** episode["sign"]
 
 
-def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw where the count of lost readings starts."""
-    return dict(phase=rng.random(n))
-
-
 @perturbation("vector", "share of the readings", (0.1, 0.2, 0.35, 0.5, 0.7), draw=draw_phase)
 def vector_dropout(vectors: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Set some components to 0, others at every step."""
@@ -215,4 +198,77 @@ def vector_dropout(vectors: np.ndarray, share: float, episode: Episode, rng: np.
     return np.where(evenly(reading, share, episode["phase"][:, None]), 0.0, vectors)
 
 
-perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", draw=draw_delay, later_only=True, raw=True)(delay)
+perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", later_only=True, timing=True)(delay)
+
+
+@perturbation("any", "probability", (0.1, 0.25, 0.4, 0.6, 0.8), later_only=True, timing=True)
+def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Repeat the last observation with a probability, at each step anew."""
+    return np.where((t > 0) & (rng.random(len(t)) < probability), KEEP, 0)
+
+
+def draw_lag(rng: np.random.Generator, n: int, longest: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw the delay of each episode."""
+    return dict(delay=rng.integers(1, int(longest) + 1, n), age=np.zeros(n, dtype=np.int64))
+
+
+@perturbation("any", "longest delay, steps", (1, 2, 4, 6, 8), draw=draw_lag, later_only=True, timing=True)
+def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Show the observation of some steps ago, a delay drawn for the episode, with a jitter of one step."""
+    due = (episode["delay"] + rng.integers(-1, 2, len(t))).clip(0, int(longest))
+    age = episode["age"]
+    age[:] = np.where(t == 0, 0, np.minimum(due, age + 1))  # nothing is shown again that is older than the last one
+    return age.copy()
+
+
+def draw_burst(rng: np.random.Generator, n: int, steps: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw when the burst of each episode starts, so that it ends before the horizon if it can."""
+    return dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n))
+
+
+@perturbation("any", "steps", (1, 2, 4, 8, 16), draw=draw_burst, later_only=True, timing=True)
+def blackout(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Show nothing (0, or a black image) for a burst of steps, once in an episode."""
+    since = t - episode["start"]
+    return np.where((since >= 0) & (since < steps), NOTHING, 0)
+
+
+LATEST = ("latest start, share of the episode", (1.0, 0.8, 0.6, 0.4, 0.2))
+
+
+def draw_start(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw at which step of each episode a failure begins, from the second one on."""
+    # The same random numbers give an earlier start at a higher severity.
+    return dict(start=1 + (rng.random(n) * max(1, int(latest * (sensor.horizon - 1)))).astype(np.int64))
+
+
+@perturbation("any", *LATEST, draw=draw_start, later_only=True, timing=True)
+def freeze(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Show the last observation for the rest of the episode, from a random step on."""
+    return np.where(t >= episode["start"], KEEP, 0)
+
+
+def draw_group(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw which group of components fails, and when: ``(n, G)``, never for the other groups."""
+    which = rng.integers(len(sensor.groups), size=n)
+    start = draw_start(rng, n, latest, sensor)["start"]
+    never = np.iinfo(np.int64).max
+    return dict(start=np.where(which[:, None] == np.arange(len(sensor.groups)), start[:, None], never))
+
+
+@perturbation("any", *LATEST, draw=draw_group, later_only=True, timing=True)
+def group_failure(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Show nothing of one group of components, from a random step on."""
+    return np.where(t[:, None] >= episode["start"], NOTHING, 0)
+
+
+@perturbation("action", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), draw=draw_signs)
+def actuator_gain(actions: np.ndarray, factor: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Multiply every component of the actions by a factor or divide it, constant for an episode."""
+    return actions * factor ** episode["sign"]
+
+
+@perturbation("action", "steps", (1, 2, 3, 4, 5), timing=True)
+def actuator_delay(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Apply the action of some steps ago, and 0 until then."""
+    return np.where(t < steps, NOTHING, int(steps))

@@ -11,10 +11,11 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.evaluation.figures import new_figure
+from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.robustness.core import Perturber
-from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find_applicable
+from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find, find_applicable
 from sb3_tdpg.robustness.scenes import scene_perturbations
-from sb3_tdpg.robustness.sensor import Sensor, horizon_of, kind_of
+from sb3_tdpg.robustness.sensor import Sensor, kind_of
 from sb3_tdpg.vec_env import make_episodes_env
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def perturbation_gallery(
     drawn, too.
 
     :param env: An environment with images, or a registered id.
-    :param names: The rows; default: all perturbations that apply.
+    :param names: The rows; default: all perturbations of images that apply.
     :param env_kwargs: Keywords for the environment's constructor, with an id.
     :param seed: Seed of environment and perturbations.
     :raises ValueError: if the observations are not images, or a perturbation does not apply.
@@ -57,12 +58,15 @@ def perturbation_gallery(
         if not isinstance(space, spaces.Box) or kind_of(space) != "image":
             raise ValueError(f"a gallery shows images, and the observation space is {space}")
         rows: dict[str, list[np.ndarray]] = {}
-        for name in [*applicable(space, horizon), *scenes] if names is None else names:
+        # One picture does not show the timing.
+        shown = [name for name in applicable(space, horizon) if find(name).kind == "image"]
+        for name in [*shown, *scenes] if names is None else names:
             if name in scenes:
                 rows[name] = [_frames(made(scene_kwargs), seed)[-1] for scene_kwargs in scenes[name]]
                 continue
             perturbation = find_applicable(name, space, horizon)
-            perturbers = [Perturber(perturbation, severity, space, 1, seed=seed) for severity in range(1, 6)]
+            how: dict[str, Any] = dict(seed=seed, horizon=len(frames))  # what fails has failed in the last frame
+            perturbers = [Perturber(perturbation, severity, space, 1, **how) for severity in range(1, 6)]
             rows[name] = [[perturber(frame[None]) for frame in frames][-1][0] for perturber in perturbers]
     return _draw(frames[-1], rows, Sensor(space))
 
@@ -86,7 +90,7 @@ def _draw(unperturbed: np.ndarray, rows: Mapping[str, Sequence[np.ndarray]], sen
     panels = figure.subplots(len(rows), n_columns, squeeze=False)
     for axes_of_row, (name, images) in zip(panels, rows.items(), strict=True):
         for axes, image in zip(axes_of_row, (unperturbed, *images), strict=True):
-            picture = sensor.to_units(image[None])[0].transpose(1, 2, 0)
+            picture = sensor.to_units(image[None])[-1].transpose(1, 2, 0)
             colors = picture if picture.shape[2] == 3 else picture[..., 0]
             # In depth images, near pixels are bright.
             axes.imshow(colors, cmap="gray_r" if sensor.is_depth else "gray", vmin=0, vmax=1, interpolation="nearest")

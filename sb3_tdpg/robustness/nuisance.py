@@ -110,7 +110,7 @@ class PerturbationNuisance(Nuisance):
 
     def members(self, n: int) -> Members:
         """See :meth:`Nuisance.members`."""
-        return _PerturbationMembers(Perturber(*self.arguments, n, seed=random_seed(), scale=self.scale))  # type: ignore[arg-type]
+        return _PerturbationMembers(Perturber(*self.arguments, n, seed=random_seed(), scale=self.scale))
 
 
 class _PerturbationMembers(Members):

@@ -11,6 +11,8 @@ from gymnasium import spaces
 from sb3_tdpg.robustness.sensor import Sensor, kind_of
 
 N_SEVERITIES = 5
+KINDS = ("image", "vector", "any", "action")
+KEEP, NOTHING = -1, -2  # in place of an age: what was shown last, and no observation at all
 
 Episode = Mapping[str, np.ndarray]  # what was drawn for the episodes of a batch, and their time
 Draw = Callable[[np.random.Generator, int, float, Sensor], dict[str, np.ndarray]]
@@ -26,22 +28,27 @@ def check_severities(name: str, severities: Sequence[Any]) -> None:
 @dataclass(frozen=True)
 class Perturbation:
     """
-    A change to the observations, in five severities.
+    A change to the observations or the actions, in five severities.
 
     Both functions get a batch of n episodes and the value of the severity. ``apply(observations, value, episode, rng)``
     returns the perturbed batch as a new array. It gets images as ``(n, C, H, W)`` float32 in [0, 1] and vectors as
-    ``(n, D)`` float64 in multiples of their scale, and may exceed the bounds. ``draw(rng, n, value, sensor)`` is called
-    where an episode begins and returns arrays with a leading dimension of n. ``apply`` finds them in ``episode``,
-    beside the time ``episode["t"]``, ``(n,)``, which is 0 at the first observation.
+    ``(n, D)`` float64 in multiples of their scale (actions: as they are), and may exceed the bounds.
+    ``draw(rng, n, value, sensor)`` is called where an episode begins and returns arrays with a leading dimension of n.
+    ``apply`` finds them in ``episode``, beside the time ``episode["t"]``, ``(n,)``, which is 0 at the first
+    observation.
 
-    :param kind: ``"image"`` or ``"vector"``.
+    A perturbation of the *timing* gets ``episode["t"]`` in place of observations and returns which one is shown, as
+    ``(n,)`` integers: the age in steps, at most the value of the severity (0: the present one), ``KEEP`` for the one
+    that was shown last, or ``NOTHING``. With ``(n, G)`` it decides for each of ``sensor.groups``: 0 or ``NOTHING``.
+
+    :param kind: ``"image"``, ``"vector"``, ``"any"`` (timing, for both and for ``Dict``) or ``"action"``.
     :param parameter: The quantity that the severities are values of, with its unit.
     :param severities: Five values, from the mildest to the strongest.
     :param summary: The effect in a few words.
     :param channels: Permitted numbers of image channels; ``None``: any.
     :param on_depth: Whether it makes sense on depth images: floats of one channel.
     :param later_only: Whether it leaves the first observation of an episode unchanged.
-    :param raw: ``apply`` gets and returns observations ``(n, *obs)`` in the units of their space.
+    :param timing: Whether ``apply`` decides which observation is shown.
     :raises ValueError: if the kind is unknown, or there are not five severities.
     """
 
@@ -55,11 +62,11 @@ class Perturbation:
     channels: Sequence[int] | None = None
     on_depth: bool = True
     later_only: bool = False
-    raw: bool = False
+    timing: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in ("image", "vector"):
-            raise ValueError(f"kind={self.kind!r} of {self.name!r} must be one of ['image', 'vector']")
+        if self.kind not in KINDS:
+            raise ValueError(f"kind={self.kind!r} of {self.name!r} must be one of {list(KINDS)}")
         check_severities(repr(self.name), self.severities)
 
     def value(self, severity: int) -> float:
@@ -69,12 +76,28 @@ class Perturbation:
             raise ValueError(f"severity={severity!r} of {self.name!r} must be an integer from 1 to {N_SEVERITIES}")
         return self.severities[severity - 1]
 
-    def objection(self, space: spaces.Space, horizon: int | None = None) -> str | None:
-        """Explain why this perturbation does not apply to an observation space (and a horizon); ``None`` if it does."""
+    def objection(
+        self, space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None
+    ) -> str | None:
+        """
+        Explain why this perturbation does not apply; ``None`` if it does.
+
+        :param space: The observation space; of a ``Dict``, the parts that it applies to are perturbed.
+        :param horizon: The longest episode, if there is a limit.
+        :param action_space: Needed by perturbations of the actions.
+        """
+        if self.later_only and horizon == 1:
+            return "it leaves the first observation of an episode unchanged, and with a horizon of 1 there is no other"
+        if self.kind == "action":
+            is_box = isinstance(action_space, spaces.Box)
+            return None if is_box else f"it changes the actions of a Box, and the action space is {action_space}"
+        if isinstance(space, spaces.Dict):
+            objections = [self.objection(part, horizon) for part in space.values()]
+            return objections[0] if objections and all(objections) else None
         kind = kind_of(space)
         if kind is None or not isinstance(space, spaces.Box):
             return f"the observation space {space} is not a Box: use gymnasium.wrappers.FlattenObservation first"
-        if kind != self.kind:
+        if self.kind not in (kind, "any"):
             needs = "images: a Box of three dimensions with finite bounds" if self.kind == "image" else "vectors"
             return f"it is for {needs}, and the observation space is {space}"
         sensor = Sensor(space)
@@ -83,13 +106,13 @@ class Perturbation:
             return f"it needs images of {wanted} channels, and these have {sensor.shape[0]} (shape {space.shape})"
         if sensor.is_depth and not self.on_depth:
             return "it changes colours, and in a depth image (floats of one channel) there are none"
-        if self.later_only and horizon == 1:
-            return "it leaves the first observation of an episode unchanged, and with a horizon of 1 there is no other"
         return None
 
-    def applies_to(self, space: spaces.Space, horizon: int | None = None) -> bool:
-        """Check whether this perturbation applies to an observation space; see :meth:`objection`."""
-        return self.objection(space, horizon) is None
+    def applies_to(
+        self, space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None
+    ) -> bool:
+        """Check whether this perturbation applies; see :meth:`objection`."""
+        return self.objection(space, horizon, action_space) is None
 
 
 PERTURBATIONS: dict[str, Perturbation] = {}  # by name, filled by :mod:`sb3_tdpg.robustness.effects`
@@ -123,16 +146,18 @@ def find(name: str) -> Perturbation:
     return PERTURBATIONS[name]
 
 
-def find_applicable(name: str, space: spaces.Space, horizon: int | None) -> Perturbation:
-    """Return a perturbation by its name, if it applies to an observation space."""
-    if (objection := find(name).objection(space, horizon)) is not None:
+def find_applicable(
+    name: str, space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None
+) -> Perturbation:
+    """Return a perturbation by its name, if it applies; see :meth:`Perturbation.objection`."""
+    if (objection := find(name).objection(space, horizon, action_space)) is not None:
         raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
     return PERTURBATIONS[name]
 
 
-def applicable(space: spaces.Space, horizon: int | None = None) -> list[str]:
-    """Return the names of the perturbations that apply to an observation space; see :meth:`Perturbation.objection`."""
-    return [name for name, row in PERTURBATIONS.items() if row.applies_to(space, horizon)]
+def applicable(space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None) -> list[str]:
+    """Return the names of the perturbations that apply; see :meth:`Perturbation.objection`."""
+    return [name for name, row in PERTURBATIONS.items() if row.applies_to(space, horizon, action_space)]
 
 
 def severity_table(kind: str | None = None) -> pd.DataFrame:

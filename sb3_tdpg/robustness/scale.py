@@ -5,6 +5,7 @@ Dimension key: E environments; scales have the shape of the observation space.
 """
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tdpg.evaluation.rollout import rollout
+from sb3_tdpg.robustness.core import each_part
 from sb3_tdpg.robustness.sensor import finite_range, kind_of
 
 N_OBSERVATIONS = 500
@@ -20,7 +22,7 @@ MAX_STEPS = 200
 _SEED = 0xCA1  # of every calibration: the same environment has the same scale
 
 
-def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> np.ndarray:
+def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> Any:
     """
     Measure the standard deviation of each observation component, over time and episodes, in a short rollout.
 
@@ -29,7 +31,7 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> np.ndarray:
     reset, are restored, so the next episodes are the same as without the rollout.
 
     :param model: SB3 model that acts; ``None``: clipped standard Gaussian actions, as of an untrained policy.
-    :return: in the shape of the observation space, float64
+    :return: in the shape of the observation space, float64; for the vectors in a ``Dict``, by key
     """
     vec_env = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
     inner = vec_env.unwrapped
@@ -37,7 +39,8 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> np.ndarray:
     generators = copy.deepcopy(vec_env.get_attr("np_random"))
     try:
         vec_env.seed(_SEED)
-        return _observations(vec_env, model).std(axis=0)
+        seen = _observations(vec_env, model)
+        return each_part(lambda *steps: np.concatenate(steps, dtype=np.float64).std(axis=0), *seen)
     finally:
         for i, generator in enumerate(generators):
             vec_env.set_attr("np_random", generator, indices=i)
@@ -51,50 +54,69 @@ class _Untrained:
         self.rng, self.space = np.random.default_rng(_SEED), copy.deepcopy(action_space)
         self.space.seed(_SEED)
 
-    def predict(self, observations: np.ndarray, *args: Any, **kwargs: Any) -> tuple[np.ndarray, None]:
-        n, space = len(observations), self.space
+    def predict(self, observations: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, None]:
+        first = next(iter(observations.values())) if isinstance(observations, dict) else observations
+        n, space = len(first), self.space
         if not isinstance(space, spaces.Box):
             return np.stack([space.sample() for _ in range(n)]), None
         actions = self.rng.standard_normal((n, *space.shape))
         return np.clip(actions, space.low, space.high).astype(space.dtype), None
 
 
-def _observations(env: VecEnv, model: Any) -> np.ndarray:
-    """Return the observations of the rollout, ``(T * E, *obs)``."""
+def _observations(env: VecEnv, model: Any) -> list[Any]:
+    """Return the observations of each step of the rollout, ``(E, *obs)``; of a ``Dict`` the vectors."""
     normalize = None if model is None else model.get_vec_normalize_env()
     observe = None if normalize is None else normalize.normalize_obs
-    seen: list[np.ndarray] = []
+    vectors = [key for key, part in parts_of(env.observation_space).items() if kind_of(part) == "vector"]
+    seen: list[Any] = []
     has_ended = np.zeros(env.num_envs, dtype=bool)
     for step in rollout(model or _Untrained(env.action_space), env, observe=observe):
-        seen += [step.next_observations] if seen else [step.observations, step.next_observations]
+        for observations in [step.next_observations] if seen else [step.observations, step.next_observations]:
+            is_dict = isinstance(observations, dict)
+            seen.append({key: observations[key] for key in vectors} if is_dict else observations)
         has_ended |= step.dones
         if len(seen) > MAX_STEPS or (has_ended.all() and len(seen) * env.num_envs >= N_OBSERVATIONS):
             break
-    return np.concatenate(seen, dtype=np.float64)
+    return seen
 
 
-def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None) -> np.ndarray | None:
+def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
+    """Return the parts of a ``Dict`` by key; any other space is its only part."""
+    return dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
+
+
+def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None) -> Any:
     r"""
-    Return the scale of the components of a vector; ``None`` for an image.
+    Return the scale of the components of a vector, or of the vectors in a ``Dict``, by key; ``None`` without a vector.
 
     A component with finite bounds has the standard deviation of a uniform distribution between them,
     :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The others are measured by :func:`observation_scale`.
 
-    :param scale: Given by the user and used instead: a number, or one for each component.
+    :param scale: Given by the user and used instead: a number, or one for each component; for a ``Dict`` also by key.
     """
-    if not isinstance(space, spaces.Box) or kind_of(space) != "vector":
+    vectors = {key: part for key, part in parts_of(space).items() if kind_of(part) == "vector"}
+    if not vectors:
         if scale is not None:
             raise ValueError(f"scale={scale} is for vectors, and the observation space is {space}: leave it out")
         return None
-    if scale is None:
-        result = finite_range(space) / np.sqrt(12)
-        if not np.isfinite(result).all():
-            result = np.where(np.isfinite(result), result, observation_scale(env))
-    else:
-        result = np.asarray(scale, dtype=np.float64)
-        if result.shape not in ((), space.shape) or not (np.isfinite(result) & (result >= 0)).all():
-            raise ValueError(f"scale={scale} must be a number, or an array of shape {space.shape}, and not negative")
-        result = np.broadcast_to(result, space.shape)
-    if not result.any():
+    given = scale if isinstance(scale, Mapping) else dict.fromkeys(vectors, scale)
+    if unknown := [key for key in given if key not in vectors]:
+        raise ValueError(f"scale={scale} has {unknown}: use keys of the vectors in the observation, {list(vectors)}")
+    result = {key: _given_or_bounds(part, given.get(key)) for key, part in vectors.items()}
+    if not all(np.isfinite(values).all() for values in result.values()):
+        measured = observation_scale(env)
+        measured = measured if isinstance(space, spaces.Dict) else {"": measured}
+        result = {key: np.where(np.isfinite(values), values, measured[key]) for key, values in result.items()}
+    if not any(values.any() for values in result.values()):
         raise ValueError("no component of the observations varied in the calibration: give `scale`")
-    return result
+    return result if isinstance(space, spaces.Dict) else result[""]
+
+
+def _given_or_bounds(space: Any, scale: Any) -> np.ndarray:
+    """Return the scale that was given for a vector, or that of its bounds, infinite where there are none."""
+    if scale is None:
+        return finite_range(space) / np.sqrt(12)
+    result = np.asarray(scale, dtype=np.float64)
+    if result.shape not in ((), space.shape) or not (np.isfinite(result) & (result >= 0)).all():
+        raise ValueError(f"scale={scale} must be a number, or an array of shape {space.shape}, and not negative")
+    return np.broadcast_to(result, space.shape)

@@ -1,16 +1,18 @@
 """
 The units of observations for perturbations, so that a severity means the same in every observation space.
 
-Dimension key: N environments, C channels, H and W rows and columns, D components of a vector.
+Dimension key: N environments, F stacked frames, C channels, H and W rows and columns, D components of a vector.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 
+UNKNOWN_HORIZON = 100  # steps
 VAST = 1e6  # bounds further apart count as infinite: some environments use the largest float for "unbounded"
 
 
@@ -25,19 +27,50 @@ def kind_of(space: spaces.Space) -> str | None:
     """
     Return ``"image"``, ``"vector"`` or, if it is not a ``Box``, ``None``.
 
-    An image has finite bounds and three dimensions, one of them the channels, or two dimensions and bytes.
+    An image has finite bounds and three dimensions, one of them the channels, or two dimensions and bytes. Four
+    dimensions are a stack of images, the oldest first.
     """
     if not isinstance(space, spaces.Box):
         return None
-    has_pixels = len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)
+    has_pixels = len(space.shape) in (3, 4) or (len(space.shape) == 2 and space.dtype == np.uint8)
     return "image" if has_pixels and np.isfinite(finite_range(space)).all() else "vector"
 
 
-def horizon_of(env: gym.Env | VecEnv) -> int | None:
-    """Return the attribute ``horizon`` of an environment, if it has one."""
-    if isinstance(env, VecEnv):
-        return env.get_attr("horizon", [0])[0] if env.has_attr("horizon") else None
-    return env.get_wrapper_attr("horizon") if env.has_wrapper_attr("horizon") else None
+def blank(space: spaces.Space) -> np.ndarray:
+    """Return what is shown if there is nothing: a black image, otherwise 0 as far as the bounds allow."""
+    if not isinstance(space, spaces.Box):
+        return np.zeros(space.shape or (), space.dtype)
+    return space.low if kind_of(space) == "image" else np.clip(np.zeros_like(space.low), space.low, space.high)
+
+
+Group = Mapping[str, np.ndarray]
+"""Components of the flattened observation that fail together, by the key of a ``Dict``; "" if there is no ``Dict``."""
+
+
+def groups_of(space: spaces.Space, named: Mapping[str, Sequence[Any]] | None = None) -> list[Group]:
+    """
+    Return the groups of components of an observation that can fail together.
+
+    :param space: The observation space.
+    :param named: An environment's ``observation_groups``: indices of a vector, or keys of a ``Dict``, by the name of
+        the group. Default: each part of a ``Dict``, each channel of an image, each component of a vector.
+    """
+    if isinstance(space, spaces.Dict):
+        whole = {key: np.arange(int(np.prod(part.shape or ()))) for key, part in space.items()}
+        groups = [[key] for key in whole] if named is None else [list(keys) for keys in named.values()]
+        if unknown := [key for keys in groups for key in keys if key not in whole]:
+            raise ValueError(f"observation_groups={named} has {unknown}: use keys of the observation, {list(whole)}")
+        return [{key: whole[key] for key in keys} for keys in groups]
+    assert isinstance(space, spaces.Box)
+    components = np.arange(int(np.prod(space.shape)))
+    if named is not None:
+        if outside := [i for indices in named.values() for i in indices if i not in components]:
+            raise ValueError(f"observation_groups={named} has {outside}: use indices from 0 to {len(components) - 1}")
+        return [{"": np.asarray(indices)} for indices in named.values()]
+    if kind_of(space) == "image" and len(space.shape) > 2:
+        channels = np.moveaxis(components.reshape(space.shape), -1 if Sensor(space).channels_last else -3, 0)
+        return [{"": channel.ravel()} for channel in channels]
+    return [{"": components}] if kind_of(space) == "image" else [{"": components[[i]]} for i in components]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +79,24 @@ class Sensor:
     An observation space with the units that perturbations work in.
 
     An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
-    becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed.
+    becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed. A stack of
+    images becomes ``(N F, C, H, W)``. Perturbations of the timing need no units, and the space may be a ``Dict``.
     """
 
-    space: spaces.Box
+    space: Any  # a Box, or a Dict
     scale: np.ndarray | None = None  # of the components of a vector, in the space's shape; see `observation_scale`
+    horizon: int = UNKNOWN_HORIZON
+    named_groups: Mapping[str, Sequence[Any]] | None = None
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """The groups of components that can fail together; see :func:`groups_of`."""
+        return groups_of(self.space, self.named_groups)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of stacked images F; 1 of a vector."""
+        return self.space.shape[0] if self.is_image and len(self.space.shape) == 4 else 1
 
     @property
     def is_image(self) -> bool:
@@ -65,7 +111,8 @@ class Sensor:
     @property
     def channels_last(self) -> bool:
         """Whether the last axis holds the channels: as for Stable-Baselines3, unless the first one is the shortest."""
-        return len(self.space.shape) == 3 and int(np.argmin(self.space.shape)) != 0
+        shape = self.space.shape[-3:]
+        return len(shape) == 3 and int(np.argmin(shape)) != 0
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -73,6 +120,7 @@ class Sensor:
         shape = self.space.shape
         if not self.is_image:
             return (int(np.prod(shape)),)
+        shape = shape[-3:]
         channels = (1,) if len(shape) == 2 else ()
         return (shape[2], *shape[:2]) if self.channels_last else (*channels, *shape)
 
@@ -86,13 +134,14 @@ class Sensor:
         units = np.multiply(observations, np.float32(1 / (high - low)), dtype=np.float32)
         if low != 0:
             units -= np.float32(low / (high - low))
+        units = units.reshape(-1, *units.shape[-3:]) if self.n_frames > 1 else units
         return np.moveaxis(units, 3, 1) if self.channels_last else units.reshape(len(units), *self.shape)
 
     def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Convert back to the order, bounds and type of the space; components without a scale stay unperturbed."""
         low, high = self.space.low, self.space.high
         if self.is_image:
-            units = np.moveaxis(units, 1, 3) if self.channels_last else units.reshape(observations.shape)
+            units = (np.moveaxis(units, 1, 3) if self.channels_last else units).reshape(observations.shape)
             if (low == low.flat[0]).all() and (high == high.flat[0]).all():
                 low, high = low.flat[0], high.flat[0]  # much faster than arrays
             lowest, highest = float(np.min(low)), float(np.max(high))

