@@ -103,6 +103,12 @@ ARGUMENTS = {
     ),
     "nuisance without scenes": (dict(nuisance={"env_kwargs": []}), r"'env_kwargs': \[\]", "hold keywords"),
     "nuisance with a number for scenes": (dict(nuisance={"env_kwargs": 3}), "'env_kwargs': 3", "a list of such"),
+    "nuisance with an unknown keyword": (
+        dict(nuisance={"env_kwargs": [{"bar": 3}]}), r"'env_kwargs': \[\{'bar': 3\}\]", "unexpected keyword .*'bar'"
+    ),
+    "nuisance that redraws a number": (
+        dict(nuisance={"env_kwargs": [{"sensor_noise_std": 1.0}], "redraw": 3}), "redraw=3", r"list .*'d \(m\)'"
+    ),
     "nuisance that only redraws": (dict(nuisance={"redraw": ["d"]}), "'redraw' needs 'env_kwargs'"),
     "nuisance with three severities": (
         dict(nuisance={"vector_noise": [1, 2, 3]}), r"\[1, 2, 3\]", "the lowest and the highest"

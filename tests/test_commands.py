@@ -62,6 +62,8 @@ BAD = {
     "block": ([*SWEEP, "--block", "Lava-v0-foo"], "no block 'Lava-v0-foo'.*choose one with --block"),
     "storage": ([*SWEEP, *TINY, "--storage", "postgresql://a:b@127.0.0.1:1/c"], "cannot be opened"),
     "out": ([*SWEEP, *TINY, "--out", "/proc/nowhere"], "No such file or directory: '/proc/nowhere'"),
+    "grace period": ([*SWEEP, "--storage", "s.log", "--grace-period", "inf"], "grace_period=inf must be at least 2 s"),
+    "seed": (["demo", "--seed", "-1", "--out", "out"], "seed=-1 must be at least 0"),
     "folder": (["push", "nothing", "--repo-id", "a/b"], "nothing holds no training"),
 }
 
@@ -73,3 +75,11 @@ def test_bad_input_is_told_in_a_line(arguments, message, capsys, tmp_path, monke
     error = capsys.readouterr().err
     assert re.search(message, error)
     assert len(error.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_flag_that_is_no_number_is_told_with_what_is_expected(capsys):
+    for value in ("abc", "0", "1.5"):
+        with pytest.raises(SystemExit, match="2"):
+            main(["demo", "--n-timesteps", value])
+        assert f"argument --n-timesteps: {value} must be an integer of at least 1" in capsys.readouterr().err

@@ -59,6 +59,11 @@ class Run:
     max_attempts: int = 1
     start: Path | None = None
 
+    def __post_init__(self) -> None:
+        last = self.seed + SEEDS_BETWEEN_ATTEMPTS * (self.max_attempts - 1)
+        if not (self.seed >= 0 and last < 2**32):
+            raise ValueError(f"seed={self.seed} must be at least 0, and below 2**32 in the last attempt")
+
     @property
     def settings(self) -> dict[str, Any]:
         """The block with the overrides."""

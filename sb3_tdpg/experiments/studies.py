@@ -33,6 +33,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_tdpg.common.provenance import differences, jsonable
 
 GRACE_PERIOD = 60.0  # seconds
+MAX_GRACE_PERIOD = 86400
 MAX_RETRIES = 3
 FORMS = "postgresql://user:password@host/database (many machines) or a path that ends in .log (one machine)"
 POSTGRES = dict(connect_timeout=5, keepalives_idle=30, keepalives_interval=10, keepalives_count=3)  # seconds
@@ -109,8 +110,8 @@ def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PE
     text = os.fspath(storage)
     url = re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", text)
     shown = re.sub(r"(//[^:@]*):.*@", r"\1:***@", text)
-    if grace_period < 2:
-        raise ValueError(f"grace_period={grace_period} must be at least 2 seconds")
+    if not 2 <= grace_period <= MAX_GRACE_PERIOD:
+        raise ValueError(f"grace_period={grace_period} must be at least 2 seconds, and at most {MAX_GRACE_PERIOD}")
     if text.startswith("sqlite") or ("://" not in text and not text.endswith(".log")):
         raise ValueError(f"storage={shown!r} must be {FORMS}; SQLite is not meant for several workers")
     if text.count("@") > 1:

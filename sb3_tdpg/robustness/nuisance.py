@@ -400,6 +400,8 @@ def _scenes(env_kwargs: Any, redraw: Sequence[str], env: VecEnv) -> Nuisance:
             f"{type(inner).__name__}: give a function of the observations instead"
         )
     names = list(getattr(inner, "state_names", ()))
+    if not isinstance(redraw, (list, tuple)):
+        raise ValueError(f"redraw={redraw!r} must be a list of components of the state, some of {names}")
     if unknown := [name for name in redraw if name not in names]:
         raise ValueError(f"redraw={unknown} are no components of the state: use some of {names}")
     own = {} if inner.spec is None else inner.spec.kwargs
@@ -408,7 +410,10 @@ def _scenes(env_kwargs: Any, redraw: Sequence[str], env: VecEnv) -> Nuisance:
         raise ValueError(
             f"nuisance={{'env_kwargs': {env_kwargs!r}}} must hold keywords of the environment, or a list of such"
         )
-    scenes = [type(inner)(**{**own, **kwargs}) for kwargs in given]
+    try:
+        scenes = [type(inner)(**{**own, **kwargs}) for kwargs in given]
+    except TypeError as e:  # an unknown keyword
+        raise ValueError(f"nuisance={{'env_kwargs': {env_kwargs!r}}}: {e}") from e
     for scene in scenes:
         if scene.observation_space != inner.observation_space:
             raise ValueError(f"a scene of the nuisance has the observation space {scene.observation_space}")

@@ -1,5 +1,6 @@
 """Workers that share a study: real processes on a real PostgreSQL and on a journal file."""
 
+import math
 import re
 import time
 
@@ -296,7 +297,11 @@ def test_a_file_that_is_no_journal_is_left_alone(tmp_path):
 
 
 def test_bad_arguments_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"grace_period=0\.1 must be at least 2 seconds"):
-        open_storage(tmp_path / "study.log", 0.1)
+    for grace_period in (0.1, 1.5, math.inf, math.nan, 1e9):
+        with pytest.raises(
+            ValueError, match=rf"grace_period={re.escape(str(grace_period))} must be at least 2 seconds"
+        ):
+            open_storage(tmp_path / "study.log", grace_period)
+    assert not (tmp_path / "study.log").exists()
     with pytest.raises(ValueError, match="n_trials=0"):
         work(open_quick(tmp_path / "study.log"), lambda trial: 0.0, 0)
