@@ -226,6 +226,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             with named_shapes(env):
                 new_obs, rewards, dones, infos = cast(Any, env.step(env_actions))
 
+            check_numbers("reward", np.nan_to_num(rewards), (), t)  # train() tells of NaN
             self.num_timesteps += n_envs
             callback.update_locals(locals())
             if not callback.on_step():

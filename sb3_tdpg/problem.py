@@ -62,12 +62,16 @@ class Problem:
             parts = list(obs.values()) if isinstance(obs, dict) else [obs]
             return np.concatenate([x.reshape(len(x), -1) for x in parts], axis=1, dtype=np.float32)
         try:
-            states = np.stack([info["state"] for info in infos])
+            states = [info["state"] for info in infos]
         except KeyError as e:
             raise ValueError(f'the environment has a `state_space` but no info["state"]: {BRING_THE_STATE}') from e
-        if states.shape[1:] != (self.state_dim,):
-            raise ValueError(f'info["state"] has shape {states.shape[1:]}, but `state_space` says {(self.state_dim,)}')
-        return states
+        for env, state in enumerate(states):
+            if np.shape(state) != (self.state_dim,):
+                raise ValueError(
+                    f'info["state"] of environment {env} has shape {np.shape(state)}, but `state_space` says '
+                    f"{(self.state_dim,)}: mend reset() and step(), or the space"
+                )
+        return np.stack(states)
 
 
 def read_problem(env: VecEnv) -> Problem:
@@ -130,7 +134,7 @@ def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, 
     """
     Check what the environments returned, before it reaches a network.
 
-    :param what: "observation" or "state".
+    :param what: "observation", "state" or "reward".
     :param values: ``(E, *shape)``
     :param shape: Expected shape of one.
     :param t: time step of each environment, ``(E,)``
@@ -143,9 +147,9 @@ def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, 
         )
     if np.issubdtype(values.dtype, np.floating) and not (good := np.abs(values) <= LARGEST).all():
         index = tuple(int(i) for i in np.argwhere(~good)[0])
-        env, component = index[0], list(index[1:])
+        env, component = index[0], f" in component {list(index[1:])}" if shape else ""
         raise ValueError(
-            f"environment {env} returned the {what} {values[index]:g} in component {component} at step "
+            f"environment {env} returned the {what} {values[index]:g}{component} at step "
             f"{t[env]} of its episode: it must be a finite number of at most {LARGEST:g}"
         )
 

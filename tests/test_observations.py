@@ -1,5 +1,7 @@
 """What environments return is checked before it reaches a network, and what is wrong is named."""
 
+import re
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -51,6 +53,34 @@ def test_a_bad_state_is_named_as_well():
     env._terminal_cost = env._cost = lambda state, action=None: np.zeros(len(state))
     with pytest.raises(ValueError, match=r"environment 0 returned the state nan in component \[1\] at step 1"):
         train_epochs(tiny_tdpg(BatchedVecEnv(env, 4), n_episodes=4), 1)
+
+
+@pytest.mark.parametrize("reward", [-1e30, 1e19, np.inf])
+def test_a_reward_that_is_too_large_is_named_with_environment_and_step(reward):
+    class Costly(ToyEnv):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, reward if self.t == 2 else 0.0, *rest
+
+    model = tiny_tdpg(DummyVecEnv([ToyEnv, Costly]), n_episodes=8, mi_estimator="logdet")
+    with pytest.raises(
+        ValueError, match=r"environment 1 returned the reward [-+.\de]+ at step 1 of its episode: it must"
+    ):
+        train_epochs(model, 1)
+
+
+@pytest.mark.parametrize("shape", [(3,), (1, 1), ()])
+def test_a_state_of_another_shape_is_named_with_its_environment(shape):
+    class WrongState(ToyEnv):
+        def reset(self, **kwargs):
+            observation, info = super().reset(**kwargs)
+            return observation, {**info, "state": np.zeros(shape)}
+
+    model = tiny_tdpg(DummyVecEnv([ToyEnv, WrongState]), n_episodes=8, mi_estimator="logdet")
+    with pytest.raises(
+        ValueError, match=rf'"state"\] of environment 1 has shape {re.escape(str(shape))}.*\(1,\): mend'
+    ):
+        train_epochs(model, 1)
 
 
 @pytest.mark.parametrize("at_reset", [False, True])
