@@ -20,6 +20,7 @@ DPI = 100
 MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below
 PANEL_HEIGHT = 190  # pixels of the plot of the TRVs
 LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # pixels around the axes; the legend is at the right
+SYMBOLS = {"TRV": r"$\tilde{x}_t$", "action": "$u_t$"}
 HOLD = 1.0  # s: how long the last frame of an episode stays
 MAX_LINES = 8  # more TRVs are rows of an image
 
@@ -28,7 +29,7 @@ class Episode(NamedTuple):
     """One episode to show."""
 
     pictures: Sequence[np.ndarray]  # T + 1 of (H, W, 3) uint8, of x_0 ... x_T
-    trvs: np.ndarray  # (T, Z)
+    signals: np.ndarray  # (T, Z)
     costs: np.ndarray  # (T,), the last one with the terminal cost
     between: Sequence[Sequence[np.ndarray]] = ()  # pictures between x_t and x_{t+1} for each step, or nothing
 
@@ -68,7 +69,9 @@ def _ffmpeg() -> str | None:
         return None
 
 
-def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float) -> None:
+def save_animation(
+    episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float, signal: str = "TRV"
+) -> None:
     """
     Write episodes as a video, one after the other; the last frame of each stays for about a second.
 
@@ -76,12 +79,13 @@ def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *,
     :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
     :param horizon: Number of controls T in an episode.
     :param fps: Frames per second; a GIF is timed in hundredths of a second.
+    :param signal: ``"TRV"`` or ``"action"``: what is drawn below the pictures.
     :raises ValueError: if the video cannot be written there.
     """
     check_animation_path(path)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    video = _Video(episodes, horizon)
+    video = _Video(episodes, horizon, signal)
     with replaced_atomically(path) as partial:
         (_write_gif if path.suffix == ".gif" else _write_mp4)(video, partial, fps)
 
@@ -89,11 +93,11 @@ def save_animation(episodes: Sequence[Episode], path: str | os.PathLike[str], *,
 class _Video:
     """The figure of a video, and the parts of it that change from frame to frame."""
 
-    def __init__(self, episodes: Sequence[Episode], horizon: int) -> None:
+    def __init__(self, episodes: Sequence[Episode], horizon: int, signal: str) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        self.episodes = episodes
+        self.episodes, self._signal = episodes, signal
         height, width = episodes[0].pictures[0].shape[:2]
         self._factor = -(-MIN_WIDTH // width)
         height, width = self._factor * height, self._factor * width
@@ -109,48 +113,48 @@ class _Video:
         axes.locator_params(axis="x", integer=True)
         tidy(axes)
         # All frames share the limits.
-        trvs = np.concatenate([episode.trvs for episode in episodes])
+        signals = np.concatenate([episode.signals for episode in episodes])
         self._lines: list[Any] = []
         self._rows: Any = None
-        if trvs.shape[1] <= MAX_LINES:
-            self._draw_lines(trvs, horizon)
+        if signals.shape[1] <= MAX_LINES:
+            self._draw_lines(signals, horizon)
         else:
-            self._draw_rows(trvs, horizon)
+            self._draw_rows(signals, horizon)
         self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
 
-    def _draw_lines(self, trvs: np.ndarray, horizon: int) -> None:
+    def _draw_lines(self, signals: np.ndarray, horizon: int) -> None:
         """Draw a line for each TRV: ``(n, Z)``."""
         axes = self._axes
-        low, high = float(trvs.min()), float(trvs.max())
+        low, high = float(signals.min()), float(signals.max())
         margin = 0.05 * (high - low) or 1.0
         axes.set(xlim=(0, horizon), ylim=(low - margin, high + margin))
         axes.grid(alpha=0.25)
-        axes.set_ylabel(r"TRVs $\tilde{x}_t$", fontsize=9)
+        axes.set_ylabel(f"{self._signal}s {SYMBOLS[self._signal]}", fontsize=9)
         looks: dict[str, Any] = dict(linewidth=1.3, marker="o", markersize=2.5, clip_on=False)
         self._lines = [
             axes.plot([], [], label=str(i + 1), color=color, **looks)[0]
-            for i, color in zip(range(trvs.shape[1]), PALETTE, strict=False)
+            for i, color in zip(range(signals.shape[1]), PALETTE, strict=False)
         ]
         axes.legend(
-            title="TRV", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7, title_fontsize=8,
-            handlelength=1.2, labelspacing=0.2,
+            title=self._signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7,
+            title_fontsize=8, handlelength=1.2, labelspacing=0.2,
         )  # fmt: skip
 
-    def _draw_rows(self, trvs: np.ndarray, horizon: int) -> None:
+    def _draw_rows(self, signals: np.ndarray, horizon: int) -> None:
         """Draw a row of colours for each TRV: ``(n, Z)``."""
-        n_trvs = trvs.shape[1]
-        largest = float(np.abs(trvs).max()) or 1.0
+        n_signals = signals.shape[1]
+        largest = float(np.abs(signals).max()) or 1.0
         self._rows = self._axes.imshow(
-            np.full((n_trvs, horizon), np.nan), aspect="auto", interpolation="nearest", cmap="RdBu_r",
-            vmin=-largest, vmax=largest, extent=(-0.5, horizon - 0.5, n_trvs + 0.5, 0.5),
+            np.full((n_signals, horizon), np.nan), aspect="auto", interpolation="nearest", cmap="RdBu_r",
+            vmin=-largest, vmax=largest, extent=(-0.5, horizon - 0.5, n_signals + 0.5, 0.5),
         )  # fmt: skip
         self._axes.set_xlim(-0.5, horizon + 0.5)  # the last picture is of the end, after the last TRVs
-        self._axes.set_ylabel("TRV", fontsize=9)
+        self._axes.set_ylabel(self._signal, fontsize=9)
         box = self._axes.get_position()
         bar = self.figure.add_axes((box.x1 + 0.012, box.y0, 0.012, box.height))
         self.figure.colorbar(self._rows, cax=bar)
         bar.tick_params(labelsize=7, length=2)
-        bar.set_title(r"$\tilde{x}_t$", fontsize=9)
+        bar.set_title(SYMBOLS[self._signal], fontsize=9)
 
     def frames(self) -> Iterator[bool]:
         """Set the figure to one frame after the other; yield whether it is the last one of its episode."""
@@ -160,11 +164,11 @@ class _Video:
                 t = int(time)
                 self._picture.set_data(self._enlarged(picture))
                 self._now.set_xdata([time, time])
-                for line, values in zip(self._lines, episode.trvs.T, strict=False):
+                for line, values in zip(self._lines, episode.signals.T, strict=False):
                     line.set_data(np.arange(len(values))[: t + 1], values[: t + 1])
                 if self._rows is not None:
                     shown = np.full(self._rows.get_array().shape, np.nan)
-                    shown[:, : min(t + 1, len(episode.trvs))] = episode.trvs[: t + 1].T
+                    shown[:, : min(t + 1, len(episode.signals))] = episode.signals[: t + 1].T
                     self._rows.set_data(shown)
                 self._axes.set_title(
                     f"episode {number}, step {t}: cost so far {cost_so_far[t]:.2f}", loc="left", fontsize=9, color=INK

@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.animation import Episode, check_animation_path, save_animation
-from sb3_tdpg.evaluation.environments import check_models_fit
+from sb3_tdpg.evaluation.environments import check_models_fit, wrapped_for
+from sb3_tdpg.evaluation.loading import load_model
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.tdpg import TDPG
@@ -31,13 +32,15 @@ def enjoy(
     """
     Run episodes of a saved model and print the cost and the final state of each.
 
-    :param model_path: File written by ``model.save``.
+    :param model_path: File written by ``model.save`` of TDPG, Stable-Baselines3 or sb3-contrib; see
+        :func:`~sb3_tdpg.report.load_model`.
     :param env_id: A registered id, also in the ``module:id`` form.
     :param env_kwargs: Keywords of the environment's constructor.
     :param seed: Seed of the environment and of the policy's sampling.
     :param n_episodes: Number of episodes.
     :param deterministic: Act without noise, which changes the policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param record: Write a video there, ``.gif`` or ``.mp4``. A method ``film`` of the environment returns the pictures
+    :param record: Write a video there, ``.gif`` or ``.mp4``, with the TRVs below the picture; of other models, the
+        actions. A method ``film`` of the environment returns the pictures
         between two steps.
     :return: the episodes; without ``record`` they have no pictures
     :raises ValueError: if there is no model, it does not fit the environment, or a video cannot be made.
@@ -46,32 +49,32 @@ def enjoy(
     if record is not None:
         check_animation_path(record)
         env_kwargs.setdefault("render_mode", "rgb_array")
-    try:
-        model = TDPG.load(Path(model_path))
-    except OSError as e:
-        raise ValueError(f"{model_path} cannot be read ({e.strerror}): give the .zip file of model.save()") from e
+    model = load_model(Path(model_path), env_id, env_kwargs)
+    has_trvs = isinstance(model, TDPG)
     check_models_fit({str(model_path): model}, [Scenario("enjoy", env_id, env_kwargs)])
     env = gym.make(env_id, **env_kwargs)
     fps = env.metadata.get("render_fps", 10)
-    with contextlib.closing(DummyVecEnv([lambda: _Recorder(env, record is not None)])) as vec_env:
+    recorded = DummyVecEnv([lambda: _Recorder(env, record is not None)])
+    with contextlib.closing(wrapped_for(model, recorded)) as vec_env:
         if record is not None and env.render_mode != "rgb_array":
             raise ValueError(f"{env_id} needs render_mode='rgb_array' to be recorded, not {env.render_mode!r}")
         episodes: list[Episode] = []
-        trvs: list[np.ndarray] = []
+        signals: list[np.ndarray] = []
         for step in rollout(model, vec_env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic):
-            trvs.append(step.memory[0][0])
+            signals.append(step.memory[0][0] if has_trvs else np.ravel(step.actions[0]))
             if step.finished[0]:
                 pictures, costs, between = step.infos[0]["recorded"]
-                episodes.append(Episode(pictures, np.stack(trvs), np.array(costs), between))
+                episodes.append(Episode(pictures, np.stack(signals), np.array(costs), between))
                 text = f"episode {len(episodes)}: cost {episodes[-1].costs.sum():.2f}"
                 if (state := step.infos[0].get("state")) is not None:
                     text += f", final state {np.array2string(np.asarray(state), precision=3, suppress_small=True)}"
                 print(text, flush=True)
-                trvs = []
+                signals = []
     if n_episodes > 1:
         print(f"mean cost {np.mean([episode.costs.sum() for episode in episodes]):.2f}")
     if record is not None:
-        save_animation(episodes, record, horizon=model.horizon, fps=fps)
+        horizon = model.horizon if has_trvs else max(len(episode.costs) for episode in episodes)
+        save_animation(episodes, record, horizon=horizon, fps=fps, signal="TRV" if has_trvs else "action")
         print(f"the video is {record}")
     return episodes
 

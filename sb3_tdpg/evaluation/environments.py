@@ -8,7 +8,7 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
@@ -20,21 +20,36 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
     Make a new environment of a scenario (see ``make_episodes_env``), wrapped as an SB3 model needs it.
 
     If the model's own environment normalises observations (``VecNormalize``), the new one does so with the same
-    statistics, frozen. The scenario's ``sensor`` is put around the environment, inside the wrappers of the model.
+    statistics, frozen. If the model's observations are stacked (``VecFrameStack``), the new ones are, too. The
+    scenario's ``sensor`` is put around the environment, inside the wrappers of the model.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
     )
-    if scenario.sensor is not None:
-        env = scenario.sensor(env)
+    return wrapped_for(model, env if scenario.sensor is None else scenario.sensor(env))
+
+
+def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
+    """Wrap a new environment as an SB3 model needs it; see :func:`scenario_env`."""
     if (normalize := model.get_vec_normalize_env()) is not None:
         normalize = copy.copy(normalize)  # without an environment
         normalize.set_venv(env)
         normalize.training = normalize.norm_reward = False
         env = normalize
+    env = stacked_for(model, env)
     space = env.observation_space
     if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
         env = VecTransposeImage(env)  # as SB3 wraps the environment that it trains on
+    return env
+
+
+def stacked_for(model: Any, env: VecEnv) -> VecEnv:
+    """Stack as many observations as a model was trained on at once (``VecFrameStack``)."""
+    own, single = model.observation_space, env.observation_space
+    if type(own) is type(single) and isinstance(own, (spaces.Box, spaces.Dict)):
+        n_stack, rest = divmod(spaces.flatdim(own), spaces.flatdim(single))
+        if n_stack > 1 and not rest:
+            return VecFrameStack(env, n_stack)
     return env
 
 

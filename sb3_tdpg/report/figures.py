@@ -18,7 +18,6 @@ from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, legend_above, log_axis, new_panels
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
-from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.report.numbers import Numbers
 from sb3_tdpg.report.records import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^vP"
-MAX_STEPS = 500  # of the episode that shows the perturbations
+MAX_STEPS = 100  # of the episode that shows the perturbations: more cannot be told apart
 
 
 def degradation_curves(numbers: Numbers) -> Figure:
@@ -121,7 +120,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     The model acts on the unperturbed observations, so that the true episode is the same in all panels. The component is
     the one that varies most, in multiples of its scale.
     """
-    observations, space, horizon = _episode(plan, model)
+    observations, space = _episode(plan, model)
     scales = plan.scale if isinstance(plan.scale, Mapping) else {"": plan.scale}
     parts = {key: np.concatenate([_part(each, key) for each in observations]) for key in scales}  # (T, *obs)
     spread = {
@@ -136,7 +135,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     dots = "." if len(unperturbed) <= 30 else ""
     for axes, name in zip(panels.flat, names, strict=False):
         for row in (row for row in rows if row.perturbation == name):
-            how: dict[str, Any] = dict(seed=plan.seed, scale=plan.scale, horizon=horizon)
+            how: dict[str, Any] = dict(seed=plan.seed, scale=plan.scale, horizon=len(observations))
             perturber = Perturber(find(name), row.severity, space, 1, **how)
             seen = [_part(perturber(observation), key).ravel()[component] for observation in observations]
             color = shades(0.1 + 0.8 * row.severity / 5)
@@ -170,8 +169,8 @@ class _Recorder(VecEnvWrapper):
         return step
 
 
-def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space, int]:
-    """Return the observations of an episode, each ``(1, *obs)``, their space, and the longest episode."""
+def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space]:
+    """Return the first observations of an episode, each ``(1, *obs)``, and their space."""
     recorders: list[_Recorder] = []
 
     def sensor(env: VecEnv) -> VecEnv:
@@ -183,7 +182,7 @@ def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space, int]:
         steps = rollout(model, env, 1, seeds=evaluation_seeds(plan.seed), deterministic=plan.deterministic)
         n_steps = len(list(islice(steps, MAX_STEPS)))
         (recorder,) = recorders
-        return recorder.seen[:n_steps], recorder.observation_space, horizon_of(env) or n_steps
+        return recorder.seen[:n_steps], recorder.observation_space
 
 
 def _grid(n: int) -> tuple[Figure, np.ndarray]:

@@ -11,10 +11,13 @@ from gymnasium import spaces
 from PIL import Image
 from small_problems import ToyEnv, tiny_tdpg
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_tdpg.cli import main, parse_keywords
 from sb3_tdpg.evaluation.animation import Episode, save_animation
 from sb3_tdpg.evaluation.enjoy import enjoy
+from sb3_tdpg.evaluation.randomness import evaluation_seeds
 
 pytest.importorskip("matplotlib")
 
@@ -105,10 +108,10 @@ def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(lava, cap
 
 def test_a_deterministic_policy_repeats_an_episode_that_starts_alike(ball):
     first, second = enjoy(ball, "BallCatch-v0", SAME_START, n_episodes=2, deterministic=True)
-    np.testing.assert_array_equal(first.trvs, second.trvs)
+    np.testing.assert_array_equal(first.signals, second.signals)
     np.testing.assert_array_equal(first.costs, second.costs)
     first, second = enjoy(ball, "BallCatch-v0", SAME_START, n_episodes=2)
-    assert not np.array_equal(first.trvs, second.trvs)
+    assert not np.array_equal(first.signals, second.signals)
 
 
 def test_recording_does_not_change_the_episodes(ball, tmp_path):
@@ -116,7 +119,7 @@ def test_recording_does_not_change_the_episodes(ball, tmp_path):
     episodes = enjoy(ball, "BallCatch-v0", **settings)
     recorded = enjoy(ball, "BallCatch-v0", **settings, record=tmp_path / "film.mp4")
     for episode, seen in zip(episodes, recorded, strict=True):
-        np.testing.assert_array_equal(episode.trvs, seen.trvs)
+        np.testing.assert_array_equal(episode.signals, seen.signals)
         np.testing.assert_array_equal(episode.costs, seen.costs)
 
 
@@ -169,9 +172,9 @@ def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(registered, tm
     env_id = registered(PictureEnv)
     tiny_tdpg(gym.make(env_id)).save(tmp_path / "model.zip")
     episodes = enjoy(tmp_path / "model.zip", env_id, n_episodes=6, record=tmp_path / "film.gif")
-    assert {len(episode.trvs) for episode in episodes} == {1, 3}
+    assert {len(episode.signals) for episode in episodes} == {1, 3}
     frames, _ = frames_of(tmp_path / "film.gif")
-    assert len(frames) == sum(len(episode.trvs) + 1 for episode in episodes)
+    assert len(frames) == sum(len(episode.signals) + 1 for episode in episodes)
     assert frames[0].shape == (8 * 30 + 190, 8 * 50, 3)
 
 
@@ -288,15 +291,10 @@ def a_folder(path):
 
 def no_zip(path):
     path.write_text("text")
-    return "wasn't a zip-file"
+    return "cannot be read (File is not a zip file)"
 
 
-def a_model_of_ppo(path):
-    PPO("MlpPolicy", "Lava-v0", device="cpu").save(path)
-    return "another algorithm saved it"
-
-
-@pytest.mark.parametrize("make", [a_missing_file, a_folder, no_zip, a_model_of_ppo])
+@pytest.mark.parametrize("make", [a_missing_file, a_folder, no_zip])
 def test_what_is_no_model_is_reported_in_one_line_with_exit_code_2(make, tmp_path, capsys):
     path = tmp_path / "model.zip"
     expected = make(path)
@@ -329,3 +327,53 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
     assert main(["enjoy", str(lava), "--env", "Lava-v0", "--record", str(tmp_path / "film.gif")]) == 130
     assert capsys.readouterr().err.strip() == "interrupted"
     assert not list(tmp_path.iterdir())
+
+
+# -- other algorithms ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "RecurrentPPO", "DQN"])
+def test_models_of_other_algorithms_are_played(algorithm, registered, tmp_path, capsys):
+    import sb3_contrib
+    import stable_baselines3
+
+    registered(PictureEnv)
+    make = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
+    policy = "MlpLstmPolicy" if algorithm == "RecurrentPPO" else "MlpPolicy"
+    make(policy, "Own-v0", seed=0, device="cpu").save(tmp_path / "own.zip")
+    film = tmp_path / "film.gif"
+    episodes = enjoy(tmp_path / "own.zip", "Own-v0", n_episodes=3, record=film)
+    assert costs_printed(capsys.readouterr().out) == pytest.approx(
+        [episode.costs.sum() for episode in episodes], abs=0.01
+    )
+    for episode in episodes:
+        assert episode.signals.shape == (len(episode.costs), 1)  # the actions
+        assert set(episode.signals.ravel()) <= {0, 1}
+    assert len(frames_of(film)[0]) == sum(len(episode.costs) + 1 for episode in episodes)
+
+
+@pytest.mark.filterwarnings("ignore:You are trying to run PPO")
+def test_a_model_plays_with_the_statistics_and_the_stack_of_its_training(tmp_path):
+    """As the zoo saves it: normalised first, then stacked."""
+    normalized = VecNormalize(make_vec_env("Pendulum-v1", 2, seed=0), norm_reward=False)
+    model = PPO("MlpPolicy", VecFrameStack(normalized, 3), n_steps=20, batch_size=10, seed=0, device="cpu").learn(40)
+    model.save(tmp_path / "Pendulum-v1.zip")
+    (tmp_path / "Pendulum-v1").mkdir()
+    normalized.save(tmp_path / "Pendulum-v1" / "vecnormalize.pkl")
+    (episode,) = enjoy(tmp_path / "Pendulum-v1.zip", "Pendulum-v1", deterministic=True)
+
+    env = make_vec_env("Pendulum-v1", 1)
+    env = VecFrameStack(VecNormalize.load(tmp_path / "Pendulum-v1" / "vecnormalize.pkl", env), 3)
+    env.unwrapped.seed(evaluation_seeds(0).env)
+    env.venv.training = False
+    observation = env.reset()
+    for expected in episode.signals:
+        action, _ = model.predict(observation, deterministic=True)
+        np.testing.assert_allclose(action[0], expected, rtol=1e-5)
+        observation, *_ = env.step(action)
+
+
+def test_a_model_of_another_environment_is_not_taken_for_a_stack(tmp_path, capsys):
+    PPO("MlpPolicy", "CartPole-v1", n_steps=10, batch_size=10, device="cpu").save(tmp_path / "model.zip")
+    assert main(["enjoy", str(tmp_path / "model.zip"), "--env", "Lava-v0"]) == 2  # 4 components there, 2 here
+    assert "does not fit" in capsys.readouterr().err

@@ -1,0 +1,70 @@
+"""Load the models of any algorithm."""
+
+import json
+import zipfile
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from sb3_tdpg.evaluation.environments import load_statistics, stacked_for
+from sb3_tdpg.vec_env import make_episodes_env
+
+# A model is recognised by the module of its policy, or by a setting that only its algorithm has.
+ALGORITHMS = {
+    "sb3_tdpg.": "sb3_tdpg:TDPG",
+    "sb3_contrib.common.recurrent.": "sb3_contrib:RecurrentPPO",
+    "sb3_contrib.common.maskable.": "sb3_contrib:MaskablePPO",
+    "sb3_contrib.ars.": "sb3_contrib:ARS",
+    "sb3_contrib.crossq.": "sb3_contrib:CrossQ",
+    "sb3_contrib.qrdqn.": "sb3_contrib:QRDQN",
+    "sb3_contrib.tqc.": "sb3_contrib:TQC",
+    "stable_baselines3.dqn.": "stable_baselines3:DQN",
+    "stable_baselines3.sac.": "stable_baselines3:SAC",
+    "stable_baselines3.td3.": "stable_baselines3:TD3",  # and DDPG, which acts in the same way
+}
+SETTINGS = {
+    "mi_estimator": "sb3_tdpg:TDPG",
+    "cg_max_steps": "sb3_contrib:TRPO",
+    "clip_range": "stable_baselines3:PPO",
+    "normalize_advantage": "stable_baselines3:A2C",
+}
+
+
+def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
+    """
+    Load a model of TDPG, Stable-Baselines3 or sb3-contrib, and recognise its algorithm from the file.
+
+    If rl-zoo3 has saved a ``vecnormalize.pkl`` beside it, observations are normalised as in training. Loading unpickles
+    the file, which can run any code: load only files that you trust.
+
+    :param path: The file that ``model.save`` wrote.
+    :param env_id: Id of the environment, for the normalisation.
+    :param env_kwargs: Keywords of the environment.
+    :raises ValueError: if the file cannot be read, or its algorithm is unknown.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            settings = dict(json.loads(archive.read("data")))
+    except Exception as e:  # damaged bytes lead to any error
+        reason = e.strerror if isinstance(e, OSError) else e
+        raise ValueError(f"{path} cannot be read ({reason}): give the .zip file that model.save() wrote") from e
+    policy = settings.get("policy_class")
+    module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
+    known = [name for prefix, name in ALGORITHMS.items() if module.startswith(prefix)]
+    known += [name for setting, name in SETTINGS.items() if setting in settings]
+    if not known:
+        raise ValueError(f"{path} is of an unknown algorithm: load it in Python")
+    package, name = known[0].split(":")
+    try:
+        model = getattr(import_module(package), name).load(path, device="cpu")
+    except Exception as e:
+        reason = " ".join(str(e).split())
+        if str(path) in reason:
+            raise ValueError(reason) from e
+        raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
+    statistics = [path.parent / "vecnormalize.pkl", path.with_suffix("") / "vecnormalize.pkl"]
+    if found := [each for each in statistics if each.is_file()]:
+        env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
+        model.set_env(stacked_for(model, load_statistics(found[0], env)))
+    return model
