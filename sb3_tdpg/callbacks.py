@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import time
 import warnings
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple, cast
@@ -223,13 +225,21 @@ class TrainingCheckpointCallback(TDPGCallback):
 
 
 class TDPGProgressBar(ProgressBarCallback):
-    """SB3's progress bar with the epoch's cost and information, and the failures where episodes report success."""
+    """
+    SB3's progress bar with the epoch's cost and information, and the failures where episodes report success.
+
+    Where the output is no terminal a bar shows nothing before its end: then a line is printed every half minute.
+    """
+
+    SECONDS = 30.0
 
     _open: ClassVar[list[TDPGProgressBar]] = []
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
         self._open.append(self)
+        self._started = time.monotonic()
+        self._next_line = 0.0 if _needs_lines() else math.inf
 
     @classmethod
     def close(cls) -> None:
@@ -245,6 +255,16 @@ class TDPGProgressBar(ProgressBarCallback):
         if model.information is not None:
             shown += f", {model.information.sum():.2f} nat"
         self.pbar.set_description(shown, refresh=False)  # tqdm.rich shows no postfix
+        if (now := time.monotonic()) >= self._next_line:
+            self._next_line = now + self.SECONDS
+            total = model.num_timesteps + model.remaining_timesteps
+            print(f"{now - self._started:.0f} s: {model.num_timesteps:,} of {total:,} steps, {shown}", flush=True)
+
+
+def _needs_lines() -> bool:
+    from rich import get_console
+
+    return not (get_console().is_terminal or get_console().is_jupyter)
 
 
 def _zip_path(path: str | os.PathLike[str]) -> Path:

@@ -1,6 +1,7 @@
 """TDPG does what users of Stable-Baselines3 expect of any of its algorithms."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -217,6 +218,17 @@ def test_the_progress_bar_runs(capsys):
     pytest.importorskip("rich")
     train_epochs(tiny_tdpg(), 2, progress_bar=True)
     assert "200/200" in (output := capsys.readouterr()).out + output.err
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_progress_has_lines_where_there_is_no_terminal(monkeypatch, capsys, is_terminal):
+    rich = pytest.importorskip("rich")
+    monkeypatch.setattr(type(rich.get_console()), "is_terminal", is_terminal)
+    monkeypatch.setattr(TDPGProgressBar, "SECONDS", 0.0)
+    train_epochs(tiny_tdpg(), 2, progress_bar=True)
+    lines = [line for line in capsys.readouterr().out.splitlines() if " of 200 steps, cost " in line]
+    assert [re.sub(r"^\d+ s: ", "", line).split(" of")[0] for line in lines] == ([] if is_terminal else ["100", "200"])
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")
