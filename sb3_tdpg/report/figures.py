@@ -129,13 +129,14 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     key = max(spread, key=lambda key: spread[key].max())
     component = int(np.argmax(spread[key]))
     unperturbed = parts[key].reshape(len(observations), -1)[:, component]
+    shown = {"shown": [key or component]}  # of all groups that can fail
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
     shades = import_matplotlib().colormaps["viridis_r"]
     dots = "." if len(unperturbed) <= 30 else ""
     for axes, name in zip(panels.flat, names, strict=False):
         for row in (row for row in rows if row.perturbation == name):
-            how: dict[str, Any] = dict(seed=plan.seed, scale=plan.scale, horizon=len(observations))
+            how: dict[str, Any] = dict(seed=plan.seed, scale=plan.scale, horizon=len(observations), groups=shown)
             perturber = Perturber(find(name), row.severity, space, 1, **how)
             seen = [_part(perturber(observation), key).ravel()[component] for observation in observations]
             color = shades(0.1 + 0.8 * row.severity / 5)
