@@ -62,7 +62,10 @@ class TrustBadge:
     def _warning(self) -> str:
         if not self.capped_steps:
             return ""
-        steps = ", ".join(map(str, self.capped_steps))
+        # Runs of steps: "0 to 199".
+        breaks = np.flatnonzero(np.diff(self.capped_steps) != 1) + 1
+        runs = np.split(np.array(self.capped_steps), breaks)
+        steps = ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
         return f"; warning: at the ln N cap at t = {steps}: the lower limit can be far too low, use more episodes"
 
 

@@ -37,7 +37,7 @@ from sb3_tdpg.vec_env import make_episodes_env
 
 N_INFORMATION = 500  # episodes
 N_STEPS = 10_000  # of each model in each row
-PAUSE = 9  # between two unfinished pages, as a multiple of the time that one takes to write
+PAUSE = 4  # between two unfinished pages, as a multiple of the time that one takes to write
 DPI = 110
 
 
@@ -159,6 +159,8 @@ class _Writer:
         # A mean over the mild severities alone would look better than it is.
         open_names = {row.perturbation for row in self.rows if row not in records and row.kind != "own"}
         rows = [row for row in self.rows if row in records and row.perturbation not in open_names]
+        if len(rows) == 1:  # not a perturbation yet
+            return
         self.write(rows, pd.concat([records[row] for row in rows], ignore_index=True))
         self.not_before = time.monotonic() + PAUSE * (time.monotonic() - began)
 
@@ -284,7 +286,7 @@ def _save(figure: Any, out: Path, name: str) -> str:
 
 
 def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: bool) -> list[Knowledge]:
-    """Measure the information in the TRVs of the first model of each method; long episodes take a minute each."""
+    """Measure the information in the TRVs of the first model of each method; long episodes take many minutes."""
     firsts = {label: of_method[0] for label, of_method in models.items()}
     total = len(ESTIMATES) * sum(isinstance(model, TDPG) for model in firsts.values())
     known = []
@@ -307,7 +309,10 @@ def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: 
 def _knowledge(label: str, report: InformationReport, out: Path, prefix: str) -> Knowledge:
     figures = [_save(figure, out, f"{prefix}-{name}") for name, figure in report.figures().items()]
     lower, upper = report.interval.total
-    trust = "all checks passed" if report.badge.passed else "**not reliable**: a check failed"
+    failed = ", ".join(check.name for check in report.badge.checks if not check.passed)
+    trust = f"**not reliable**: failed {failed}" if failed else "all checks passed"
+    if n_capped := len(report.badge.capped_steps):
+        trust += f"; at {n_capped} time steps the lower limit is at its cap, ln {N_INFORMATION}, and can be far too low"
     text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over the time steps of an episode ({trust})."
     if n_left_out := report.interval.n_left_out:
         text += f" **Left out**: {n_left_out} time steps that too few of the {N_INFORMATION} episodes reach."

@@ -90,3 +90,8 @@ def test_a_value_that_is_no_number_is_no_pass():
 def test_nothing_to_be_checked_is_an_error():
     with pytest.raises(ValueError, match="no time step has an interval to check: at most 10 episodes"):
         trust_checks(random_batch(n=10))
+
+
+def test_many_capped_steps_are_told_as_runs():
+    badge = TrustBadge((), (0, 1, 2, 5, 8, 9))
+    assert "at t = 0 to 2, 5, 8 to 9:" in str(badge)

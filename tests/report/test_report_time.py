@@ -1,12 +1,14 @@
 """What a report costs: a budget of steps, a page that fills as rows finish, information only where it is asked for."""
 
 import re
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
 from small_problems import CountdownEnv, tiny_tdpg
 from stable_baselines3 import PPO
 
+from sb3_tdpg.measurement import TrustBadge, TrustCheck
 from sb3_tdpg.report import main as report_main
 from sb3_tdpg.report import records, robustness_report
 
@@ -80,8 +82,10 @@ def test_the_page_of_an_interrupted_report_has_what_is_finished(tmp_path, monkey
 def test_unfinished_pages_take_a_small_share_of_the_time(tmp_path, monkeypatch):
     written, write = [], report_main.to_html
     monkeypatch.setattr(report_main, "to_html", lambda *args, **how: written.append(how) or write(*args, **how))
-    report_of(tmp_path, severities=[1, 2, 3, 4, 5], progress_bar=False)
-    assert written == [dict(reload=True), dict(reload=False)]  # the rows take less time than ten pages
+    names = ["vector_bias", "vector_noise", "vector_scale"]
+    report_of(tmp_path, perturbations=names, severities=[5], progress_bar=False)
+    # The first one has a perturbation, and the other rows take less time than four pages.
+    assert written == [dict(reload=True), dict(reload=False)]
 
 
 # -- the information in the TRVs -------------------------------------------------------------------------------------
@@ -105,6 +109,17 @@ def test_the_estimates_of_the_information_show_their_progress(tmp_path, capsys, 
         assert words in page
     report_of(tmp_path, models, information=True, progress_bar=False)
     assert capsys.readouterr().err == ""
+
+
+def test_a_failed_check_and_a_capped_limit_are_told_beside_the_number(tmp_path):
+    interval = SimpleNamespace(total=(1.0, 2.0), n_left_out=0)
+    for value, words in (
+        (1.0, "**not reliable**: failed components; at 2 time steps"),
+        (0.0, "all checks passed; at 2"),
+    ):
+        badge = TrustBadge((TrustCheck("components", value, 0.0, "nats"),), (0, 1))
+        report = SimpleNamespace(figures=dict, interval=interval, badge=badge)
+        assert words in report_main._knowledge("A", report, tmp_path, "information").text
 
 
 class FirstEpisodeEnv(CountdownEnv):
