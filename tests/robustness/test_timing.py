@@ -276,18 +276,21 @@ def test_one_environment_with_a_dict_shows_what_many_show():
 
 def test_the_images_of_a_stack_are_perturbed_one_by_one():
     """As what the wrapper of one image shows, with the same square in all images of an episode."""
-    stack = gym.wrappers.FrameStackObservation(PictureEnv(layout="CHW"), 3, padding_type="zero")
-    env = perturbed(DummyVecEnv([lambda: stack]), "occlusion", 3)
+
+    def stack(_):
+        return gym.wrappers.FrameStackObservation(PictureEnv(layout="CHW"), 3, padding_type="zero")
+
+    env = perturbed(dummy(stack, 2), "occlusion", 3)
     assert env.observation_space.shape == (3, 3, 24, 24)
-    single = perturbed(dummy(lambda _: PictureEnv(layout="CHW"), 1), "occlusion", 3)
+    single = perturbed(dummy(lambda _: PictureEnv(layout="CHW"), 2), "occlusion", 3)
     for each in (env, single):
         each.seed(0)
-    seen = [single.reset()[0]]
+    seen = [single.reset()]
     env.reset()
     for _ in range(4):
-        seen.append(single.step(np.zeros((1, 1), np.float32))[0][0])
-        stacked = env.step(np.zeros((1, 1), np.float32))[0][0]
-    np.testing.assert_array_equal(stacked, np.stack(seen[-3:]))
+        seen.append(single.step(np.zeros((2, 1), np.float32))[0])
+        stacked = env.step(np.zeros((2, 1), np.float32))[0]
+    np.testing.assert_array_equal(stacked, np.stack(seen[-3:], axis=1))
 
 
 def test_a_stack_around_the_wrapper_holds_what_it_showed():
