@@ -105,7 +105,10 @@ class _Recorder(gym.Wrapper):
         return observation, reward, terminated, truncated, {**info, "recorded": recorded}
 
     def _picture(self) -> np.ndarray:
-        picture = self.env.render()
+        try:
+            picture: Any = self.env.render()
+        except gym.error.DependencyNotInstalled as e:
+            raise ValueError(f"{self.env} cannot be drawn: {e}") from e
         if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
             raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
         return picture

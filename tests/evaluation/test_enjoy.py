@@ -329,6 +329,19 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+def test_a_missing_package_for_pictures_is_told_in_a_line(registered, tmp_path, monkeypatch, capsys):
+    def render(self):
+        raise gym.error.DependencyNotInstalled("pygame is not installed")
+
+    registered(PictureEnv)
+    monkeypatch.setattr(PictureEnv, "render", render)
+    tiny_tdpg("Own-v0").save(tmp_path / "own.zip")
+    film = tmp_path / "film.gif"
+    assert main(["enjoy", str(tmp_path / "own.zip"), "--env", "Own-v0", "--record", str(film)]) == 2
+    assert "cannot be drawn: pygame is not installed" in capsys.readouterr().err
+    assert not film.exists()
+
+
 # -- other algorithms ------------------------------------------------------------------------------------------------
 
 
