@@ -5,10 +5,12 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
+
+from tqdm import tqdm
 
 from sb3_tdpg.common.threads import set_threads
 
@@ -32,15 +34,16 @@ def process_pool(
     # All workers are forked from one process that has imported the package once and computed nothing.
     context: Any = mp.get_context("spawn")
     if "forkserver" in mp.get_all_start_methods():
-        from multiprocessing import forkserver
+        from multiprocessing import forkserver, resource_tracker
 
         context = mp.get_context("forkserver")
         context.set_forkserver_preload(["sb3_tdpg.tdpg"])
-        with _ignoring_ctrl_c():  # also while the server imports
+        resource_tracker.ensure_running()  # it would unblock what follows
+        with _postponing_ctrl_c(), _blocking_ctrl_c():  # the server is not to hear it while it imports
             forkserver.ensure_running()
     # Only this process holds the writing end, so the workers see when it is closed, or when this process has died.
     reading, writing = context.Pipe(duplex=False)
-    with ProcessPoolExecutor(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
+    with _Pool(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
         try:
             yield pool
         except BaseException:
@@ -50,22 +53,45 @@ def process_pool(
         writing.close()
 
 
+class _Pool(ProcessPoolExecutor):
+    """Hears Ctrl-C only after a worker has started: otherwise nobody waits for it, and it finds its queues gone."""
+
+    def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
+        with _postponing_ctrl_c():
+            return super().submit(*args, **kwargs)
+
+
 @contextmanager
-def _ignoring_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C, here and for good in processes that are started meanwhile; in threads do nothing."""
+def _postponing_ctrl_c() -> Iterator[None]:
+    """Act on Ctrl-C at the end of the block; in threads do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    pressed: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
+        if pressed:
+            signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def _blocking_ctrl_c() -> Iterator[None]:
+    """Start processes that never hear Ctrl-C."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _start_worker(reading: Connection, initializer: Callable[..., Any] | None, initargs: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_at_end_of, args=(reading,), daemon=True).start()
+    # By default it is a semaphore between processes, which a worker that is stopped would leave behind.
+    tqdm.set_lock(threading.RLock())
     set_threads(1)
     if initializer is not None:
         initializer(*initargs)

@@ -90,3 +90,39 @@ def test_workers_end_with_the_main_process(name, tmp_path):
         error = process.communicate(timeout=30)[1]
     assert error.count("Traceback") == (name == "SIGINT")
     assert [(tmp_path / name).exists() and (tmp_path / name).read_text() for name in "abc"] == ["started"] * 2 + [False]
+
+
+def test_a_worker_that_is_stopped_leaves_no_semaphore_of_its_progress_bars(tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text(
+        "from tqdm import tqdm\nfrom sb3_tdpg.common.processes import process_pool\n"
+        "def work():\n    list(tqdm(range(3), disable=True))\n    list(tqdm(range(3), file=open('/dev/null', 'w')))\n"
+        "if __name__ == '__main__':\n    with process_pool(1) as pool:\n        pool.submit(work).result()\n"
+        "        raise SystemExit('stopped')\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.stderr == "stopped\n"
+
+
+def test_ctrl_c_while_the_workers_start_is_told_once_and_not_lost(tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM.replace("with process_pool", "print('begins', flush=True)\n    with process_pool"))
+    process = subprocess.Popen(
+        [sys.executable, script],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    with process:
+        assert process.stdout.readline() == "begins\n"
+        time.sleep(0.5)  # the server of the workers imports for seconds
+        os.killpg(process.pid, signal.SIGINT)
+        error = process.communicate(timeout=60)[1]
+    assert error.count("Traceback") == 1
+    assert error.endswith("KeyboardInterrupt\n")
+    assert not (tmp_path / "c").exists()
