@@ -31,6 +31,29 @@ def test_what_could_not_be_written_leaves_the_old_file_and_nothing_else(tmp_path
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_what_a_killed_process_has_left_is_removed_the_next_time_and_nothing_else(tmp_path):
+    script = (
+        "import os, signal, sys; from pathlib import Path; from sb3_tdpg.common.files import replaced_atomically\n"
+        f"with replaced_atomically(Path({str(tmp_path / 'model.zip')!r})) as partial:\n"
+        "    partial.write_text('half'); print('writes', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdin=-1, stdout=-1, text=True) as process:
+        assert process.stdout.readline() == "writes\n"
+        (left,) = tmp_path.iterdir()
+        other = tmp_path / "model2.zip.abc.partial"
+        other.mkdir()
+        for old in (left, other):
+            os.utime(old, (0, 0))
+        write_atomically(tmp_path / "model.zip", "whole")
+        assert left.exists(), "it is being written"
+        process.kill()
+        process.wait()
+    new = tmp_path / "model.zip.new.partial"
+    new.mkdir()
+    write_atomically(tmp_path / "model.zip", "whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"model.zip", new.name, other.name}
+
+
 def test_content_and_folder_are_flushed_before_and_after_the_file_is_replaced(tmp_path, monkeypatch):
     done = []
     replace = os.replace
