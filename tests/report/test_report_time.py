@@ -2,12 +2,14 @@
 
 import re
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import gymnasium as gym
 import pytest
 from small_problems import CountdownEnv, tiny_tdpg
 from stable_baselines3 import PPO
 
+from sb3_tdpg.cli import main
 from sb3_tdpg.measurement import TrustBadge, TrustCheck
 from sb3_tdpg.report import main as report_main
 from sb3_tdpg.report import records, robustness_report
@@ -120,6 +122,16 @@ def test_a_failed_check_and_a_capped_limit_are_told_beside_the_number(tmp_path):
         badge = TrustBadge((TrustCheck("components", value, 0.0, "nats"),), (0, 1))
         report = SimpleNamespace(figures=dict, interval=interval, badge=badge)
         assert words in report_main._knowledge("A", report, tmp_path, "information").text
+
+
+def test_the_command_takes_a_budget_of_steps_and_measures_information_if_asked(tmp_path, monkeypatch):
+    given = Mock()
+    monkeypatch.setattr("sb3_tdpg.report.robustness_report", given)
+    tiny_tdpg().save(tmp_path / "model.zip")
+    arguments = ["report", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--out", str(tmp_path / "out")]
+    for flags, expected in (([], (10_000, False)), (["--steps", "60", "--information"], (60, True))):
+        assert main([*arguments, *flags]) == 0
+        assert (given.call_args.kwargs["n_steps"], given.call_args.kwargs["information"]) == expected
 
 
 class FirstEpisodeEnv(CountdownEnv):
