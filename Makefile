@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 OLDEST ?= .venv-oldest
 JOBS ?= 2
-EXTRAS ?= zoo,postgres,ray,hub,tests,plots,public,docs,dev
+EXTRAS ?= zoo,postgres,ray,hub,export,tests,plots,public,docs,dev
 
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed

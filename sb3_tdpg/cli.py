@@ -90,6 +90,13 @@ def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> 
     enjoy(model, env, parse_keywords(env_kwargs), **options)
 
 
+def _export(model: Path, out: Path | None, format: str | None) -> None:
+    from sb3_tdpg.export import export_model
+
+    say_what_is_trusted(model)
+    print(f"the policy's step is {export_model(model, out, format=format)}")
+
+
 def _zoo(program: str, arguments: Sequence[str]) -> None:
     try:
         from sb3_tdpg.zoo.programs import run
@@ -295,6 +302,11 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--n-episodes", type=_positive, default=1)
     add("--record", type=Path, help="write a video to this file, .gif or .mp4")
 
+    add = command(_export, "write one step of a saved TDPG policy for a robot: ONNX or TorchScript")
+    add("model", type=Path, help="the .zip file from model.save()")
+    add("--out", type=Path, help="the file (default: beside the model)")
+    add("--format", choices=("onnx", "torchscript"), help="default: that of the file's name, or onnx")
+
     text = "train with several betas and seeds, select by the paper's rule, plot cost against information"
     add = command(_sweep, text, "--env", "--jobs", *sizes)
     add("--betas", nargs="+", required=True, metavar="BETA", help="1/25 1/50 0.01 inf ...")
@@ -331,8 +343,11 @@ def _make_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--perturbations", nargs="+", metavar="NAME", help="default: all that apply to the observation")
     add("--severities", nargs="+", type=int, default=(1, 2, 3, 4, 5), metavar="N", help="1 to 5")
-    text = "per model and row (default: 100 for images, 500 for vectors)"
+    text = "per model and row (default: as many as fit into --steps, at most 100 for images and 500 for vectors)"
     add("--episodes", dest="n_episodes", type=_positive, help=text)
+    add("--steps", dest="n_steps", type=_positive, default=10_000, help="per model and row, at most (default: 10000)")
+    text = "also measure the information in the TRVs, which takes long with long episodes"
+    add("--information", action="store_true", help=text)
     add("--out", type=Path, help="folder for the report (default: results/report-<env>)")
 
     add = command(_push, "publish a trained model and its card on the Hugging Face Hub")

@@ -258,15 +258,19 @@ class TRVPolicy(BasePolicy):
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
         """Return the distribution of the action from the head's outputs, ``(n, ...)`` with one batch dimension."""
         if isinstance(self.action_dist, DiagGaussianDistribution):
-            shared = self.shared_action_noise
-            mean, log_var = (parameters, self.action_log_var) if shared else parameters.chunk(2, dim=-1)
-            variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
-            log_std = 0.5 * th.log(variance).expand_as(mean)
-            if self.scale_actions:
-                mean = self.action_middle + self.action_range * mean
-                log_std = log_std + self.action_range.log()
-            return self.action_dist.proba_distribution(mean, log_std)
+            return self.action_dist.proba_distribution(*self.action_gaussian(parameters))
         return self.action_dist.proba_distribution(parameters)
+
+    def action_gaussian(self, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return mean and log standard deviation of Box actions, ``(n, U)`` each, from the head's outputs."""
+        shared = self.shared_action_noise
+        mean, log_var = (parameters, self.action_log_var) if shared else parameters.chunk(2, dim=-1)
+        variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
+        log_std = 0.5 * th.log(variance).expand_as(mean)
+        if self.scale_actions:
+            mean = self.action_middle + self.action_range * mean
+            log_std = log_std + self.action_range.log()
+        return mean, log_std
 
     def _variance(self, log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
         # A bounded exp(log_var): unfamiliar observations would drive it to inf. A clamp would stop the gradient there.

@@ -7,9 +7,11 @@ Dimension key: T horizon, N episodes of an epoch, X state, Z task-relevant varia
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from functools import partial
 from inspect import signature
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch as th
@@ -468,6 +470,21 @@ class TDPG(EpisodicAlgorithm):
         if self.verbose >= 1 and self.auto_weight is not None and (kept := self.auto_weight.kept()) is not None:
             print(f"Information: {kept}")
         return self
+
+    def export(self, path: str | os.PathLike[str], *, format: str | None = None) -> Path:
+        """
+        Write one step of the policy to a file that runs without this package; see
+        :func:`~sb3_tdpg.export.export_policy`.
+
+        What ``VecNormalize`` does to the observations of the model's environment is part of the file.
+
+        :param path: The file, ``.onnx`` or ``.pt``.
+        :param format: ``"onnx"`` or ``"torchscript"``; default: by the suffix.
+        :return: the file
+        """
+        from sb3_tdpg.export import export_policy
+
+        return export_policy(self.policy, path, format=format, normalization=self.get_vec_normalize_env())
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]

@@ -63,8 +63,13 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
         if str(path) in reason:
             raise ValueError(reason) from e
         raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
-    statistics = [path.parent / "vecnormalize.pkl", path.with_suffix("") / "vecnormalize.pkl"]
-    if found := [each for each in statistics if each.is_file()]:
+    if found := statistics_beside(path):
         env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
-        model.set_env(stacked_for(model, load_statistics(found[0], env)))
+        model.set_env(stacked_for(model, load_statistics(found, env)))
     return model
+
+
+def statistics_beside(path: Path) -> Path | None:
+    """Return the ``vecnormalize.pkl`` that rl-zoo3 has saved for a model, if there is one."""
+    candidates = [path.parent / "vecnormalize.pkl", path.with_suffix("") / "vecnormalize.pkl"]
+    return next((each for each in candidates if each.is_file()), None)

@@ -1,0 +1,262 @@
+"""
+Write one step of a policy to a file that runs without this package: ONNX or TorchScript.
+
+Dimension key: N robots, Z task-relevant variables (TRVs), U actions.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.save_util import load_from_pkl
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+import sb3_tdpg
+from sb3_tdpg.common.files import replaced_atomically
+from sb3_tdpg.evaluation.loading import statistics_beside
+from sb3_tdpg.networks import TimeMLP
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.tdpg import TDPG
+
+FORMATS = {"onnx": ".onnx", "torchscript": ".pt"}
+METADATA = "sb3_tdpg"  # key of the metadata in the file
+OPSET = 18
+
+
+class ExportedStep(nn.Module):
+    """
+    One step of a policy as a pure function of tensors; the noise is an input.
+
+    ``forward(*observation, memory, [time_step], trv_noise, action_noise)`` returns ``(action, memory)``. An observation
+    is as the environment's, in bytes or in its own units; a ``Dict`` has one input for each key, in the order of the
+    space. With zeros for both noises the step is that of ``predict(deterministic=True)``.
+
+    :param policy: The policy, on the CPU.
+    :param normalization: Statistics of the observations that the training standardised.
+    """
+
+    def __init__(self, policy: TRVPolicy, normalization: VecNormalize | None = None) -> None:
+        super().__init__()
+        self.policy = policy
+        space = policy.observation_space
+        self.keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
+        self.clip = np.inf if normalization is None else float(normalization.clip_obs)
+        self.scales: dict[str, tuple[th.Tensor, th.Tensor]] = {}  # mean and standard deviation by key
+        if normalization is not None and normalization.norm_obs:
+            statistics = cast(Any, normalization.obs_rms)
+            for key, rms in statistics.items() if isinstance(statistics, dict) else [("", statistics)]:
+                std = np.sqrt(rms.var + normalization.epsilon)
+                self.scales[key] = th.as_tensor(rms.mean), th.as_tensor(std)
+        action_space = policy.action_space
+        if isinstance(action_space, spaces.Box):
+            self.register_buffer("low", th.as_tensor(action_space.low.reshape(-1), dtype=th.float32))
+            self.register_buffer("high", th.as_tensor(action_space.high.reshape(-1), dtype=th.float32))
+
+    low: th.Tensor
+    high: th.Tensor
+
+    @property
+    def input_names(self) -> list[str]:
+        """Names of the inputs, in their order."""
+        observations = [f"observation.{key}" for key in self.keys] or ["observation"]
+        return [*observations, "memory", *["time_step"] * self.policy.time_varying, "trv_noise", "action_noise"]
+
+    @property
+    def n_action_noises(self) -> int:
+        """Length of the action noise of one robot."""
+        distribution = self.policy.action_dist
+        if isinstance(distribution, DiagGaussianDistribution):
+            return distribution.action_dim
+        return self.policy._n_action_parameters()
+
+    def example(self, n: int = 2) -> tuple[th.Tensor, ...]:
+        """Return inputs of N robots: sampled observations, zeros for the rest."""
+        space = self.policy.observation_space
+        parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+        observations = [th.as_tensor(np.stack([part.sample() for _ in range(n)])) for part in parts]
+        time_step = [th.zeros(n, dtype=th.int64)] * self.policy.time_varying
+        return (
+            *(x if x.dtype != th.float64 else x.float() for x in observations),
+            th.zeros(n, self.policy.trv_dim),
+            *time_step,
+            th.zeros(n, self.policy.trv_dim),
+            th.zeros(n, self.n_action_noises),
+        )
+
+    def forward(self, *inputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """See the class."""
+        policy = self.policy
+        n_parts = len(self.keys) or 1
+        parts, (memory, *time_step, trv_noise, action_noise) = inputs[:n_parts], inputs[n_parts:]
+        t = time_step[0] if time_step else None
+        named = {key: self._prepared(part, key) for key, part in zip(self.keys or [""], parts, strict=True)}
+        features = policy._features(named if self.keys else named[""])
+        mean, std = policy._encoder_density(
+            _at_time_steps(policy.encoder, th.cat([memory, features], dim=1), t), features, memory
+        )
+        trv = mean + std * trv_noise
+        return self._action(_at_time_steps(policy.action_head, trv, t), action_noise), trv
+
+    def _prepared(self, observation: th.Tensor, key: str) -> th.Tensor:
+        """Standardise, and turn bytes into floats: pooling of bytes uses integers, which ONNX lacks."""
+        if key in self.scales:
+            mean, std = self.scales[key]
+            return ((observation.double() - mean) / std).clamp(-self.clip, self.clip).float()
+        return observation.float() if observation.dtype == th.uint8 else observation
+
+    def _action(self, parameters: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """Return the action for the head's outputs: as the distribution's ``mode`` where the noise is 0."""
+        space = self.policy.action_space
+        if isinstance(space, spaces.Box):
+            mean, log_std = self.policy.action_gaussian(parameters)
+            action = th.minimum(th.maximum(mean + log_std.exp() * noise, self.low), self.high)
+        elif isinstance(space, spaces.MultiBinary):
+            action = (parameters + noise > 0).long()
+        else:  # with Gumbel noise the largest logit is a sample (the Gumbel-max trick)
+            sizes = space.nvec.flatten().tolist() if isinstance(space, spaces.MultiDiscrete) else [parameters.shape[1]]
+            logits = (parameters + noise).split(sizes, dim=1)
+            action = th.stack([x.argmax(dim=1) for x in logits], dim=1)
+        return action.reshape(-1, *(space.shape or ()))
+
+
+def _at_time_steps(network: TimeMLP, x: th.Tensor, t: th.Tensor | None) -> th.Tensor:
+    """Evaluate a network at the time step of each robot: ``(N, I)`` and ``(N,) -> (N, O)``; None: shared weights."""
+    if t is None:
+        return network.at(x, 0)
+    last = len(network.mlp.layers) - 1
+    for i, layer in enumerate(network.mlp.layers):
+        weight, bias = cast(th.Tensor, layer.weight), cast(th.Tensor, layer.bias)
+        x = (x[:, None, :] @ weight[t] + bias[t])[:, 0]
+        if i < last:
+            x = network.mlp.activation(x)
+    return x
+
+
+def metadata_of(step: ExportedStep) -> dict[str, Any]:
+    """Return what the user of an exported file must know of it."""
+    policy, space = step.policy, step.policy.action_space
+    noise = "gumbel"
+    if isinstance(space, (spaces.Box, spaces.MultiBinary)):
+        noise = "normal" if isinstance(space, spaces.Box) else "logistic"
+    example = dict(zip(step.input_names, step.example(1), strict=True))
+    return dict(
+        inputs={name: dict(shape=list(x.shape[1:]), dtype=str(x.dtype)[6:]) for name, x in example.items()},
+        observation_space=str(policy.observation_space),
+        action_space=str(space),
+        horizon=policy.horizon,
+        action_noise=noise,
+        trained="stochastic",
+        evaluated="stochastic",
+        certified="stochastic",
+        versions=dict(
+            sb3_tdpg=sb3_tdpg.__version__, stable_baselines3=stable_baselines3.__version__, torch=th.__version__
+        ),
+    )
+
+
+def export_policy(
+    policy: TRVPolicy,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    normalization: VecNormalize | None = None,
+) -> Path:
+    """
+    Write one step of a policy to a file.
+
+    :param policy: The policy.
+    :param path: The file; an existing one is replaced when the new one is complete.
+    :param format: ``"onnx"`` (needs the extra ``export``) or ``"torchscript"``; default: by the suffix, ``.onnx`` or
+        ``.pt``.
+    :param normalization: Statistics of the observations that the training standardised with ``VecNormalize``.
+    :return: the file
+    :raises ValueError: if the format is unknown.
+    :raises ImportError: if the packages for ONNX are missing.
+    """
+    path = Path(path)
+    by_suffix = {suffix: name for name, suffix in FORMATS.items()}
+    format = format or by_suffix.get(path.suffix)
+    if format not in FORMATS:
+        raise ValueError(
+            f"{path}: format={format!r} is none of {list(FORMATS)}: give one, or a file name with .onnx or .pt"
+        )
+    if path.suffix != FORMATS[format]:
+        path = path.with_name(path.name + FORMATS[format])
+    device, was_training = policy.device, policy.training
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        policy.cpu().set_training_mode(False)
+        step = ExportedStep(policy, normalization).eval()
+        metadata = json.dumps(metadata_of(step))
+        with th.no_grad(), warnings.catch_warnings(), replaced_atomically(path) as partial:
+            # Of torch's own: parts that it will replace, and sizes of images, which are fixed.
+            warnings.filterwarnings("ignore", category=FutureWarning)
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            warnings.filterwarnings("ignore", category=th.jit.TracerWarning)
+            if format == "onnx":
+                _write_onnx(step, partial, metadata)
+            else:
+                traced = th.jit.trace(step, step.example(), check_trace=False)
+                th.jit.save(traced, str(partial), _extra_files={METADATA: metadata})
+    finally:
+        policy.to(device).set_training_mode(was_training)
+    return path
+
+
+def export_model(
+    model: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, format: str | None = None
+) -> Path:
+    """
+    Write one step of a saved model of TDPG, with the ``vecnormalize.pkl`` beside it, if there is one.
+
+    :param model: File written by ``model.save``; loading it unpickles it, which can run any code.
+    :param out: The file; default: beside the model, with its name.
+    :param format: See :func:`export_policy`; default: by the suffix of ``out``, or ONNX.
+    :return: the file
+    """
+    model = Path(model)
+    path = model.with_suffix("") if out is None else Path(out)
+    statistics = statistics_beside(model)
+    return export_policy(
+        TDPG.load(model, device="cpu").policy,
+        path,
+        format=format or ("onnx" if path.suffix not in FORMATS.values() else None),
+        normalization=None if statistics is None else load_from_pkl(statistics),
+    )
+
+
+def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
+    try:
+        from onnxscript import opset18 as op  # torch.onnx needs it, too
+    except ImportError as e:
+        raise ImportError("ONNX needs more packages: pip install 'sb3_tdpg[export]'") from e
+
+    def sigmoid(x: Any) -> Any:
+        # ONNX Runtime's Sigmoid is wrong by a tenth and more where it is small, as in the variance of narrow TRVs.
+        return op.Reciprocal(op.Add(op.Exp(op.Neg(x)), op.Constant(value_float=1.0)))
+
+    names = step.input_names
+    program = th.onnx.export(
+        step,
+        step.example(),
+        input_names=names,
+        output_names=["action", "next_memory"],
+        dynamic_shapes=(tuple({0: th.export.Dim.DYNAMIC} for _ in names),),
+        custom_translation_table={th.ops.aten.sigmoid.default: sigmoid},
+        opset_version=OPSET,
+        dynamo=True,
+        verbose=False,
+    )
+    assert program is not None
+    program.model.metadata_props[METADATA] = metadata
+    program.save(str(path))
