@@ -292,8 +292,14 @@ class TRVPolicy(BasePolicy):
         mean, std = self.encoder_density(observation, prev_trv, t)
         noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
         trv = mean + std * noise
-        distribution = self.action_density(trv, t)
-        return PolicyStep(distribution.get_actions(deterministic), trv, mean, std, noise)
+        parameters = self.action_head.at_times(trv, t)
+        if isinstance(self.action_dist, DiagGaussianDistribution):  # in a fifth of the time of a distribution
+            actions, log_std = self.action_gaussian(parameters)
+            if not deterministic:
+                actions = actions + log_std.exp() * th.randn_like(actions)
+        else:
+            actions = self._action_distribution(parameters).get_actions(deterministic)
+        return PolicyStep(actions, trv, mean, std, noise)
 
     def encoder_density(
         self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray
@@ -473,7 +479,8 @@ class TRVPolicy(BasePolicy):
                 "not the policy that was trained. Give deterministic=False, also to evaluate_policy and EvalCallback",
                 stacklevel=3,
             )
-        self.set_training_mode(False)
+        if self.training:
+            self.set_training_mode(False)
         observation_tensor, is_vectorized = self.obs_to_tensor(observation)
         n_envs = len(
             next(iter(observation_tensor.values())) if isinstance(observation_tensor, dict) else observation_tensor
@@ -497,7 +504,7 @@ class TRVPolicy(BasePolicy):
                 f"{self.horizon} steps: pass episode_start=True at the first step of an episode (or state=None), or "
                 "train a policy that goes on for any number of steps with policy_kwargs=dict(time_varying=False)"
             )
-        with th.no_grad():
+        with th.inference_mode():
             step = self.step(observation_tensor, th.as_tensor(prev_trv, device=self.device), t, deterministic)
         actions = step.actions.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
         if isinstance(self.action_space, spaces.Box):
