@@ -149,8 +149,16 @@ def metadata_of(step: ExportedStep) -> dict[str, Any]:
     if isinstance(space, (spaces.Box, spaces.MultiBinary)):
         noise = "normal" if isinstance(space, spaces.Box) else "logistic"
     example = dict(zip(step.input_names, step.example(1), strict=True))
+    inputs = {name: dict[str, Any](shape=list(x.shape[1:]), dtype=str(x.dtype)[6:]) for name, x in example.items()}
+    observation = policy.observation_space
+    for name, part in observation.items() if isinstance(observation, spaces.Dict) else [("", observation)]:
+        if isinstance(part, spaces.Box) and part.dtype != np.uint8 and len(part.shape) == 1:
+            bounds = {
+                key: [float(x) if np.isfinite(x) else None for x in getattr(part, key)] for key in ("low", "high")
+            }
+            inputs[f"observation.{name}".rstrip(".")].update(bounds)
     return dict(
-        inputs={name: dict(shape=list(x.shape[1:]), dtype=str(x.dtype)[6:]) for name, x in example.items()},
+        inputs=inputs,
         observation_space=str(policy.observation_space),
         action_space=str(space),
         horizon=policy.horizon,

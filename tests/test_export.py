@@ -202,7 +202,7 @@ def test_the_file_says_what_it_is(tmp_path):
     extra = {METADATA: ""}
     th.jit.load(str(model.export(tmp_path / "p.pt")), _extra_files=extra)
     assert json.loads(extra[METADATA]) == about
-    assert about["inputs"]["observation"] == dict(shape=[2], dtype="float32")
+    assert about["inputs"]["observation"] == dict(shape=[2], dtype="float32", low=[None] * 2, high=[None] * 2)
     assert about["inputs"]["time_step"] == dict(shape=[], dtype="int64")
     assert (about["horizon"], about["action_noise"], about["trained"]) == (5, "normal", "stochastic")
     assert set(about["versions"]) == {"sb3_tdpg", "stable_baselines3", "torch"}

@@ -27,6 +27,7 @@ import torch as th  # noqa: E402
 from tests.benchmarks.speed.critics import bench_critics  # noqa: E402
 from tests.benchmarks.speed.environments import bench_camera, bench_environment  # noqa: E402
 from tests.benchmarks.speed.grasping import GraspTrials, bench_grasp, bench_processes  # noqa: E402
+from tests.benchmarks.speed.inference import bench_inference  # noqa: E402
 from tests.benchmarks.speed.long_horizons import bench_long_horizons  # noqa: E402
 from tests.benchmarks.speed.measure import FULL, QUICK, format_table  # noqa: E402
 from tests.benchmarks.speed.training import bench_epoch, bench_training  # noqa: E402
@@ -41,6 +42,7 @@ BENCHES = (
     bench_camera,
     bench_grasp,
     bench_processes,
+    bench_inference,
 )
 
 
