@@ -1,7 +1,10 @@
 """Work of a batch that several processes share: grasps, images."""
 
 import multiprocessing
+import os
 import signal
+import threading
+import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -31,7 +34,7 @@ class WorkPool:
         self._n_processes = n_processes
         context = multiprocessing.get_context(method)
         self._executor = ProcessPoolExecutor(
-            n_processes, context, initializer=_begin, initargs=(make_worker, *arguments)
+            n_processes, context, initializer=_begin, initargs=(os.getpid(), make_worker, *arguments)
         )
 
     def call(self, method: str, *arrays: np.ndarray) -> Any:
@@ -52,10 +55,19 @@ class WorkPool:
 _worker: Any  # of a process of a pool
 
 
-def _begin(make_worker: Callable[..., Any], *arguments: Any) -> None:
+def _begin(parent: int, make_worker: Callable[..., Any], *arguments: Any) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a handler of the parent is forked with it
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     _worker = make_worker(*arguments)
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone: a parent that was killed has not shut its pool down."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
 
 
 def _call(method: str, *arrays: np.ndarray) -> Any:

@@ -3,7 +3,10 @@
 import gc
 import os
 import signal
+import subprocess
+import sys
 import time
+import types
 from concurrent.futures.process import BrokenProcessPool
 
 import gymnasium as gym
@@ -160,6 +163,23 @@ def test_the_processes_do_not_end_by_ctrl_c_but_with_their_environment():
         del made
         gc.collect()
         assert all(has_ended(process) for process in processes)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_the_processes_end_when_their_program_is_killed(number):
+    program = (
+        "import time, numpy as np\n"
+        "from sb3_tdpg import make_episodes_env\n"
+        "env = make_episodes_env('BallCatch-v0', 4, env_kwargs=dict(renderer='pybullet', n_processes=2), seed=0)\n"
+        "env.reset()\n"
+        "print('pids', *env.env._pool._executor._processes, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as running:
+        line = next(line for line in running.stdout if line.startswith("pids"))
+        running.send_signal(number)
+        running.wait()
+        assert all(has_ended(types.SimpleNamespace(pid=int(pid))) for pid in line.split()[1:])
 
 
 def test_a_process_that_dies_is_reported():
