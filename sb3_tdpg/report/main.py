@@ -27,7 +27,7 @@ from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, write_page
 from sb3_tdpg.report.records import Models, Plan, complete_rows, default_episodes, missing_rows, seconds_of_a_row
 from sb3_tdpg.report.rendering import to_html
-from sb3_tdpg.report.rows import Row, default_env_kwargs, make_rows
+from sb3_tdpg.report.rows import Row, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.registry import find
 from sb3_tdpg.robustness.scale import default_scale
@@ -73,7 +73,7 @@ def robustness_report(
         with the first one.
     :param env_id: A registered id, also in the ``module:id`` form.
     :param out: Folder of the results.
-    :param env_kwargs: Keywords of the environment in all rows. (``BallCatch-v0`` uses its fast renderer by default.)
+    :param env_kwargs: Keywords of the environment in all rows.
     :param perturbations: Perturbations of the sensor and of the scene; default: all that apply.
     :param severities: Severities from 1 to 5.
     :param scenarios: Test rows of the environment; default: the test rows of the paper's table, if there are any.
@@ -96,7 +96,7 @@ def robustness_report(
     sources = _sources(models)
     if not isinstance(env_id, str):
         raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
-    kwargs = default_env_kwargs(env_id, env_kwargs)
+    kwargs = dict(env_kwargs or {})
     for name, value, least in (
         ("n_episodes", n_episodes, 1),
         ("n_steps", n_steps, 1),

@@ -18,9 +18,6 @@ ALL = "all perturbations"
 PERTURBED = ("sensor", "plant", "scene")
 """The kinds of rows with severities: other observations, other actions, other keywords of the environment."""
 
-FAST: Mapping[str, Mapping[str, Any]] = {"BallCatch-v0": dict(renderer="fast")}
-"""Keywords that save time and hardly change the results, by environment; the user's keywords take precedence."""
-
 
 @dataclass(frozen=True, eq=False)
 class Row:
@@ -44,11 +41,6 @@ class Row:
         env = [self.scenario.env_id, self.scenario.env_kwargs]
         content = json.dumps(jsonable([self.title, self.kind, *env, self.value]), sort_keys=True)
         return f"{slug}-{hashlib.sha256(content.encode()).hexdigest()[:8]}.csv.xz"
-
-
-def default_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Add the keywords of :data:`FAST` to the given ones, which take precedence."""
-    return {**FAST.get(env_id.rpartition(":")[2], {}), **(env_kwargs or {})}
 
 
 def make_rows(

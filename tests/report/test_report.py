@@ -241,7 +241,6 @@ def test_images_get_a_gallery_and_a_scene(tmp_path):
         n_episodes=3, scenarios=(), progress_bar=False,
     )  # fmt: skip
     assert "figures/examples.png" in text
-    assert "renderer='fast'" in text
     assert "| camera_pose | the environment changes | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
     assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
