@@ -31,7 +31,7 @@ from sb3_tdpg.paper import common
 from sb3_tdpg.paper.baselines import baselines_table, training_times
 from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves, sorted_walls
-from sb3_tdpg.paper.knowledge import trv_knowledge
+from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
 from sb3_tdpg.robustness.training import VecImagePerturbation
 from sb3_tdpg.settings import IMAGE_ENCODER
 from sb3_tdpg.tdpg import TDPG
@@ -216,10 +216,15 @@ def reproduce_ball(
     ]
     with threads(1):  # sums are the same on any number of cores
         knowledge = [
-            dict(model=m.label, train_seed=seed, **trv_knowledge(TDPG.load(path, device="cpu"), launch_kwargs))
+            dict(
+                model=m.label,
+                train_seed=seed,
+                information=pooled_information(model, launch_kwargs),
+                **trv_knowledge(model, launch_kwargs),
+            )
             for m, seed in everything
             if m.algo == "tdpg"
-            for path in [folders[m.label, seed] / "model.zip"]
+            for model in [TDPG.load(folders[m.label, seed] / "model.zip", device="cpu")]
         ]
     command = "make reproduce-ball" + ("-varying" if not is_fixed else "-controls" if controls else "")
     return common.write_results(

@@ -18,10 +18,12 @@ import torch as th
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.envs.textures import load_texture
 from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.information import rollout_information
 from sb3_tdpg.evaluation.randomness import EvaluationSeeds, evaluation_seeds, isolated_randomness
 from sb3_tdpg.evaluation.rollout import act, rollout
 from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet, Mine, own_sample_bound
 from sb3_tdpg.problem import read_problem
+from sb3_tdpg.robustness.training import VecImagePerturbation
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
@@ -79,6 +81,21 @@ def trv_knowledge(
     all_trvs = np.concatenate(trvs, axis=1)  # (T, N, Z)
     of_all = (np.concatenate(of_walls, axis=1) for of_walls in zip(*targets, strict=True))
     return {name: _r2(all_trvs, target) for name, target in zip(names, of_all, strict=True)}
+
+
+def pooled_information(model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_episodes: int = 160) -> float:
+    """
+    Bound the information of a ball-catching policy on the images of its training, in nats, as its penalty does.
+
+    It is the log-det bound of the steps of all times together, times the horizon; each image has declared changes.
+    """
+    scenario = Scenario(
+        "training", "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast"}, sensor=VecImagePerturbation
+    )
+    batch = rollout_information(model, scenario, n_episodes)
+    pooled = InformationBatch(*(x.flatten(0, 1)[None] for x in batch[:4]))
+    with th.no_grad():
+        return model.horizon * LogDet(1, batch.states.shape[2], batch.trvs.shape[2])(pooled).item()
 
 
 def _darkened(images: np.ndarray, factor: np.ndarray) -> np.ndarray:

@@ -56,3 +56,14 @@ def test_the_knowledge_of_a_ball_catching_policy_is_measured_without_a_trace():
     assert knowledge.trv_knowledge(model, n_walls=2, n_episodes=10) == first
     th.manual_seed(3)
     assert th.rand(1) == after
+
+
+def test_the_information_of_faint_trvs_is_less_and_nearly_none_behind_much_noise():
+    nats = []
+    for log_var in (-3.0, 0.0, 12.0):
+        # Without a gate, which keeps the noise of the last TRVs.
+        kwargs = dict(encoder_log_var_init=log_var, trv_dim=4, gate=False)
+        model = TDPG("TRVPolicy", "BallCatch-v0", n_episodes=4, policy_kwargs=kwargs, seed=0, device="cpu")
+        nats.append(knowledge.pooled_information(model, n_episodes=20))
+    assert nats[0] > nats[1] > nats[2] > 0
+    assert nats[2] < 1
