@@ -4,12 +4,14 @@ VENV ?= .venv
 OLDEST ?= .venv-oldest
 JOBS ?= 2
 EXTRAS ?= zoo,postgres,ray,hub,export,tests,plots,public,docs,dev
+HTML ?= docs/_build/html
 
-PY := $(VENV)/bin/python
+BIN := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
+PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines reproduce-public wheel clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines reproduce-public wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -39,7 +41,7 @@ test-slow: $(STAMP) ## run the slow tests
 	OMP_NUM_THREADS=1 $(PY) -m pytest -m slow -n $(JOBS) --dist worksteal
 
 test-oldest: $(OLDEST)/.installed ## run the tests with the lowest versions that setup.cfg allows
-	OMP_NUM_THREADS=1 $(OLDEST)/bin/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile
+	OMP_NUM_THREADS=1 $(OLDEST)/$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile
 
 # No extra "hub": rl-zoo3 2.8 needs an older huggingface_hub.
 $(OLDEST)/.installed: setup.cfg constraints.txt constraints-oldest.txt
@@ -47,7 +49,7 @@ $(OLDEST)/.installed: setup.cfg constraints.txt constraints-oldest.txt
 	grep -v -i -E "^($$(sed -n 's/[=<].*//p' constraints-oldest.txt | paste -s -d '|' -))==" constraints.txt > build/constraints-oldest.txt
 	cat constraints-oldest.txt >> build/constraints-oldest.txt
 	$(PYTHON) -m venv $(OLDEST)
-	$(OLDEST)/bin/python -m pip install --disable-pip-version-check -c build/constraints-oldest.txt -e '.[zoo,postgres,tests,plots]'
+	$(OLDEST)/$(BIN)/python -m pip install --disable-pip-version-check -c build/constraints-oldest.txt -e '.[zoo,postgres,tests,plots]'
 	@touch $@
 
 mutants: $(STAMP) ## change the code in small ways and count the changes that the tests notice (half an hour)
@@ -68,7 +70,7 @@ format: $(STAMP) ## mend style and format in place
 	$(PY) -m ruff format .
 
 docs: $(STAMP) ## build the documentation into docs/_build/html
-	$(PY) -m sphinx -W --keep-going -b html docs docs/_build/html
+	$(PY) -m sphinx -W --keep-going -b html docs $(HTML)
 
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py
@@ -105,6 +107,9 @@ reproduce-public: $(STAMP) ## our one preset, tuned blocks and a cost limit besi
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib
 	$(PY) -m pip wheel --no-deps --wheel-dir dist .
+
+release-check: $(STAMP) ## build wheel and sdist into dist/, install each into a fresh environment and try it
+	$(PY) tests/release_check.py $(if $(BORROW),--borrow)
 
 clean: ## remove what was built, but neither results nor the virtual environment
 	rm -rf build dist docs/_build *.egg-info .mypy_cache .pytest_cache .ruff_cache
