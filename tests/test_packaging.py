@@ -1,6 +1,7 @@
 """The package as a user gets it: built, installed alone in a fresh environment, used from another folder."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,9 +24,11 @@ NOTHING_ELSE = (
 MAKE_LAVA = "import gymnasium, sb3_tdpg; [gymnasium.make(id).reset() for id in ('Lava-v0', 'sb3_tdpg:Lava-v0')]"
 
 
-def run(*command: object, cwd: Path, pythonpath: Path | None = None) -> str:
+def run(*command: object, cwd: Path, pythonpath: Path | None = None, path: Path | None = None) -> str:
     """Run a command with no trace of this checkout in its environment; fail with all that it printed."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    if path is not None:
+        environment["PATH"] = f"{path}{os.pathsep}{environment['PATH']}"
     if pythonpath is not None:
         environment["PYTHONPATH"] = str(pythonpath)
     arguments = [str(argument) for argument in command]
@@ -124,6 +127,21 @@ def test_the_installed_wheel_does_not_get_in_the_way_of_a_checkout(installed: Pa
 def test_a_checkout_on_the_python_path_works_without_an_install(tmp_path: Path) -> None:
     python = make_environment(tmp_path / "venv")
     run(python, "-c", IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA, cwd=tmp_path, pythonpath=REPOSITORY)
+
+
+@pytest.mark.slow
+def test_the_blocks_of_the_readme_chain_word_for_word(installed: Path, tmp_path: Path) -> None:
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    section = text[text.index("## Use it") : text.index("## Results")]
+    blocks = re.findall(r"^```(python|bash)\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    assert len(blocks) >= 6
+    for language, code in blocks:
+        program = (installed, "-c") if language == "python" else ("bash", "-e", "-c")
+        print(run(*program, code, cwd=tmp_path, path=installed.parent))
+    for made in ("models/ppo_1.zip", "cartpole.gif", "tdpg_lava.onnx", "ball.gif", "logs/tdpg/Lava-v0_1/Lava-v0.zip"):
+        assert (tmp_path / made).stat().st_size > 0
+    assert list(tmp_path.glob("results/report-*/report.html"))
+    assert (tmp_path / "results/sweep-Lava-v0/selected.zip").exists()
 
 
 @pytest.mark.slow
