@@ -3,7 +3,14 @@
 import pytest
 import torch as th
 
-from sb3_tdpg.advantages import BASELINES, episode_mean_advantages, get_baseline, regression_advantages
+from sb3_tdpg.advantages import (
+    BASELINES,
+    ValueFunction,
+    _ridge,
+    episode_mean_advantages,
+    get_baseline,
+    regression_advantages,
+)
 from sb3_tdpg.losses import cost_to_go
 
 T, N = 3, 400
@@ -165,3 +172,23 @@ def test_the_value_of_a_state_far_from_all_others_is_not_extrapolated():
     baseline = costs - regression_advantages(costs, states, th.ones(1, n), 1.0, 1.0)
     assert baseline[0, 0] == pytest.approx(10.0)
     assert baseline.abs().max() <= 10.0
+
+
+def test_the_ridge_regression_is_that_of_its_penalty_and_weights():
+    features, targets = th.tensor([[[2.0], [4.0], [3.5]]]), th.tensor([[1.0, 5.0, 100.0]])
+    weight = th.tensor([[1.0, 1.0, 0.0]])  # the third is predicted only
+    # Deviations from the means, 3 and 3, are -1, 1 and -2, 2: a slope of 4 / (2 + 0.5).
+    expected = [3 - 1.6, 3 + 1.6, 3 + 0.5 * 1.6]
+    assert _ridge(features, targets, weight)[0].tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("gamma", [0.8, 0.99, 1.0])
+def test_the_value_network_is_told_the_discounted_time_that_is_left(gamma):
+    value = ValueFunction(2, 20, hidden_sizes=())
+    with th.no_grad():  # predict the last input
+        value.network[0].weight.copy_(th.tensor([[0.0, 0.0, 1.0]]))
+        value.network[0].bias.zero_()
+    left = cost_to_go(th.ones(20, 3), gamma)
+    th.testing.assert_close(value(th.randn(20, 3, 2), gamma), left / left[0])
+    # Episodes that have all ended early are as far from the horizon as the others.
+    th.testing.assert_close(value(th.randn(5, 3, 2), gamma), (left / left[0])[:5])

@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 from small_problems import tiny_tdpg, train_epochs
 
+from sb3_tdpg.certificates.nuisance import FAMILY, nuisance_table
 from sb3_tdpg.cli import main
 
 
@@ -33,3 +34,16 @@ def test_wrong_arguments_of_certify_are_explained(arguments, fragment, tmp_path,
     model.save(tmp_path / "model.zip")
     assert main(["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--out", str(tmp_path), *arguments]) != 0
     assert fragment in capsys.readouterr().err
+
+
+def test_a_cost_above_its_bound_counts_from_three_standard_errors_on():
+    errors_above = [-5.0, 0.0, 2.0, 2.9, 3.1, 10.0]
+    numbers = dict(model="policy", training_cost=1.0, bound=10.0, standard_error=0.5)
+    rows = [dict(shift=FAMILY, clipped_cost=5.0, **numbers)]
+    rows += [dict(shift=f"member {x}", clipped_cost=10.0 + 0.5 * x, **numbers) for x in errors_above]
+    heads, _, cells = (
+        [x.strip() for x in line.split("|")] for line in nuisance_table(pd.DataFrame(rows), 50.0).split("\n")
+    )
+    table = dict(zip(heads, cells, strict=True))
+    assert (table["random members"], table["cost above the bound"]) == ("6", "4")
+    assert table["by more than 3 standard errors"] == "2"
