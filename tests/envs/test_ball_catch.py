@@ -202,6 +202,12 @@ def test_pixel_noise_has_the_standard_deviation_that_was_asked_for():
     assert abs(difference[:, 20:50].mean()) < 0.003
 
 
+def test_pixels_with_noise_are_rounded_to_the_nearest_byte():
+    keywords = dict(renderer="fast", noise_mode="clip")
+    clean, noisy = (BallCatchEnv(pixel_noise_std=std, **keywords).reset(seed=0)[0] for std in (0.0, 1e-4))
+    np.testing.assert_array_equal(noisy, clean)  # the noise is a fortieth of a byte
+
+
 def test_minmax_spreads_each_image_over_the_whole_range_and_clip_leaves_its_contrast():
     images = {
         mode: BatchedVecEnv(BallCatchEnv(pixel_noise_std=0.25, noise_mode=mode), 5).reset().astype(float)

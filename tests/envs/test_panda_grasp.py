@@ -68,6 +68,15 @@ def test_the_cost_is_one_up_to_a_height_of_five_centimetres(shared):
     np.testing.assert_array_equal(shared._cost(states, np.zeros((4, 4))), 0)
 
 
+def test_a_mug_up_to_five_centimetres_above_the_table_is_no_success(shared, monkeypatch):
+    heights = np.array([0.0, 0.03, 0.05, 0.0501])
+    ends = np.c_[np.zeros((4, 2)), heights, np.zeros(4)]
+    monkeypatch.setattr(shared, "_shared", lambda method, mugs, poses: [(end, 0) for end in ends])
+    shared._dynamics(np.zeros((4, 4)), np.zeros((4, 4)))
+    assert [more["success"] for more in shared._details] == [False, False, False, True]
+    assert [more["is_success"] for more in shared._details] == [False, False, False, True]
+
+
 def test_without_friction_nothing_is_lifted(shared):
     slippery = PandaGraspEnv(friction=0.0)
     states = random_states(10, seed=3)

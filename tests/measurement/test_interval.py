@@ -174,6 +174,15 @@ def test_only_living_episodes_count_and_a_step_with_too_few_has_no_interval():
     assert (ended.n_left_out, ended.n_episodes[3]) == (0, 0)
 
 
+def test_many_trvs_need_more_than_two_living_episodes_for_each():
+    batch = gaussian_batch(62, [[0.5] * 30] * 2, generator=generator())
+    alive = th.ones(2, 62, dtype=th.bool)
+    alive[1, 0] = False
+    interval = information_interval(batch._replace(alive=alive))
+    assert np.isfinite([interval.lower, interval.upper]).tolist() == [[True, False], [True, False]]
+    assert (min_episodes(30), min_episodes(2)) == (62, 20)
+
+
 def test_a_higher_confidence_is_a_wider_interval():
     batch = gaussian_batch(100, [[1.0, 1.0]], generator=generator())
     wide, narrow = (information_interval(batch, confidence=c) for c in (0.99, 0.8))

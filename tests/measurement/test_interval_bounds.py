@@ -203,6 +203,15 @@ def test_a_gaussian_critic_sees_nothing_of_the_episodes_that_it_is_evaluated_on(
     assert np.mean(values) < 0
 
 
+def test_the_first_draw_is_the_rollout_s_and_each_has_a_mirror_image():
+    batch = random_batch(horizon=1, n=40)
+    step = draw_trvs(batch.at(0), np.random.default_rng(0))
+    assert step.trvs.shape == (40, bounds_module.MAX_DRAWS, 2)
+    np.testing.assert_allclose(step.trvs[:, 0], batch.trvs[0])
+    first, mirrored = np.split(step.trvs - step.means[:, None], 2, axis=1)
+    np.testing.assert_allclose(first, -mirrored)
+
+
 def test_control_variates_expect_nothing_and_take_off_the_noise_of_the_draws():
     rng = np.random.default_rng(0)
     n, dim = 60, 3
