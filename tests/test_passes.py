@@ -1,6 +1,7 @@
 """Passes over an epoch's rollouts, and the defaults of arguments left out."""
 
 import math
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -114,11 +115,17 @@ def test_the_clip_range_may_follow_the_progress():
     assert asked == sorted(asked, reverse=True)
 
 
-def test_equal_costs_do_not_blow_up_the_penalty():
-    model = tiny_tdpg(toy_vec_env(n_envs=4), n_episodes=4, beta=1.0, normalize_advantage=True)
+# In single precision the sums differ in the last digit.
+SAME_SUM = [(0.0, *costs) for costs in permutations([1 / 3, 7 / 3, 11 / 3])]
+
+
+@pytest.mark.parametrize(("costs", "baseline"), [(np.ones((6, 4)), "regression"), (np.array(SAME_SUM), "mean")])
+def test_equal_costs_do_not_blow_up_the_penalty(costs, baseline):
+    settings = dict(beta=1.0, normalize_advantage=True, baseline=baseline)
+    model = tiny_tdpg(toy_vec_env(n_envs=6, horizon=4), n_episodes=6, **settings)
     _, callback = model._setup_learn(1)
     model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
-    model.rollout_buffer.costs[:] = 1.0
+    model.rollout_buffer.costs[:] = costs.T
     model.train()
     assert model.logger.name_to_value["train/grad_norm"] < 100
 
