@@ -52,7 +52,7 @@ $(OLDEST)/.installed: setup.cfg constraints.txt constraints-oldest.txt
 	$(OLDEST)/$(BIN)/python -m pip install --disable-pip-version-check -c build/constraints-oldest.txt -e '.[zoo,postgres,tests,plots]'
 	@touch $@
 
-mutants: $(STAMP) ## change the code in small ways and count the changes that the tests notice (half an hour)
+mutants: $(STAMP) ## change the code in small ways and count the changes that the tests notice (an hour or more)
 	$(PY) tests/mutants.py
 
 soak: $(STAMP) ## endurance: leaks, killed trainings, killed workers (ten minutes)
