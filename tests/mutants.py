@@ -36,8 +36,9 @@ CODE = [
 LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|show_window|_figure__")
 TESTS = [
     "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
-    "test_passes.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py", "test_episodic.py", "test_features.py",
-    "test_nuisance.py", "information", "robustness/test_nuisance_members.py", "measurement", "certificates", "envs",
+    "test_passes.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py", "test_episodic.py",
+    "test_features.py", "test_nuisance.py", "information", "robustness/test_nuisance_members.py", "measurement",
+    "certificates", "envs",
 ]  # fmt: skip
 SETTINGS = """
 [mutmut]
