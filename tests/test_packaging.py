@@ -138,7 +138,7 @@ def test_the_blocks_of_the_readme_chain_word_for_word(installed: Path, tmp_path:
     for language, code in blocks:
         program = (installed, "-c") if language == "python" else ("bash", "-e", "-c")
         print(run(*program, code, cwd=tmp_path, path=installed.parent))
-    for made in ("models/ppo_1.zip", "cartpole.gif", "tdpg_lava.onnx", "ball.gif", "logs/tdpg/Lava-v0_1/Lava-v0.zip"):
+    for made in ("models/ppo_1.zip", "tdpg_lava.onnx", "ball.gif", "logs/tdpg/Lava-v0_1/Lava-v0.zip"):
         assert (tmp_path / made).stat().st_size > 0
     assert list(tmp_path.glob("results/report-*/report.html"))
     assert (tmp_path / "results/sweep-Lava-v0/selected.zip").exists()
