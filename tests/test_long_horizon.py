@@ -332,7 +332,7 @@ def test_the_variance_of_the_actions_is_one_parameter_unless_asked_for():
         stds[shared] = distribution.stddev[:, 0]
     assert stds[None].unique().numel() == 1
     assert stds[False].unique().numel() > 10
-    before = float(stds[None][0])
+    before = stds[None][0].item()
     model = tiny("Pendulum-v1")
     model.learn(800)
     after = model.policy.action_density(th.zeros(1, model.policy.trv_dim), np.zeros(1, int)).distribution.stddev

@@ -29,7 +29,7 @@ def mean_cost(model: TDPG, share: float) -> float:
 def main(pg: Path, tdpg: Path, figure: Path) -> None:
     """Draw the costs of every model, and print their means over the models."""
     _, axes = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
-    for name, folder, colour in (("PG", pg, "tab:orange"), ("TDPG", tdpg, "tab:blue")):
+    for name, folder, colour in (("PG", pg, "C1"), ("TDPG", tdpg, "C0")):
         models = [TDPG.load(path, device="cpu") for path in sorted(folder.glob("*/model.zip"))]
         costs = np.array([[mean_cost(model, share) for share in SHARES] for model in models])
         axes.plot(SHARES, costs.T, ".", color=colour, alpha=0.6)
