@@ -336,7 +336,7 @@ def test_the_variance_of_the_actions_is_one_parameter_unless_asked_for():
     model = tiny("Pendulum-v1")
     model.learn(800)
     after = model.policy.action_density(th.zeros(1, model.policy.trv_dim), np.zeros(1, int)).distribution.stddev
-    assert float(after) != pytest.approx(before, rel=1e-4)  # it is learnt
+    assert after.item() != pytest.approx(before, rel=1e-4)  # it is learnt
     assert not hasattr(tiny("CartPole-v1").policy, "action_log_var")  # nothing to learn with discrete actions
 
 
