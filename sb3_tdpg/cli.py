@@ -91,7 +91,7 @@ def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> 
 
 
 def _export(model: Path, out: Path | None, format: str | None) -> None:
-    from sb3_tdpg.export import export_model
+    from sb3_tdpg.deployment.export import export_model
 
     say_what_is_trusted(model)
     print(f"the policy's step is {export_model(model, out, format=format)}")

@@ -474,7 +474,7 @@ class TDPG(EpisodicAlgorithm):
     def export(self, path: str | os.PathLike[str], *, format: str | None = None) -> Path:
         """
         Write one step of the policy to a file that runs without this package; see
-        :func:`~sb3_tdpg.export.export_policy`.
+        :func:`~sb3_tdpg.deployment.export.export_policy`.
 
         What ``VecNormalize`` does to the observations of the model's environment is part of the file.
 
@@ -482,7 +482,7 @@ class TDPG(EpisodicAlgorithm):
         :param format: ``"onnx"`` or ``"torchscript"``; default: by the suffix.
         :return: the file
         """
-        from sb3_tdpg.export import export_policy
+        from sb3_tdpg.deployment.export import export_policy
 
         return export_policy(self.policy, path, format=format, normalization=self.get_vec_normalize_env())
 

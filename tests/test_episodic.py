@@ -48,6 +48,15 @@ def test_another_environment_brings_its_own_scenes():
     np.testing.assert_array_equal(seen, states + np.array([10.0, -10.0]))
 
 
+def test_the_last_epoch_takes_the_steps_that_are_left():
+    model = TDPG("TRVPolicy", "CartPole-v1", epoch_steps=400, batch_size=100, n_envs=1, seed=0, device="cpu").learn(600)
+    assert model.epoch == 2
+    assert 600 <= model.num_timesteps < 700  # less than an episode more
+    before = model.num_timesteps
+    model.learn(1, reset_num_timesteps=False)  # a tenth of an epoch is the least
+    assert 40 <= model.num_timesteps - before < 140
+
+
 @pytest.mark.parametrize(("epoch_steps", "n_episodes"), [(8, 2), (9, 3)])
 def test_no_episode_begins_once_an_epoch_has_its_steps(epoch_steps, n_episodes):
     env = DummyVecEnv([lambda: CountdownEnv(0, [4])])

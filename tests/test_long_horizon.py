@@ -52,15 +52,6 @@ def test_a_cost_limit_takes_information_out_and_keeps_the_return():
 # -- epochs of steps -------------------------------------------------------------------------------------------
 
 
-def test_the_last_epoch_takes_the_steps_that_are_left():
-    model = tiny(epoch_steps=400, n_envs=1).learn(600)
-    assert model.epoch == 2
-    assert 600 <= model.num_timesteps < 700  # less than an episode more
-    before = model.num_timesteps
-    model.learn(1, reset_num_timesteps=False)  # a tenth of an epoch is the least
-    assert 40 <= model.num_timesteps - before < 140
-
-
 def test_an_epoch_of_steps_has_whole_episodes_and_stops_as_soon_as_there_are_enough():
     model = tiny(epoch_steps=300, n_envs=3)
     model.learn(300)

@@ -37,7 +37,7 @@ def kind_of(space: spaces.Space) -> str | None:
 
 
 def blank(space: spaces.Space) -> np.ndarray:
-    """Return what is shown if there is nothing: a black image, otherwise 0 as far as the bounds allow."""
+    """Return the observation of a dead sensor: a black image, or 0 moved into the bounds."""
     if not isinstance(space, spaces.Box):
         return np.zeros(space.shape or (), space.dtype)
     return space.low if kind_of(space) == "image" else np.clip(np.zeros_like(space.low), space.low, space.high)

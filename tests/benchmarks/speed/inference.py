@@ -12,7 +12,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.export import ExportedStep
+from sb3_tdpg.deployment.export import ExportedStep
 from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
 
 N_STEPS = 500

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.cli import main
-from sb3_tdpg.export import METADATA, ExportedStep, export_policy
+from sb3_tdpg.deployment.export import METADATA, ExportedStep, export_policy
 
 onnxruntime = pytest.importorskip("onnxruntime")
 pytestmark = [
@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*multi-dimensional MultiDiscrete"),
 ]
 
-ROBOT_LOOP = Path(__file__).parents[1] / "docs" / "robot" / "robot_loop.py"
+ROBOT_LOOP = Path(__file__).parents[2] / "docs" / "robot" / "robot_loop.py"
 N_STEPS = 1000
 DICT = spaces.Dict(
     image=spaces.Box(0, 255, (3, 36, 36), np.uint8), position=spaces.Box(-2.0, 2.0, (3,)), mode=spaces.Discrete(4)

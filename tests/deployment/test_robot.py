@@ -14,7 +14,7 @@ from sb3_tdpg import TDPG
 
 pytest.importorskip("onnxruntime")
 
-PROGRAMS = Path(__file__).parents[1] / "docs" / "robot"
+PROGRAMS = Path(__file__).parents[2] / "docs" / "robot"
 ONNXRUNTIME_ROOT = os.environ.get("ONNXRUNTIME_ROOT")
 
 
