@@ -37,7 +37,7 @@ def process_pool(
         from multiprocessing import forkserver, resource_tracker
 
         context = mp.get_context("forkserver")
-        context.set_forkserver_preload(["sb3_tdpg.tdpg"])
+        context.set_forkserver_preload(["sb3_tdpg.tdpg", "sb3_tdpg.common.unblock"])
         resource_tracker.ensure_running()  # it would unblock what follows
         with _postponing_ctrl_c(), _blocking_ctrl_c():  # the server is not to hear it while it imports
             forkserver.ensure_running()

@@ -1,5 +1,6 @@
 """Pools of worker processes: order, Ctrl-C, and what happens when the main process is killed."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -126,3 +127,15 @@ def test_ctrl_c_while_the_workers_start_is_told_once_and_not_lost(tmp_path):
     assert error.count("Traceback") == 1
     assert error.endswith("KeyboardInterrupt\n")
     assert not (tmp_path / "c").exists()
+
+
+def test_other_processes_of_the_fork_server_hear_ctrl_c():
+    with process_pool(1) as pool:
+        pool.submit(int).result()
+    context = multiprocessing.get_context("forkserver")
+    other = context.Process(target=time.sleep, args=(60,))
+    other.start()
+    time.sleep(1.0)
+    os.kill(other.pid, signal.SIGINT)
+    other.join(20)
+    assert other.exitcode not in (0, None)
