@@ -1,4 +1,4 @@
-"""The paper's environments; importing this package registers their Gymnasium ids."""
+"""The environments, the paper's and two of our own; importing this package registers their Gymnasium ids."""
 
 import gymnasium as gym
 
@@ -7,6 +7,8 @@ ENTRY_POINTS = {
     "Lava-v0": "sb3_tdpg.envs.lava:LavaEnv",
     "BallCatch-v0": "sb3_tdpg.envs.ball_catch:BallCatchEnv",
     "PandaGrasp-v0": "sb3_tdpg.envs.panda_grasp:PandaGraspEnv",
+    "SqueezeInsert-v0": "sb3_tdpg.envs.squeeze_insert:SqueezeInsertEnv",
+    "PegCorner-v0": "sb3_tdpg.envs.peg_corner:PegCornerEnv",
 }
 
 # Returns at which a problem counts as solved: the limit on the cost for beta="auto". The ball is caught within 5 cm; of

@@ -1,0 +1,37 @@
+"""Pictures of the planar environments: boxes on a light ground, in NumPy."""
+
+import math
+
+import numpy as np
+
+
+def canvas(height: int, width: int) -> np.ndarray:
+    """Return an empty picture: ``(height, width, 3)`` uint8."""
+    return np.full((height, width, 3), 245, np.uint8)
+
+
+def paint_box(
+    image: np.ndarray,
+    middle: tuple[float, float],
+    size: tuple[float, float],
+    angle: float,
+    colour: tuple[int, int, int],
+    span: tuple[float, float, float, float] = (-1.0, 1.0, -1.0, 1.0),
+) -> None:
+    """
+    Paint a turned box in place.
+
+    :param image: ``(H, W, 3)`` uint8.
+    :param middle: x and y of its middle, in the units of ``span``.
+    :param size: Its length and its width.
+    :param angle: Between its length and the x-axis, in rad.
+    :param colour: Red, green and blue, 0 to 255.
+    :param span: Left, right, lower and upper edge of the picture.
+    """
+    height, width = image.shape[:2]
+    left, right, low, high = span
+    x = left + (np.arange(width) + 0.5) * (right - left) / width - middle[0]
+    y = (high - (np.arange(height) + 0.5) * (high - low) / height - middle[1])[:, None]
+    along = x * math.cos(angle) + y * math.sin(angle)
+    across = y * math.cos(angle) - x * math.sin(angle)
+    image[(np.abs(along) <= size[0] / 2) & (np.abs(across) <= size[1] / 2)] = colour

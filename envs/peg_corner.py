@@ -1,0 +1,101 @@
+"""Push a peg into the corner of a fence, then move blindly into the hole: a mechanical funnel in two dimensions."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from . import checks
+from .base import POMDPEnv
+from .drawing import canvas, paint_box
+
+SIZE = 6.0  # cm, side of the square table
+START = (2.0, 6.0)  # cm, range of both coordinates
+HOLE = np.array([1.2, 1.2])  # cm
+
+
+class PegCornerEnv(POMDPEnv):
+    r"""
+    Bring a peg, which slides on a fenced table, over a hole near one corner.
+
+    State ``x = (x, y)``: position on a table of 6 cm by 6 cm, which starts uniformly in [2, 6]^2 cm. Action ``u``: the
+    displacement, at most ``max_action`` in each direction. The fence stops the peg; where a displacement would lead
+    beyond one side by ``b``, friction takes :math:`\mu b` off the component along that side. With
+    :math:`d_t = \lVert x_t - g \rVert`, ``g = (1.2, 1.2)`` cm, and T = 4 controls,
+
+    .. math::
+        c_t = d_t, \qquad c_T = 30 \max(0, d_T - \text{tolerance}).
+
+    A policy that looks can go to the hole; one that does not look can push the peg into the corner with three moves,
+    wherever it was, and go on to the hole with the fourth.
+
+    :param friction: Coefficient :math:`\mu` of the fence.
+    :param tolerance: Distance from the hole that costs nothing at the end, in cm.
+    :param sensor_noise_std: Standard deviation of the sensor noise in cm.
+    :param max_action: The longest displacement in each direction, in cm.
+    :param actuator_gain: The displacements are this many times the action.
+    :param horizon: Number of controls T.
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    :raises ValueError: for a keyword out of its range.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    state_names = ("x (cm)", "y (cm)")
+
+    def __init__(
+        self,
+        *,
+        friction: float = 0.2,
+        tolerance: float = 0.4,
+        sensor_noise_std: float = 0.01,
+        max_action: float = 2.5,
+        actuator_gain: float = 1.0,
+        horizon: int = 4,
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(horizon=horizon, render_mode=render_mode)
+        self.friction = checks.not_negative("friction", friction)
+        self.tolerance = checks.not_negative("tolerance", tolerance)
+        self.sensor_noise_std = checks.not_negative("sensor_noise_std", sensor_noise_std)
+        self.actuator_gain = checks.positive("actuator_gain", actuator_gain)
+        max_action = checks.positive("max_action", max_action)
+        self.state_space = spaces.Box(0.0, SIZE, (2,), np.float64)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = spaces.Box(-max_action, max_action, (2,), np.float32)
+
+    def _initial_state(self, n: int) -> np.ndarray:
+        return self.np_random.uniform(*START, (n, 2))
+
+    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        move = self.actuator_gain * action
+        aim = state + move
+        beyond = np.abs(aim - np.clip(aim, 0.0, SIZE))
+        # The push against one side brakes the motion along it, which is the other component.
+        move = np.sign(move) * np.maximum(0.0, np.abs(move) - self.friction * beyond[:, ::-1])
+        return np.clip(state + move, 0.0, SIZE)
+
+    def _sensor(self, state: np.ndarray) -> np.ndarray:
+        return (state + self.sensor_noise_std * self.np_random.standard_normal(state.shape)).astype(np.float32)
+
+    def _distance(self, state: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(state - HOLE, axis=1)
+
+    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        return self._distance(state)
+
+    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+        return 30.0 * np.maximum(0.0, self._distance(state) - self.tolerance)
+
+    def render(self) -> np.ndarray | None:
+        """Draw the table from above: fence (grey), hole (dark), peg (blue): ``(200, 200, 3)`` uint8."""
+        if self.render_mode is None:
+            return None
+        x, y = self._current_state()[0]
+        span = (-0.7, SIZE + 0.7, -0.7, SIZE + 0.7)
+        image = canvas(200, 200)
+        middle = SIZE / 2
+        paint_box(image, (middle, middle), (SIZE + 1.2, SIZE + 1.2), 0.0, (140, 140, 150), span)
+        paint_box(image, (middle, middle), (SIZE + 0.7, SIZE + 0.7), 0.0, (245, 245, 245), span)
+        paint_box(image, (HOLE[0], HOLE[1]), (0.8, 0.8), 0.0, (90, 90, 95), span)
+        paint_box(image, (x, y), (0.6, 0.6), 0.0, (45, 90, 190), span)
+        return image
