@@ -22,7 +22,7 @@ FIRST_SEED = 400
 # policy gradient that is trained further.
 LEVELS = (24.0, 8.7, 5.0)
 PAPERS_LEVEL = 8.7
-PRICES = (16, 22, 28, 34, 40)  # 1 / beta; the paper has every even number between
+PRICES = (16, 28, 40)  # 1 / beta; the paper has every even number between
 KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "test backgrounds": BACKGROUND_ROWS}
 
 
