@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-baselines reproduce-public wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-baselines reproduce-public wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -97,6 +97,9 @@ reproduce-grasp: $(STAMP) ## reproduce Table III: policy gradient, TDPG and its 
 
 reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a scenario of our own
 	$(PY) -m sb3_tdpg reproduce grasp-camera --out results/panda_grasp_camera --publish docs/results/panda_grasp_camera
+
+reproduce-pays: $(STAMP) ## where the bottleneck pays: squeeze, cue, peg and lava under faults that nobody declared
+	$(PY) -m sb3_tdpg reproduce pays --out results/pays --publish docs/results/pays
 
 reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside TDPG, on lava and grasping
 	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines

@@ -11,8 +11,8 @@ ENTRY_POINTS = {
     "PegCorner-v0": "sb3_tdpg.envs.peg_corner:PegCornerEnv",
 }
 
-# Returns at which a problem counts as solved: the default limit of a sweep's selection. The ball is caught within 5 cm; of
-# a hundred mugs 97 are lifted.
+# Returns at which a problem counts as solved: the default limit of a sweep's selection. The ball is caught within 5 cm;
+# of a hundred mugs 97 are lifted.
 REWARD_THRESHOLDS = {"BallCatch-v0": -5.0, "PandaGrasp-v0": -0.03}
 
 for _env_id, _entry_point in ENTRY_POINTS.items():

@@ -101,7 +101,7 @@ class SqueezeInsertEnv(POMDPEnv):
         yaw = self.yaw(state)
         away = wrap(yaw - action[:, 0])
         rest = np.where(np.abs(away) < self.basin, 0.0, np.sign(away) * RIGHT_ANGLE)
-        turn = self.np_random.uniform(*self.turn, len(state))
+        turn = self.np_random.uniform(self.turn[0], self.turn[1], len(state))
         return self._with_yaw(yaw + turn * (rest - away), state[:, 2:])
 
     def _sensor(self, state: np.ndarray) -> np.ndarray:

@@ -77,10 +77,11 @@ class EpisodeBatch(NamedTuple):
 
         :param pooled: Take the living steps of all times as samples of one variable: ``(1, n, ...)``.
         """
-        batch = InformationBatch(self.states, self.trvs, self.means, self.stds)
-        if pooled:
-            return InformationBatch(*(x[self.alive.bool()][None] for x in batch[:4]))
-        return batch if bool(self.alive.all()) else batch._replace(alive=self.alive.bool())
+        # Of rebuilt TRVs, too, so that gradients reach both sides of the recurrence.
+        prev_trvs = th.cat([self.prev_trvs[:1], self.trvs[:-1]])
+        alive = None if bool(self.alive.all()) else self.alive.bool()
+        batch = InformationBatch(self.states, self.trvs, self.means, self.stds, alive, prev_trvs)
+        return batch.pooled() if pooled else batch
 
 
 class PolicyStep(NamedTuple):

@@ -64,6 +64,7 @@ EXPERIMENTS = {
     "ball-varying": Experiment("ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)),
     "grasp": Experiment("grasp:reproduce_grasp", "panda_grasp"),
     "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
+    "pays": Experiment("pays:reproduce_pays", "pays"),
     "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
 }
 

@@ -27,7 +27,8 @@ def gaussian_batch(n, gains, noise_std=1.0, generator=None):
     states = th.randn(gains.shape[0], n, gains.shape[2], generator=generator)
     means = gains * states
     stds = th.full_like(means, noise_std)
-    return InformationBatch(states, means + stds * th.randn(means.shape, generator=generator), means, stds)
+    trvs = means + stds * th.randn(means.shape, generator=generator)
+    return InformationBatch(states, trvs, means, stds, prev_trvs=th.randn(means.shape))
 
 
 def gaussian_channels(nats, dim, n, n_channels, rng):
@@ -57,7 +58,7 @@ def build(name, horizon, state_dim, trv_dim, **kwargs):
 def random_batch(horizon=4, n=60, alive=None):
     states, means = th.randn(horizon, n, 2), th.randn(horizon, n, 2)
     stds = 0.5 + th.rand(horizon, n, 2)
-    return InformationBatch(states, means + stds * th.randn_like(means), means, stds, alive)
+    return InformationBatch(states, means + stds * th.randn_like(means), means, stds, alive, th.randn_like(means))
 
 
 def half_dead():

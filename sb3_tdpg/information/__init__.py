@@ -7,7 +7,7 @@ To add an estimator, add a file here and a row to :data:`ESTIMATORS`.
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.information.infonce import InfoNCE
-from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.logdet import DirectedLogDet, LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
@@ -20,6 +20,7 @@ ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "smile": Smile,
     "infonce": InfoNCE,
     "logdet": LogDet,
+    "directed": DirectedLogDet,
     "loo": LeaveOneOut,
     "vib": VariationalBottleneck,
 }
@@ -43,6 +44,7 @@ def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[Inf
 __all__ = [
     "ESTIMATORS",
     "CriticEstimator",
+    "DirectedLogDet",
     "InfoNCE",
     "InformationBatch",
     "InformationEstimator",

@@ -7,6 +7,7 @@ Dimension key: T time steps, N episodes, X state, Z task-relevant variables (TRV
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch as th
@@ -21,6 +22,7 @@ class InformationBatch(NamedTuple):
     means: th.Tensor  # (T, N, Z) of q(x~_t | x~_{t-1}, y_t)
     stds: th.Tensor  # (T, N, Z)
     alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
+    prev_trvs: th.Tensor | None = None  # (T, N, Z), x~_{t-1}, for estimators of the directed information
 
     @property
     def living(self) -> th.Tensor:
@@ -30,12 +32,22 @@ class InformationBatch(NamedTuple):
     def at(self, t: int) -> InformationBatch:
         """Select step t and its living episodes: ``(1, n, ...)``."""
         keep = slice(None) if self.alive is None else self.alive[t]
-        return InformationBatch(*(x[t, keep][None] for x in self[:4]))
+        return self._each(lambda x: x[t, keep][None])
 
     def select(self, episodes: th.Tensor) -> InformationBatch:
         """Select episodes by their indices: ``(T, n, ...)``."""
         alive = None if self.alive is None else self.alive[:, episodes]
-        return InformationBatch(*(x[:, episodes] for x in self[:4]))._replace(alive=alive)
+        return self._each(lambda x: x[:, episodes])._replace(alive=alive)
+
+    def pooled(self) -> InformationBatch:
+        """Take the living steps of all times as samples of one variable: ``(1, n, ...)``."""
+        return self._each(lambda x: x[self.living][None])
+
+    def _each(self, take: Callable[[th.Tensor], th.Tensor]) -> InformationBatch:
+        """Apply a function to all samples, which all live in the result."""
+        prev_trvs = None if self.prev_trvs is None else take(self.prev_trvs)
+        states, trvs, means, stds = map(take, self[:4])
+        return InformationBatch(states, trvs, means, stds, None, prev_trvs)
 
 
 class InformationEstimator(nn.Module):

@@ -93,7 +93,7 @@ def pooled_information(model: Any, env_kwargs: Mapping[str, Any] | None = None, 
         "training", "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast"}, sensor=VecImagePerturbation
     )
     batch = rollout_information(model, scenario, n_episodes)
-    pooled = InformationBatch(*(x.flatten(0, 1)[None] for x in batch[:4]))
+    pooled = batch.pooled()
     with th.no_grad():
         return model.horizon * LogDet(1, batch.states.shape[2], batch.trvs.shape[2])(pooled).item()
 

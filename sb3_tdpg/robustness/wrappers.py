@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tdpg.problem import attribute_of, horizon_of
 from sb3_tdpg.robustness.core import Perturber, each_part
-from sb3_tdpg.robustness.registry import find_applicable
+from sb3_tdpg.robustness.registry import Perturbation, find_applicable
 from sb3_tdpg.robustness.scale import default_scale
 
 Scale = float | np.ndarray | Mapping[str, Any] | None
@@ -47,7 +47,7 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
             raise ValueError(f"{type(env).__name__} holds several environments: use PerturbedVecEnv")
         RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
         gym.ObservationWrapper.__init__(self, env)
-        self._perturber = _perturber(perturbation, severity, env, 1, seed, scale)
+        self._perturber = make_perturber(perturbation, severity, env, 1, seed, scale)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and perturb its first observation."""
@@ -90,7 +90,7 @@ class PerturbedVecEnv(VecEnvWrapper):
         if isinstance(venv, VecNormalize) and venv.norm_obs:
             raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)
-        self._perturber = _perturber(perturbation, severity, venv, venv.num_envs, seed, scale)
+        self._perturber = make_perturber(perturbation, severity, venv, venv.num_envs, seed, scale)
 
     def reset(self) -> Any:
         """Start N episodes, and perturb their first observations."""
@@ -139,11 +139,18 @@ def _put(where: Any, target: np.ndarray, values: np.ndarray) -> None:
     target[where] = values
 
 
-def _perturber(
-    name: str, severity: int, env: gym.Env | VecEnv, n_envs: int, seed: int | None, scale: Scale
+def make_perturber(
+    perturbation: str | Perturbation,
+    severity: int,
+    env: gym.Env | VecEnv,
+    n_envs: int,
+    seed: int | None,
+    scale: Scale,
 ) -> Perturber:
+    """Make the perturber of an environment from a perturbation or its name; see :class:`PerturbedObservation`."""
     space, horizon = env.observation_space, horizon_of(env)
-    perturbation = find_applicable(name, space, horizon, env.action_space)
+    if isinstance(perturbation, str):
+        perturbation = find_applicable(perturbation, space, horizon, env.action_space)
     perturbation.value(severity)  # checked before the calibration, which takes time
     if seed is not None and (isinstance(seed, bool) or seed < 0):
         raise ValueError(f"seed={seed} must be None or an integer of at least 0")

@@ -284,7 +284,8 @@ def test_a_share_that_leaves_too_few_episodes_on_either_side_is_refused(held_out
 def with_garbage(batch, value):
     """Overwrite everything that belongs to dead episodes."""
     dead = ~batch.alive[..., None]
-    return InformationBatch(*(x.masked_fill(dead, value) for x in batch[:4]), batch.alive)
+    samples = (x.masked_fill(dead, value) for x in (*batch[:4], batch.prev_trvs))
+    return InformationBatch(*[next(samples) for _ in range(4)], batch.alive, next(samples))
 
 
 @pytest.mark.parametrize(
@@ -307,9 +308,7 @@ def test_what_stands_where_an_episode_has_ended_makes_no_difference(name, settin
 @pytest.mark.parametrize("name", CRITIC_FREE)
 def test_a_step_is_estimated_from_the_episodes_that_live(name):
     batch = random_batch(alive=half_dead())
-    living = batch.alive[2]
-    alone = InformationBatch(*(x[2:3, living] for x in batch[:4]))
-    th.testing.assert_close(build(name, 4, 2, 2)(batch)[2:3], build(name, 1, 2, 2)(alone))
+    th.testing.assert_close(build(name, 4, 2, 2)(batch)[2:3], build(name, 1, 2, 2)(batch.at(2)))
 
 
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))

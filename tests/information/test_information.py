@@ -200,7 +200,8 @@ def test_the_gradient_of_the_estimate_is_that_of_finite_differences(name):
     def estimate(trvs, means, stds):
         th.manual_seed(1)  # the same derangement each time
         # Times zero: finite differences must exist for an estimator that does not use an input.
-        return estimator(InformationBatch(batch.states.double(), trvs, means, stds)) + 0 * (trvs + means + stds).sum()
+        samples = InformationBatch(batch.states.double(), trvs, means, stds, prev_trvs=batch.prev_trvs.double())
+        return estimator(samples) + 0 * (trvs + means + stds).sum()
 
     assert th.autograd.gradcheck(estimate, inputs)
 
@@ -208,6 +209,7 @@ def test_the_gradient_of_the_estimate_is_that_of_finite_differences(name):
 @pytest.mark.parametrize(("name", "reached"), [
     *((name, {"trvs"}) for name in CRITICS),
     ("logdet", {"means", "stds"}),
+    ("directed", {"means", "stds"}),
     ("loo", {"trvs", "means", "stds"}),
     ("vib", {"means", "stds"}),
 ])  # fmt: skip
@@ -245,7 +247,9 @@ def test_an_estimator_is_found_by_its_name_or_given_as_a_class():
 
 @pytest.mark.parametrize("estimator", ["mime", dict, 3, None, InformationBatch])
 def test_anything_else_is_refused_with_the_list(estimator):
-    with pytest.raises(ValueError, match=r"use one of \['infonce', 'logdet', 'loo', 'mine', 'nwj', 'smile', 'vib'\]"):
+    with pytest.raises(
+        ValueError, match=r"use one of \['directed', 'infonce', 'logdet', 'loo', 'mine', 'nwj', 'smile', 'vib'\]"
+    ):
         get_estimator_class(estimator)
 
 
