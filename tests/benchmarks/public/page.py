@@ -63,7 +63,7 @@ class Records:
         """The tasks that there are records of."""
         return [task for task in TASKS if task.env_id in set(self.episodes["env_id"])]
 
-    def means(self, task: PublicTask, method: str, deterministic: bool = True) -> np.ndarray:
+    def means(self, task: PublicTask, method: str, deterministic: bool) -> np.ndarray:
         """Return the mean return of each seed, ``(seeds,)``."""
         frame = self.episodes
         frame = frame[(frame["env_id"] == task.env_id) & (frame["method"] == method)]
@@ -82,9 +82,10 @@ class Records:
         parts = [
             "# Public tasks",
             "## Final returns",
-            self.returns_table(True),
-            "With the noise of the policy:",
+            "With the noise that the policies were trained with:",
             self.returns_table(False),
+            "Without noise, as `evaluate_policy` evaluates by default:",
+            self.returns_table(True),
             "## Cost limit",
             self.limit_table(),
             "## CPU time",
