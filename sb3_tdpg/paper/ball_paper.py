@@ -49,7 +49,7 @@ class StopAtCost(TDPGCallback):
 
 def methods() -> tuple[Method, ...]:
     """
-    List policy gradient at each of the levels, and TDPG from each with each price.
+    List policy gradient at each of the levels, and TDPG with each price from those that cost as much as the paper's.
 
     Each level of policy gradient goes on from the one before.
     """
@@ -63,6 +63,7 @@ def methods() -> tuple[Method, ...]:
         found += [
             Method(f"TDPG {price} from {level:g}", "BallCatch-v0-paper", pg, overrides=dict(beta=1 / price))
             for price in PRICES
+            if level >= PAPERS_LEVEL
         ]
         start = pg
     return tuple(found)
