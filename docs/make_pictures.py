@@ -1,19 +1,24 @@
 """Draw the pictures of the environments and the perturbations: ``python docs/make_pictures.py``."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 from sb3_tdpg.envs.panda_view import depth_picture
+from sb3_tdpg.envs.peg_corner import HOLE, PegCornerEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
+from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 from sb3_tdpg.robustness import perturbation_gallery
 
+Policy = Callable[[np.ndarray, int], Sequence[float] | np.ndarray]
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
 OPEN_LOOP = (-5.0, 0.0, 1.5, 0.0, -1.5)
 MUG = (0.5, 0.02, 0.0, 0.6)  # m and rad; the handle points to the viewer
@@ -34,6 +39,53 @@ def lava(path: Path) -> None:
     frames = [Image.fromarray(np.concatenate(rows)) for rows in zip(*rows_of_frames, strict=True)]
     durations = [900] * (len(frames) - 1) + [2500]  # ms
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+
+
+def ways(path: Path, env: POMDPEnv, starts: Sequence[Sequence[float]], look: Policy, blind: Policy) -> None:
+    """
+    Animate a policy that looks at the state, above, and one that does not, below, from the same states.
+
+    :param look: The action at time t in a state.
+    """
+    rows = []
+    for policy in (look, blind):
+        columns = []
+        for start in starts:
+            env.reset(seed=0)
+            env._state = np.array([start], dtype=np.float64)
+            pictures = [env.render()]
+            for t in range(env.horizon):
+                env.step(np.asarray(policy(env._state[0], t)))
+                pictures.append(env.render())
+            columns.append(pictures)
+        rows.append([side_by_side(list(pictures)) for pictures in zip(*columns, strict=True)])
+    gap = np.full((6, rows[0][0].shape[1], 3), 255, np.uint8)
+    frames = [Image.fromarray(np.concatenate([above, gap, below])) for above, below in zip(*rows, strict=True)]
+    durations = [1200] * (len(frames) - 1) + [2500]  # ms
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+
+
+def squeeze_insert(path: Path) -> None:
+    """Turn four parts, by looking and by the best fixed angles."""
+    turn, basin, fixed = 0.85, np.deg2rad(64), (0.428, -0.073, -3.14, -3.123)
+
+    def look(state: np.ndarray, t: int) -> list[float]:
+        yaw = 0.5 * np.arctan2(state[0], state[1])
+        fingers = -yaw * (1 - turn) / turn
+        return [fingers if abs(yaw - fingers) < basin else yaw - np.sign(yaw) * basin]
+
+    yaws = np.deg2rad([-70.0, -25.0, 40.0, 85.0])
+    starts = np.column_stack([np.sin(2 * yaws), np.cos(2 * yaws)])
+    env = SqueezeInsertEnv(render_mode="rgb_array")
+    ways(path, env, starts, look, lambda state, t: [fixed[t]])
+
+
+def peg_corner(path: Path) -> None:
+    """Bring four pegs to the hole, straight and by way of the corner."""
+    fixed = ((-2.5, -2.5), (-1.27, -1.34), (-2.35, -2.19), (0.94, 0.92))
+    starts = [(5.6, 5.2), (2.4, 5.0), (4.0, 2.6), (3.2, 3.8)]
+    env = PegCornerEnv(render_mode="rgb_array")
+    ways(path, env, starts, lambda state, t: HOLE - state, lambda state, t: fixed[t])
 
 
 def side_by_side(images: list[np.ndarray], gap: int = 6) -> np.ndarray:
@@ -152,6 +204,8 @@ def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
 if __name__ == "__main__":
     folder = Path(__file__).parent / "environments"
     lava(folder / "lava.gif")
+    squeeze_insert(folder / "squeeze_insert.gif")
+    peg_corner(folder / "peg_corner.gif")
     ball_textures(folder / "ball_textures.png")
     ball_camera(folder / "ball_camera.png")
     ball_catch(folder / "ball_catch.gif")
