@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
     from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "TDPG",

@@ -162,10 +162,10 @@ def test_the_notebook_installs_the_wheel_beside_it_where_the_package_is_missing(
     monkeypatch.setattr(subprocess, "check_call", installed.append)
     with pytest.raises(FileNotFoundError, match="make wheel"):
         exec(first, {})
-    Path("sb3_tdpg-0.1.0-py3-none-any.whl").touch()
+    Path("sb3_tdpg-0.2.0-py3-none-any.whl").touch()
     exec(first, {})
     assert [command[1:4] + command[-1:] for command in installed] == [
-        ["-m", "pip", "install", "sb3_tdpg-0.1.0-py3-none-any.whl[plots]"]
+        ["-m", "pip", "install", "sb3_tdpg-0.2.0-py3-none-any.whl[plots]"]
     ]
 
 
