@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import os
-import sys
 import traceback
 import warnings
 from abc import abstractmethod
@@ -37,10 +36,6 @@ from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, check_numbers, check_observations, named_shapes, read_problem
 from sb3_tdpg.robustness.nuisance import make_nuisance
 from sb3_tdpg.settings import nearest_multiples
-
-# Checkpoints that were saved before the module moved name its old path.
-sys.modules.setdefault("sb3_tdpg.random_state", sys.modules[RandomState.__module__])
-
 
 NUISANCE_OPTIMIZER = "nuisance_phase.optimizer"
 

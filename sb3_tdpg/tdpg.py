@@ -183,14 +183,14 @@ class TDPG(EpisodicAlgorithm):
             )
         if env is not None:
             check_action_space(env.action_space)
-        # A model that is being loaded has its preset from the file; those of early versions have none.
+        # A model that is being loaded has its preset from the file.
         is_new = env is not None and _init_setup_model
         horizon = None if env is None else horizon_of(env)
         self.preset = preset_of(env.observation_space, horizon) if env is not None and is_new else None
         settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1), horizon or 1)
         self._has_default_batch_size = batch_size is None
-        # The defaults of the paper's problems, and models of early versions, count episodes always.
-        self._counts_episodes = not is_new or (batch_size is None and self.preset != "long")
+        # The defaults of the paper's problems count episodes always.
+        self._counts_episodes = batch_size is None and self.preset != "long"
         check_policy(policy, self.policy_aliases)
         check_arguments({**settings, "seed": seed})
         super().__init__(
@@ -228,7 +228,7 @@ class TDPG(EpisodicAlgorithm):
         self.clip_range: Any = settings["clip_range"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.n_threads: int | None = settings["n_threads"]
-        self.nuisance = nuisance if is_new else None  # models of early versions have none
+        self.nuisance = nuisance
         self.nuisance_steps, self.nuisance_level = nuisance_steps, nuisance_level
         self.first_cost: float | None = None
         """Mean episode cost of the first epoch."""
@@ -241,8 +241,6 @@ class TDPG(EpisodicAlgorithm):
 
     def _setup_model(self) -> None:
         # load() sets attributes without the constructor: check them again.
-        if self.preset is None and self.baseline == "value":  # a model of an early version
-            self.baseline = "regression"
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         check_policy(self.policy_class, self.policy_aliases)
         check_arguments(vars(self))

@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -16,10 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdpg import TDPG, InformationCallback
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
 from sb3_tdpg.features import Changes, RunningNorm
-from sb3_tdpg.information import LogDet, get_estimator_class
+from sb3_tdpg.information import LogDet
 from sb3_tdpg.settings import DEFAULTS, discount_of, preset_of
-
-OLD_MODEL = Path(__file__).parent / "data" / "cartpole_before_segments.zip"
 
 
 def tiny(env="CartPole-v1", **kwargs):
@@ -340,35 +337,6 @@ def test_a_saved_model_predicts_and_continues_the_same(tmp_path):
     assert_same_parameters(parameters(model.value_function), parameters(loaded.value_function))
     assert (loaded.preset, loaded.batch_size, loaded.epoch_steps) == ("long", 100, 400)
     loaded.learn(400, reset_num_timesteps=False)
-
-
-# The file was written with NumPy 1, so that NumPy 1 can read it, too.
-@pytest.mark.filterwarnings("ignore:numpy.core:DeprecationWarning")
-def test_a_model_from_before_the_segments_loads_and_trains_as_it_did():
-    model = TDPG.load(OLD_MODEL, env=make_vec_env("CartPole-v1", 2), device="cpu")
-    action, (trvs, _) = model.predict(np.array([0.1, 0.2, 0.03, 0.4], np.float32), deterministic=True)
-    assert action == 0
-    np.testing.assert_allclose(trvs, [[0.05216565, -0.0425191]], rtol=1e-4)
-    assert (model.baseline, model.n_episodes) == ("regression", 10)
-    assert model.batch_size == 5 * model.horizon  # it was in episodes
-    model.beta, model.cost_limit = 100.0, None
-    model._setup_beta()
-    model.learn(200)
-    assert model.epoch == 1
-    assert np.isfinite(model.logger.name_to_value["train/mi_loss"])
-
-
-def test_the_critics_of_a_model_with_one_for_each_step_start_afresh():
-    old, new = (get_estimator_class("mine")(horizon, 2, 3) for horizon in (60, 1))
-    before = parameters(new)
-    new.load_state_dict(old.state_dict())
-    after = parameters(new)
-    assert before["critic.layers.0.weight"].shape == after["critic.layers.0.weight"].shape
-    assert_same_parameters(before, after)
-    with pytest.raises(RuntimeError, match="size mismatch"):  # these do not fit in any version
-        get_estimator_class("mine")(60, 2, 4).load_state_dict(old.state_dict())
-    with pytest.raises(RuntimeError, match="size mismatch"):
-        get_estimator_class("mine")(1, 2, 4).load_state_dict(new.state_dict())
 
 
 # -- dicts -----------------------------------------------------------------------------------------------------

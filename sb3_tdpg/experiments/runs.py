@@ -227,7 +227,7 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
     rows: list[dict[str, Any]] = [
         dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios
     ]
-    for row, scenario in zip(rows, scenarios, strict=True):  # the folders of earlier versions have neither
+    for row, scenario in zip(rows, scenarios, strict=True):  # only where there is one
         if scenario.sensor is not None:
             row["sensor"] = str(scenario.sensor)
         if scenario.n_episodes is not None:

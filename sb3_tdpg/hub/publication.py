@@ -111,13 +111,13 @@ def read_run(folder: Path) -> Publication:
         refuse_links(folder.parent / start)
         notes.append(f"The training started from the policy of another run, {start}.")
         files[f"{start}/model.zip"] = folder.parent / start / "model.zip"
-    # A run of an early version lacks its scenarios, and the policy that it started from may be gone.
-    is_repeatable = "scenarios" in config and (start is None or files[f"{start}/model.zip"].exists())
+    # The policy that the run started from may be gone.
+    is_repeatable = start is None or files[f"{start}/model.zip"].exists()
     return Publication(
         model=folder / "model.zip",
         **{name: config[name] for name in ("env_id", "method", "seed")},
         records=records,
-        scenarios=scenarios_of(config) if "scenarios" in config else (),
+        scenarios=scenarios_of(config),
         settings=settings,
         progress=read_progress(folder),
         notes=notes,
@@ -132,8 +132,7 @@ def read_run(folder: Path) -> Publication:
 
 def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
     """Read the episodes of a run; a file that was cut is refused."""
-    # Early versions recorded neither scenarios nor the number of episodes.
-    expected = config.get("n_eval_episodes", 0) * len(config.get("scenarios", ()))
+    expected = config["n_eval_episodes"] * len(config["scenarios"])
     try:
         records = pd.read_csv(path)
     except EmptyDataError:
@@ -141,7 +140,7 @@ def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
     columns = ["attempts", "scenario", "cost"]
     if len(records) < max(expected, 1) or records.reindex(columns=columns).isna().any(axis=None):
         raise ValueError(
-            f"{path} is not whole: it has {len(records)} of {expected or 'some'} episodes, with the columns "
+            f"{path} is not whole: it has {len(records)} of {expected} episodes, with the columns "
             f"{', '.join(records) or 'none'}; needed are {', '.join(columns)}. Delete it and run the command again"
         )
     return records

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch as th
 from torch import nn
@@ -95,14 +95,6 @@ class InformationEstimator(nn.Module):
     def recommended_episodes(self) -> int:
         """Number of episodes of an epoch below which the estimate is misleading."""
         return self.trv_dim + 2
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # Early versions had a network for each step also where one for all is fitted now: it starts afresh.
-        for name, value in self.state_dict().items() if self.horizon == 1 else ():
-            saved = state_dict.get(f"{prefix}{name}", value)
-            if saved.shape[1:] == value.shape[1:] and saved.shape != value.shape:
-                state_dict[f"{prefix}{name}"] = value
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
