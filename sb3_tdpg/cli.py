@@ -117,6 +117,16 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
     print(f"\n{text}\n\nresults are in {out}")
 
 
+def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequence[str], **options: Any) -> None:
+    from sb3_tdpg.experiments.frontier import frontier
+
+    out = options.pop("out") or Path("results", f"frontier-{options['block'] or env.rpartition(':')[2]}")
+    keywords = dict(env_kwargs=parse_keywords(env_kwargs), settings=parse_keywords(settings))
+    with kept_by_this_process(out):
+        text = frontier(env, n_seeds=seeds, out=out, **keywords, **options)
+    print(f"\n{text}\n\nresults are in {out}")
+
+
 def _certify(
     models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, nuisance: str | None, n_members: int,
     **options: Any,
@@ -258,6 +268,10 @@ FLAGS: dict[str, dict[str, Any]] = {
     "--seed": dict(type=int, default=0),
     "--deterministic": dict(action="store_true", help="use means instead of samples: not the policy that was trained"),
     "--jobs": dict(type=_positive, help="processes (default: the number of cores)"),
+    "--block": dict(help="block of hyperparameters (default: that of the environment)"),
+    "--set": dict(
+        dest="settings", help="replace settings of the block: mi_estimator=logdet (values in YAML)", **KEYWORDS
+    ),
     "--n-timesteps": dict(type=_positive, help="environment steps of each training"),
     "--n-eval-episodes": dict(type=_positive, default=1000, help="episodes of each row of the table"),
 }
@@ -309,18 +323,23 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--format", choices=("onnx", "torchscript"), help="default: that of the file's name, or onnx")
 
     text = "train with several betas and seeds, select by the paper's rule, plot cost against information"
-    add = command(_sweep, text, "--env", "--jobs", *sizes)
+    add = command(_sweep, text, "--env", "--jobs", "--block", "--set", *sizes)
     add("--betas", nargs="+", required=True, metavar="BETA", help="1/25 1/50 0.01 inf ...")
     add("--seeds", type=_positive, default=5, help="training seeds of each beta")
     add("--cost-limit", type=float, help="of the selection (default: minus the environment's reward_threshold)")
-    add("--block", help="block of hyperparameters (default: that of the environment)")
-    add(
-        "--set", dest="settings", help="replace settings of the block: mi_estimator=logdet (values in YAML)", **KEYWORDS
-    )
     add("--out", type=Path, help="folder for the results (default: results/sweep-<block>)")
     add("--storage", metavar="URL", help="share the sweep with other workers: postgresql://... or FILE.log")
     add("--study-name", help="name of the study in the storage (default: sweep-<block>)")
     add("--grace-period", type=float, default=60.0, help="seconds without a heartbeat until a worker counts as dead")
+
+    text = (
+        "find out whether the bottleneck will pay: short trainings that keep shares of the improvement, and a verdict"
+    )
+    add = command(_frontier, text, "--env", "--env-kwargs", "--jobs", "--n-timesteps", "--block", "--set")
+    add("--shares", nargs="+", type=float, default=(99, 95, 90, 80), metavar="PERCENT", help="default: 99 95 90 80")
+    add("--seeds", type=_positive, default=3, help="training seeds of each row (default: 3)")
+    add("--n-eval-episodes", type=_positive, default=500, help="episodes of each evaluation (default: 500)")
+    add("--out", type=Path, help="folder for the results (default: results/frontier-<env or block>)")
 
     text = "compute upper bounds on the cost of lava policies under shifts of sensor and start"
     add = command(_certify, text, "--env", "--env-kwargs", "--seed")

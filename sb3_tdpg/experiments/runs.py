@@ -42,7 +42,7 @@ class Run:
 
     :param method: The label in tables ("PG", "TDPG").
     :param env_id: The training environment.
-    :param block: Block of ``hyperparams/tdpg.yml``.
+    :param block: Block of ``hyperparams/tdpg.yml``; ``None``: the settings are the overrides alone.
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Maximum number of trainings from scratch, each with its own seed, until one meets the limits of
@@ -53,7 +53,7 @@ class Run:
 
     method: str
     env_id: str
-    block: str
+    block: str | None
     seed: int
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
@@ -67,7 +67,7 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """The block with the overrides."""
-        return {**load_hyperparams(self.block), **self.overrides}
+        return {**(load_hyperparams(self.block) if self.block else {}), **self.overrides}
 
     @property
     def folder_name(self) -> str:
@@ -142,6 +142,7 @@ class SB3Run(Run):
     @property
     def settings(self) -> dict[str, Any]:
         """The block with the overrides."""
+        assert self.block is not None
         return {**load_hyperparams(self.block, self.algo), **self.overrides}
 
     @property

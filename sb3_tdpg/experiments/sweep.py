@@ -29,7 +29,7 @@ from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.information import information_bounds, rollout_information
 from sb3_tdpg.experiments.runs import Run, Task, check_folder, complete_run, complete_runs
 from sb3_tdpg.experiments.tradeoff import tradeoff_figure
-from sb3_tdpg.experiments.training import make_training
+from sb3_tdpg.experiments.training import Training, make_training
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.tdpg import TDPG
 
@@ -88,36 +88,14 @@ class _Plan:
         return run, self.out / "runs" / run.folder_name, self.scenarios
 
     def row(self, inverse_beta: float, seed: int) -> dict[str, Any]:
-        """Return a finished run's row of ``runs.csv``: its cost in each scenario and its information in the first."""
-        run, folder, _ = self.task(inverse_beta, seed)
-        path = folder / "sweep_row.json"
-        if path.exists():
-            return json.loads(path.read_text())
-        records = pd.read_csv(folder / "episodes.csv")
-        costs = records.groupby("scenario", sort=False)["cost"].agg(["mean", "std"])
-        model = TDPG.load(folder / "model.zip", device="cpu")
-        training = self.scenarios[0].with_kwargs(**run.settings.get("env_kwargs", {}))
-        n_episodes = min(N_INFORMATION, max(self.n_eval_episodes, model.policy.trv_dim + 2))
-        upper, lower = information_bounds(rollout_information(model, training, n_episodes))
-        row: dict[str, Any] = dict(
-            label=beta_label(inverse_beta),
-            inverse_beta=inverse_beta,
-            seed=seed,
-            cost=float(costs["mean"].iloc[0]),
-            std=float(costs["std"].iloc[0]),
-            information=upper,
-            information_lower=lower,
-            met_block_limits=bool(records["selected"].iloc[0]),
-            folder=folder.name,
-            **{column: float(costs["mean"][name]) for name, column in self.columns.items()},
-        )
-        write_atomically(path, json.dumps(row))
-        return row
+        """Return a finished run's row of ``runs.csv``."""
+        labels = dict(label=beta_label(inverse_beta), inverse_beta=inverse_beta)
+        return finished_row(self.task(inverse_beta, seed), self.n_eval_episodes, labels)
 
     @property
     def columns(self) -> dict[str, str]:
         """Name of the column of ``runs.csv`` with the mean cost, by scenario."""
-        return {scenario.name: f"cost: {scenario.name}" for scenario in self.scenarios}
+        return _columns(self.scenarios)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -126,6 +104,43 @@ class _Plan:
         rows = {row.name: dict(env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in self.scenarios}
         shared = {name: getattr(self, name) for name in ("env_id", "block", "n_eval_episodes")}
         return {**shared, "settings": settings, "scenarios": rows}
+
+
+def _columns(scenarios: Sequence[Scenario]) -> dict[str, str]:
+    return {scenario.name: f"cost: {scenario.name}" for scenario in scenarios}
+
+
+def finished_row(task: Task, n_eval_episodes: int, labels: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Measure a finished run: its cost in each scenario and its information in the first; the row is kept in its folder.
+
+    :param task: The run.
+    :param n_eval_episodes: Episodes for the information, 1000 at most.
+    :param labels: The first columns.
+    """
+    run, folder, scenarios = task
+    path = folder / "sweep_row.json"
+    if path.exists():
+        return json.loads(path.read_text())
+    records = pd.read_csv(folder / "episodes.csv")
+    costs = records.groupby("scenario", sort=False)["cost"].agg(["mean", "std"])
+    model = TDPG.load(folder / "model.zip", device="cpu")
+    training = scenarios[0].with_kwargs(**run.settings.get("env_kwargs", {}))
+    n_episodes = min(N_INFORMATION, max(n_eval_episodes, model.policy.trv_dim + 2))
+    upper, lower = information_bounds(rollout_information(model, training, n_episodes))
+    row: dict[str, Any] = dict(
+        **labels,
+        seed=run.seed,
+        cost=float(costs["mean"].iloc[0]),
+        std=float(costs["std"].iloc[0]),
+        information=upper,
+        information_lower=lower,
+        met_block_limits=bool(records["selected"].iloc[0]),
+        folder=folder.name,
+        **{column: float(costs["mean"][name]) for name, column in _columns(scenarios).items()},
+    )
+    write_atomically(path, json.dumps(row))
+    return row
 
 
 def sweep(
@@ -191,7 +206,7 @@ def sweep(
         out=out or Path("results", f"sweep-{block}"),
         study=None if storage is None else (storage, study_name or f"sweep-{block}", grace_period),
     )
-    _build_once(plan)
+    build_once(plan.run(1.0, 0))
     if plan.study is not None:
         _open_study(plan)
     tasks = [plan.task(*job) for job in wanted]
@@ -229,16 +244,19 @@ def _cost_limit(env_id: str, given: float | None) -> float:
     return -float(threshold or 0.0) if given is None else given
 
 
-def _build_once(plan: _Plan) -> None:
-    """Build a model, so that errors in the settings are found before any training."""
+def build_once(run: Run) -> Training:
+    """Build the model of a run, so that errors in the settings are found before any training."""
     try:
-        env = make_training(plan.env_id, plan.run(1.0, 0).settings, seed=0, device="cpu").model.env
+        training = make_training(run.env_id, run.settings, seed=0, device="cpu")
+    except gym.error.Error as e:
+        raise ValueError(f"env={run.env_id!r} cannot be made: {e}") from e
     except KeyError as e:
         raise ValueError(f"{e.args[0]}: choose one with --block") from e
     except TypeError as e:
-        raise ValueError(f"the settings of block {plan.block!r} do not fit: {e}") from e
-    assert env is not None
-    env.close()
+        raise ValueError(f"the settings of block {run.block!r} do not fit: {e}") from e
+    assert training.model.env is not None
+    training.model.env.close()
+    return training
 
 
 def _open_study(plan: _Plan) -> Any:

@@ -1,4 +1,4 @@
-"""The figure of a sweep: the cost of the runs against the information in their TRVs, and their robustness."""
+"""The figures of a sweep and of a frontier: the cost of the runs against the information in their TRVs."""
 
 from __future__ import annotations
 
@@ -83,3 +83,39 @@ def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: 
     kinds = dict.fromkeys(name.rsplit(" ", 1)[0].lower() for name in names[1:] if short_name(name) != name)
     axes.set_xticks(range(len(names)), texts, rotation=30 if sum(map(len, texts)) > 36 else 0)
     axes.set_xlabel(f"{', then '.join(kinds) or 'scenario'} (bar: median over seeds)", fontsize=9)
+
+
+def frontier_figure(runs: pd.DataFrame, table: pd.DataFrame, knee: str | None) -> Figure:
+    """
+    Draw cost against information: a dot for each run, the means with their intervals, the open loop, the knee.
+
+    :param runs: ``label``, ``cost`` and ``information`` (nats) of each run.
+    :param table: From :func:`~sb3_tdpg.experiments.frontier.frontier_table`: without a penalty, by share, blind.
+    :param knee: Label of the row to mark.
+    """
+    matplotlib = import_matplotlib()
+    figure, ((axes,),) = new_panels(WIDTH * 0.75, 4.2)
+    start, end = table.iloc[0], table.iloc[-1]
+    points = table.iloc[:-1]
+    shades = matplotlib.colormaps["viridis_r"](np.linspace(0.12, 1.0, len(points) - 1))
+    axes.plot(points["nats"], points["cost"], color=INK, linewidth=0.8, zorder=2)
+    mixture: dict[str, Any] = dict(color=LIMIT_COLOR, linestyle=(0, (1, 2)), linewidth=1.2, zorder=1)
+    axes.plot([start["nats"], 0], [start["cost"], end["best"]], label="mixtures of the two", **mixture)
+    for color, (_, row) in zip([INK, *shades], points.iterrows(), strict=True):
+        seeds = runs[runs["label"] == row["label"]]
+        axes.plot(seeds["information"], seeds["cost"], ".", color=color, markersize=5, alpha=0.6, zorder=3)
+        errors = [[[row[n] - row[f"{n}_low"]], [row[f"{n}_high"] - row[n]]] for n in ("nats", "cost")]
+        style: dict[str, Any] = dict(fmt="o", color=color, markersize=6, capsize=2, elinewidth=1, zorder=4)
+        axes.errorbar(row["nats"], row["cost"], yerr=errors[1], xerr=errors[0], label=row["label"], **style)
+        if row["label"] == knee:
+            ring: dict[str, Any] = dict(facecolors="none", edgecolors=LIMIT_COLOR, linewidths=2, zorder=5)
+            axes.scatter(row["nats"], row["cost"], s=170, label="knee", **ring)
+    axes.scatter(0, end["best"], marker="D", s=36, color=LIMIT_COLOR, zorder=4, label="best open loop", clip_on=False)
+    axes.axhline(end["best"], color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
+    axes.set_xlim(left=0)
+    axes.margins(y=0.08)
+    axes.grid(alpha=0.25)
+    axes.set_xlabel("information in the TRVs (nat)", fontsize=9)
+    axes.set_ylabel("mean episode cost", fontsize=9)
+    legend_above(figure, axes, 5)
+    return figure

@@ -1,0 +1,236 @@
+"""Will the bottleneck pay on a task? A short sweep over shares of the improvement kept, and a verdict."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdpg.auto_weight import WINDOW, share_of
+from sb3_tdpg.common.files import write_atomically
+from sb3_tdpg.common.markdown import fill_template, markdown_table
+from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.threads import threads
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import save_figure
+from sb3_tdpg.evaluation.statistics import interquartile_means
+from sb3_tdpg.experiments.blind import BlindVecEnv
+from sb3_tdpg.experiments.runs import Run, Task, check_folder, complete_runs, read_progress
+from sb3_tdpg.experiments.sweep import TIE, build_once, finished_row
+from sb3_tdpg.experiments.tradeoff import frontier_figure
+from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.settings import DEFAULTS, preset_of
+
+SHARES = (99, 95, 90, 80)  # per cent
+NO_PENALTY, OPEN_LOOP = "no penalty", "open loop"
+# The verdict.
+IMPROVEMENT = 0.9  # of the improvement is kept
+INFORMATION = 0.5  # of the information is kept at most
+PRICE = 0.5  # of the cost without a penalty: the open loop costs at most as much more
+
+
+def frontier(
+    env_id: str,
+    *,
+    shares: Sequence[float] = SHARES,
+    n_seeds: int = 3,
+    out: Path | None = None,
+    jobs: int | None = None,
+    n_timesteps: int | None = None,
+    n_eval_episodes: int = 500,
+    block: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> str:
+    """
+    Train without a penalty, with limits on the cost, and blind; draw cost against information, and say if it pays.
+
+    Each limit keeps a share of the improvement over training (``beta="auto", cost_limit="95%"``). The *open loop* is
+    the same training with a policy that sees only the time. Its best seed is the *best open loop* that was found. The
+    information is the log-det bound on fresh episodes; an interval is a bootstrap of 95 % over the seeds, with three
+    seeds their range. Finished runs are kept: the same call resumes an interrupted one. See :func:`verdict` for the
+    rule, and :func:`knee`.
+
+    :param env_id: A registered id.
+    :param shares: Shares of the improvement in per cent, between 0 and 100.
+    :param n_seeds: Number of training seeds of each row, from seed 0 on.
+    :param out: Folder for ``frontier.md``, ``frontier.csv``, ``frontier.png``, ``runs.csv``, ``config.json`` and
+        ``runs/``; default: ``results/frontier-<block or environment>``.
+    :param jobs: Number of runs at a time; default: the number of cores.
+    :param n_timesteps: Environment steps of each training; default: as in the block, or TDPG's default.
+    :param n_eval_episodes: Episodes of each evaluation.
+    :param block: Block of ``hyperparams/tdpg.yml``; default: that of the environment, if there is one, else TDPG's
+        defaults. Its callbacks are left out, and the estimator is the log-det bound.
+    :param env_kwargs: Keywords of the environment.
+    :param settings: Settings that replace those of the block.
+    :return: the summary, as Markdown
+    :raises ValueError: if an argument is malformed or does not fit; nothing has been trained by then.
+    """
+    labels = [NO_PENALTY, *(f"{share:g} %" for share in sorted({*shares}, reverse=True)), OPEN_LOOP]
+    if not shares or n_seeds < 1 or any(share_of(label.replace(" ", "")) is None for label in labels[1:-1]):
+        raise ValueError(f"shares={[*shares]} must be at least one number between 0 and 100, and n_seeds at least 1")
+    for name in {"beta", "cost_limit", "seed"} & set(settings or ()):
+        raise ValueError(f"{name} is set by the frontier: leave it out of the settings")
+    name = env_id.rpartition(":")[2]
+    out = out or Path("results", f"frontier-{block or name}")
+    block = block or (name if _has_block(name) else None)
+    # The penalty is the bound that the figure shows. Callbacks would select epochs by rules of their own.
+    shared: dict[str, Any] = dict(policy="TRVPolicy", mi_estimator="logdet", mi_kwargs=None, callback=[])
+    shared.update({**(settings or {}), **({"env_kwargs": dict(env_kwargs)} if env_kwargs else {})})
+    if block is not None:
+        shared.pop("policy")
+    if n_timesteps is not None or block is None:
+        shared["n_timesteps"] = n_timesteps or 1
+    model, _, length = build_once(_task(env_id, block, shared, NO_PENALTY, 0, out)[0])
+    if n_timesteps is None and block is None:
+        preset = preset_of(model.observation_space, model.horizon)
+        length = shared["n_timesteps"] = DEFAULTS[preset].total_epochs * model.epoch_size
+    if length <= 2 * WINDOW * model.epoch_size:
+        raise ValueError(
+            f"{length} steps are {length // model.epoch_size} epochs of {model.epoch_size}: a share of the improvement "
+            f"takes more than {2 * WINDOW} epochs"
+        )
+    keys = [(label, seed) for label in labels for seed in range(n_seeds)]
+    tasks = [_task(env_id, block, shared, label, seed, out) for label, seed in keys]
+    build_once(tasks[-1][0])
+    for task in tasks:
+        check_folder(*task, n_eval_episodes)
+    with threads(1):
+        complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
+        rows = [finished_row(task, n_eval_episodes, {"label": key[0]}) for task, key in zip(tasks, keys, strict=True)]
+    runs = pd.DataFrame(rows)
+    first = np.mean([read_progress(folder)["rollout/ep_cost_mean"].iloc[0] for _, folder, _ in tasks[:n_seeds]])
+    return _write(out, dict(env_id=env_id, block=block, settings=shared), runs, frontier_table(runs, float(first)))
+
+
+def _has_block(name: str) -> bool:
+    try:
+        return bool(load_hyperparams(name))
+    except KeyError:
+        return False
+
+
+def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str, seed: int, out: Path) -> Task:
+    """Return the run of one row and one seed, with its folder and its scenario."""
+    own: dict[str, Any] = dict(beta=math.inf, cost_limit=None)
+    if label == OPEN_LOOP:
+        wrappers = {**(load_hyperparams(block) if block else {}), **shared}.get("vec_env_wrapper", [])
+        own.update(nuisance=None, vec_env_wrapper=[f"{BlindVecEnv.__module__}.{BlindVecEnv.__name__}", *wrappers])
+    elif label != NO_PENALTY:
+        own.update(beta="auto", cost_limit=label.replace(" ", ""))
+    run = Run(label.replace("%", "per cent"), env_id, block, seed, {**shared, **own})
+    scenario = Scenario("Training", env_id, sensor=BlindVecEnv if label == OPEN_LOOP else None)
+    return run, out / "runs" / run.folder_name, [scenario]
+
+
+def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
+    """
+    Summarise the runs of each label over seeds.
+
+    :param runs: ``label``, ``seed``, ``cost`` and ``information`` of each run; without a penalty, by share, blind.
+    :param first_cost: Cost of the first epoch of the training.
+    :return: a row for each label: ``seeds``, the means ``cost``, ``nats`` and ``kept`` (of the nats without a penalty
+        and with the same seed), each with the ends of its interval ``_low`` and ``_high``, the ``best`` cost of a seed,
+        and ``improvement``, the share of the improvement that the mean cost keeps
+    """
+    # What a blind policy's memory shares with the state comes from its own actions, not from the sensor.
+    runs = runs.assign(nats=runs["information"].where(runs["label"] != OPEN_LOOP, 0.0))
+    of_seed = runs[runs["label"] == NO_PENALTY].set_index("seed")
+    runs["kept"] = runs["nats"] / of_seed["nats"].clip(lower=TIE).loc[runs["seed"]].to_numpy()
+    lowest = of_seed["cost"].mean()
+    rows = []
+    for label, group in runs.groupby("label", sort=False):
+        names = ("cost", "nats", "kept")
+        ends = zip(names, *interquartile_means(group[list(names)].to_numpy()), strict=True)
+        row = dict(label=label, seeds=len(group))
+        for name, mean, low, high in ends:
+            row.update({name: mean, f"{name}_low": low, f"{name}_high": high})
+        gained = (first_cost - row["cost"]) / (first_cost - lowest) if first_cost > lowest else math.nan
+        rows.append({**row, "best": group["cost"].min(), "improvement": gained})
+    return pd.DataFrame(rows)
+
+
+def knee(table: pd.DataFrame) -> str | None:
+    """
+    Return the label of the row that saves most information for its cost, if any is better than a mixture.
+
+    A mixture runs the policy without a penalty in some episodes and the best open loop in the others: it lies on the
+    line between the two. The knee is the limit that lies farthest below this line, in shares of its cost and nats.
+
+    :param table: From :func:`frontier_table`.
+    """
+    rows = table.set_index("label")
+    start, end = rows.loc[NO_PENALTY], rows.loc[OPEN_LOOP]
+    if end["best"] <= start["cost"] or start["nats"] < TIE:
+        return None
+    limits = rows.drop([NO_PENALTY, OPEN_LOOP])
+    height = (limits["cost"] - start["cost"]) / (end["best"] - start["cost"]) + limits["nats"] / start["nats"]
+    return str(height.idxmin()) if height.min() < 1 else None
+
+
+def verdict(table: pd.DataFrame) -> str:
+    """
+    Say in one sentence whether the bottleneck will pay.
+
+    Two questions. *Is information to spare?* A limit keeps at least 90 % of the improvement and at most half of the
+    information, by the upper end of its interval. *Is the open loop cheap?* The best open loop costs at most as much
+    more as half of the cost without a penalty (1.5 times the cost, if costs are positive). Two times yes: probably;
+    once: perhaps; else: probably not. It is also probably not, if the policy without a penalty carries no information.
+
+    :param table: From :func:`frontier_table`.
+    """
+    rows = table.set_index("label")
+    start, end = rows.loc[NO_PENALTY], rows.loc[OPEN_LOOP]
+    if start["nats"] < TIE:
+        return f"**Probably not**: without a penalty the policy carries {start['nats']:.2g} nats, nothing to leave out."
+    limits = rows.drop([NO_PENALTY, OPEN_LOOP])
+    good = limits[limits["improvement"] >= IMPROVEMENT]
+    spare = good[good["kept_high"] <= INFORMATION]
+    dear = start["cost"] + PRICE * abs(start["cost"])
+    is_cheap = bool(end["best"] <= dear)
+    word = ("Probably not", "Perhaps", "Probably")[int(len(spare) > 0) + is_cheap]
+    shown = (spare if len(spare) else good if len(good) else limits).iloc[0 if len(spare) else -1]
+    interval = f"{shown['kept_low']:.0%} to {shown['kept_high']:.0%}" if shown["seeds"] > 1 else "one seed, no interval"
+    return (
+        f"**{word}**: a limit of {shown.name} keeps {shown['improvement']:.0%} of the improvement with "
+        f"{shown['kept']:.0%} of the information ({interval}), and the best open loop costs {end['best']:.4g}, "
+        f"{'within' if is_cheap else 'above'} the {dear:.4g} that is half more than the {start['cost']:.4g} without a "
+        "penalty."
+    )
+
+
+def _write(out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.DataFrame) -> str:
+    write_frame_atomically(runs, out / "runs.csv")
+    write_frame_atomically(table, out / "frontier.csv")
+    write_run_config(out / "config.json", {**config, "runs": [*runs["folder"]]})
+    best = knee(table)
+    save_figure(frontier_figure(runs, table, best), out / "frontier.png")
+
+    def text(name: str, form: str) -> list[str]:
+        ends = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), table["seeds"], strict=True)
+        return [f"{form} ({form} to {form})".format(*row) if n > 1 else form.format(row[0]) for *row, n in ends]
+
+    overview = {
+        "row": table["label"],
+        "seeds": table["seeds"],
+        "cost": text("cost", "{:.4g}"),
+        "best seed": [f"{cost:.4g}" for cost in table["best"]],
+        "improvement kept": [f"{share:.0%}" for share in table["improvement"]],
+        "nats": text("nats", "{:.2g}"),
+        "of the nats": text("kept", "{:.0%}"),
+    }
+    shown = runs[["label", "seed", "cost", "std", "information", "information_lower"]]
+    summary = fill_template(
+        "sb3_tdpg.experiments",
+        "frontier.md",
+        env_id=config["env_id"],
+        verdict=verdict(table),
+        knee=best,
+        overview=markdown_table(pd.DataFrame(overview)),
+        runs=markdown_table(shown, digits=4),
+        made=how_made("sb3-tdpg frontier", provenance()),
+    )
+    write_atomically(out / "frontier.md", summary)
+    return summary
