@@ -121,9 +121,9 @@ def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequenc
     from sb3_tdpg.experiments.frontier import frontier
 
     out = options.pop("out") or Path("results", f"frontier-{options['block'] or env.rpartition(':')[2]}")
-    keywords = dict(env_kwargs=parse_keywords(env_kwargs), settings=parse_keywords(settings))
+    options.update(env_kwargs=parse_keywords(env_kwargs), settings=parse_keywords(settings))
     with kept_by_this_process(out):
-        text = frontier(env, n_seeds=seeds, out=out, **keywords, **options)
+        text = frontier(env, n_seeds=seeds, out=out, **options)
     print(f"\n{text}\n\nresults are in {out}")
 
 
@@ -332,9 +332,7 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--study-name", help="name of the study in the storage (default: sweep-<block>)")
     add("--grace-period", type=float, default=60.0, help="seconds without a heartbeat until a worker counts as dead")
 
-    text = (
-        "find out whether the bottleneck will pay: short trainings that keep shares of the improvement, and a verdict"
-    )
+    text = "will the bottleneck pay? trainings that keep shares of the improvement, an open loop, a figure, a verdict"
     add = command(_frontier, text, "--env", "--env-kwargs", "--jobs", "--n-timesteps", "--block", "--set")
     add("--shares", nargs="+", type=float, default=(99, 95, 90, 80), metavar="PERCENT", help="default: 99 95 90 80")
     add("--seeds", type=_positive, default=3, help="training seeds of each row (default: 3)")

@@ -1,7 +1,7 @@
 """Will the bottleneck pay on a task? A short sweep over shares of the improvement kept, and a verdict."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ NO_PENALTY, OPEN_LOOP = "no penalty", "open loop"
 IMPROVEMENT = 0.9  # of the improvement is kept
 INFORMATION = 0.5  # of the information is kept at most
 PRICE = 0.5  # of the cost without a penalty: the open loop costs at most as much more
+KNEE = 0.1  # of the distance from the origin to the line of mixtures: a knee is at least as far below it
 
 
 def frontier(
@@ -157,7 +158,8 @@ def knee(table: pd.DataFrame) -> str | None:
     Return the label of the row that saves most information for its cost, if any is better than a mixture.
 
     A mixture runs the policy without a penalty in some episodes and the best open loop in the others: it lies on the
-    line between the two. The knee is the limit that lies farthest below this line, in shares of its cost and nats.
+    line between the two. The knee is the limit that lies farthest below this line, with nats and additional cost
+    in shares of those of its ends, and at least a tenth of the way.
 
     :param table: From :func:`frontier_table`.
     """
@@ -167,7 +169,7 @@ def knee(table: pd.DataFrame) -> str | None:
         return None
     limits = rows.drop([NO_PENALTY, OPEN_LOOP])
     height = (limits["cost"] - start["cost"]) / (end["best"] - start["cost"]) + limits["nats"] / start["nats"]
-    return str(height.idxmin()) if height.min() < 1 else None
+    return str(height.idxmin()) if height.min() <= 1 - KNEE else None
 
 
 def verdict(table: pd.DataFrame) -> str:
@@ -191,14 +193,23 @@ def verdict(table: pd.DataFrame) -> str:
     dear = start["cost"] + PRICE * abs(start["cost"])
     is_cheap = bool(end["best"] <= dear)
     word = ("Probably not", "Perhaps", "Probably")[int(len(spare) > 0) + is_cheap]
-    shown = (spare if len(spare) else good if len(good) else limits).iloc[0 if len(spare) else -1]
-    interval = f"{shown['kept_low']:.0%} to {shown['kept_high']:.0%}" if shown["seeds"] > 1 else "one seed, no interval"
-    return (
-        f"**{word}**: a limit of {shown.name} keeps {shown['improvement']:.0%} of the improvement with "
-        f"{shown['kept']:.0%} of the information ({interval}), and the best open loop costs {end['best']:.4g}, "
-        f"{'within' if is_cheap else 'above'} the {dear:.4g} that is half more than the {start['cost']:.4g} without a "
-        "penalty."
+    shown = (
+        spare.loc[spare["cost"].idxmin()]
+        if len(spare)
+        else limits.loc[(good if len(good) else limits)["kept"].idxmin()]
     )
+    interval = f"{_percent(shown['kept_low'])} to {_percent(shown['kept_high'])}"
+    return (
+        f"**{word}**: a limit of {shown.name} keeps {_percent(shown['improvement'])} of the improvement (cost "
+        f"{shown['cost']:.4g}) with {_percent(shown['kept'])} of the information "
+        f"({interval if shown['seeds'] > 1 else 'one seed, no interval'}), and the best open loop costs "
+        f"{end['best']:.4g}, {'within' if is_cheap else 'above'} the {dear:.4g} that is half more than the "
+        f"{start['cost']:.4g} without a penalty."
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def _write(out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.DataFrame) -> str:
@@ -208,18 +219,18 @@ def _write(out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.D
     best = knee(table)
     save_figure(frontier_figure(runs, table, best), out / "frontier.png")
 
-    def text(name: str, form: str) -> list[str]:
-        ends = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), table["seeds"], strict=True)
-        return [f"{form} ({form} to {form})".format(*row) if n > 1 else form.format(row[0]) for *row, n in ends]
+    def column(name: str, form: Callable[[float], str]) -> list[str]:
+        ends = zip(*(table[f"{name}{end}"].map(form) for end in ("", "_low", "_high")), table["seeds"], strict=True)
+        return [f"{mean} ({low} to {high})" if n > 1 else mean for mean, low, high, n in ends]
 
     overview = {
         "row": table["label"],
         "seeds": table["seeds"],
-        "cost": text("cost", "{:.4g}"),
-        "best seed": [f"{cost:.4g}" for cost in table["best"]],
-        "improvement kept": [f"{share:.0%}" for share in table["improvement"]],
-        "nats": text("nats", "{:.2g}"),
-        "of the nats": text("kept", "{:.0%}"),
+        "cost": column("cost", "{:.4g}".format),
+        "best seed": table["best"].map("{:.4g}".format),
+        "improvement kept": table["improvement"].map(_percent),
+        "nats": column("nats", "{:.2g}".format),
+        "of the nats": column("kept", _percent),
     }
     shown = runs[["label", "seed", "cost", "std", "information", "information_lower"]]
     summary = fill_template(

@@ -1,0 +1,213 @@
+"""The frontier, from the command to results, with tiny trainings; its verdict and its knee on tables made by hand."""
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("rliable")
+
+from sb3_tdpg import TDPG
+from sb3_tdpg.cli import main
+from sb3_tdpg.experiments.blind import BlindVecEnv
+from sb3_tdpg.experiments.frontier import NO_PENALTY, OPEN_LOOP, frontier, frontier_table, knee, verdict
+from sb3_tdpg.vec_env import make_episodes_env
+
+COMMAND = ["frontier", "--env", "Lava-v0", "--shares", "90", "--seeds", "2", "--jobs", "1"]
+TINY = ["--n-timesteps", "1100", "--n-eval-episodes", "20", "--set", "n_episodes=20"]
+LABELS = [NO_PENALTY, "90 %", OPEN_LOOP]
+
+
+def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*COMMAND, *TINY]) == 0
+    text = capsys.readouterr().out
+    assert "results are in results/frontier-Lava-v0" in text
+    out = tmp_path / "results" / "frontier-Lava-v0"
+    assert (out / "frontier.md").read_text() in text
+    assert (out / "frontier.png").read_bytes().startswith(b"\x89PNG")
+    table = pd.read_csv(out / "frontier.csv")
+    assert table["label"].tolist() == LABELS
+    assert (table["seeds"] == 2).all()
+    assert np.isfinite(table.drop(columns="label")).all(axis=None)
+    assert (table["cost_low"] <= table["cost"]).all() and (table["cost"] <= table["cost_high"]).all()
+
+    runs = pd.read_csv(out / "runs.csv")
+    settings = {
+        label: json.loads((out / "runs" / folder / "config.json").read_text())["settings"]
+        for label, folder in zip(runs["label"], runs["folder"], strict=True)
+    }
+    assert [settings[label]["beta"] for label in LABELS] == ["inf", "auto", "inf"]
+    assert [settings[label]["cost_limit"] for label in LABELS] == [None, "90%", None]
+    assert all(each["mi_estimator"] == "logdet" and each["callback"] == [] for each in settings.values())
+    blind = TDPG.load(out / "runs" / "open-loop-seed0" / "model.zip")
+    assert blind.observation_space.shape == (8,)
+    assert json.loads((out / "config.json").read_text())["runs"] == runs["folder"].tolist()
+
+    before = {path: path.stat().st_mtime_ns for path in (out / "runs").rglob("*")}
+    assert main([*COMMAND, *TINY]) == 0
+    assert {path: path.stat().st_mtime_ns for path in (out / "runs").rglob("*")} == before
+    pd.testing.assert_frame_equal(pd.read_csv(out / "frontier.csv"), table)
+
+
+def test_an_interrupted_frontier_goes_on_and_more_shares_add_to_it(tmp_path, monkeypatch):
+    done = []
+
+    def interrupted(tasks, **_):
+        from sb3_tdpg.experiments.runs import complete_run
+
+        for task in tasks:
+            if len(done) == 2:
+                raise KeyboardInterrupt
+            if not (task[1] / "episodes.csv").exists():
+                done.append(complete_run(*task, n_eval_episodes=20))
+
+    monkeypatch.setattr("sb3_tdpg.experiments.frontier.complete_runs", interrupted)
+    how = dict(n_seeds=1, out=tmp_path, n_timesteps=1100, n_eval_episodes=20, settings=dict(n_episodes=20))
+    with pytest.raises(KeyboardInterrupt):
+        frontier("Lava-v0", shares=[90], **how)
+    assert not (tmp_path / "frontier.csv").exists()
+    done[:] = [None] * 3
+    frontier("Lava-v0", shares=[90], **how)
+    assert len(done) == 4  # the open loop alone was left
+    frontier("Lava-v0", shares=[50, 90], **how)
+    assert done[4].name == "50-per-cent-seed0"
+    assert len(done) == 5
+    assert pd.read_csv(tmp_path / "frontier.csv")["label"].tolist() == [NO_PENALTY, "90 %", "50 %", OPEN_LOOP]
+    with pytest.raises(ValueError, match=r"n_episodes: 20 there, 10 here: choose another folder or remove it"):
+        frontier("Lava-v0", shares=[90], **{**how, "settings": dict(n_episodes=10)})
+
+
+def test_an_environment_without_a_block_is_trained_with_the_defaults(tmp_path, monkeypatch):
+    class StopError(Exception):
+        pass
+
+    def stop(tasks, **_):
+        raise StopError(tasks)
+
+    monkeypatch.setattr("sb3_tdpg.experiments.frontier.complete_runs", stop)
+    with pytest.raises(StopError) as caught:
+        frontier("SqueezeInsert-v0", shares=[95], n_seeds=1, out=tmp_path)
+    (tasks,) = caught.value.args
+    assert [task[0].block for task in tasks] == [None] * 3
+    horizon = make_episodes_env("SqueezeInsert-v0", 1).get_attr("horizon")[0]
+    assert tasks[0][0].settings["n_timesteps"] == 400 * 500 * horizon  # as learn() without a number
+
+
+BAD = {
+    "share": (["--shares", "95", "120"], "must be at least one number between 0 and 100"),
+    "length": (["--n-timesteps", "1000"], "1000 steps are 10 epochs of 100"),
+    "environment": (["--env", "Lave-v0"], "env='Lave-v0' cannot be made"),
+    "block": (["--block", "Lava-v1"], "no block 'Lava-v1'"),
+    "setting": (["--set", "learning_rat=1"], "no argument 'learning_rat'"),
+    "beta": (["--set", "beta=1"], "beta is set by the frontier"),
+    "cost_limit": (["--set", "cost_limit=1"], "cost_limit is set by the frontier"),
+    "keyword": (["--env-kwargs", "horizons=3"], "horizons"),
+}
+
+
+@pytest.mark.parametrize("case", list(BAD))
+def test_bad_input_is_one_line_and_exit_code_2_before_anything_is_trained(case, tmp_path, capsys):
+    arguments, message = BAD[case]
+    out = tmp_path / "out"
+    assert main([*COMMAND, *TINY, *arguments, "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert not list(out.glob("runs/*"))
+
+
+@pytest.mark.parametrize("env_id", ["Lava-v0", "CartPole-v1"])
+def test_a_blind_environment_shows_the_time_and_nothing_else(env_id):
+    env = BlindVecEnv(make_episodes_env(env_id, 3, seed=0, use_processes=False))
+    horizon = env.horizon
+    time = np.zeros(3, int)
+    observations = env.reset()
+    for _ in range(60):
+        expected = np.cos(np.pi * np.outer(time, np.arange(1, 9)) / horizon)
+        np.testing.assert_allclose(observations, expected, atol=1e-6)
+        observations, _, dones, infos = env.step(np.array([env.action_space.sample() for _ in range(3)]))
+        time += 1
+        for i in np.flatnonzero(dones):
+            at_end = np.cos(np.pi * time[i] * np.arange(1, 9) / horizon)
+            np.testing.assert_allclose(infos[i]["terminal_observation"], at_end, atol=1e-6)
+        time[dones] = 0
+
+
+def runs_of(**seeds):
+    """Runs by label: a list of (cost, nats), one for each seed; ``s95`` stands for a limit of 95 %."""
+    names = dict(no_penalty=NO_PENALTY, open_loop=OPEN_LOOP)
+    return pd.DataFrame(
+        dict(label=names.get(name, f"{name[1:]} %"), seed=seed, cost=cost, information=nats)
+        for name, values in seeds.items()
+        for seed, (cost, nats) in enumerate(values)
+    )
+
+
+def table_of(first_cost=110.0, **seeds):
+    return frontier_table(runs_of(**seeds), first_cost)
+
+
+FREE, BLIND = [(10.0, 4.0), (10.0, 8.0)], [(14.0, 0.5), (12.0, 0.1)]
+
+
+def test_the_table_pairs_the_seeds_and_a_blind_policy_has_no_information():
+    table = table_of(no_penalty=FREE, s95=[(15.0, 2.0), (15.0, 2.0)], open_loop=BLIND).set_index("label")
+    row = table.loc["95 %"]
+    assert row[["cost", "nats", "kept"]].tolist() == pytest.approx([15.0, 2.0, (1 / 2 + 1 / 4) / 2])
+    assert row[["kept_low", "kept_high"]].tolist() == pytest.approx([1 / 4, 1 / 2])
+    assert row["improvement"] == pytest.approx(0.95)
+    assert table.loc[OPEN_LOOP, ["nats", "kept", "best", "cost"]].tolist() == pytest.approx([0, 0, 12, 13])
+
+
+@pytest.mark.parametrize(
+    ("limit", "blind", "word", "why"),
+    [
+        (
+            [(12.0, 2.0), (12.0, 3.0)],
+            BLIND,
+            "Probably",
+            "keeps 98 % of the improvement (cost 12) with 44 % of the information",
+        ),
+        ([(12.0, 2.0), (12.0, 3.0)], [(15.5, 0), (16.0, 0)], "Perhaps", "costs 15.5, above the 15"),
+        ([(12.0, 2.0), (12.0, 5.0)], BLIND, "Perhaps", "(50 % to 62 %)"),  # one seed keeps more than half
+        ([(25.0, 0.0), (25.0, 0.0)], BLIND, "Perhaps", "keeps 85 % of the improvement"),
+        ([(12.0, 4.0), (12.0, 8.0)], [(99.0, 0), (99.0, 0)], "Probably not", "costs 99, above the 15"),
+    ],
+)
+def test_the_verdict_asks_for_information_to_spare_and_a_cheap_open_loop(limit, blind, word, why):
+    text = verdict(table_of(no_penalty=FREE, s95=limit, open_loop=blind))
+    assert text.startswith(f"**{word}**: ")
+    assert why in text
+    assert "\n" not in text
+
+
+def test_returns_are_judged_as_costs_are():
+    # CartPole: the open loop falls over, although a limit keeps little of the information.
+    cartpole = dict(no_penalty=[(-500.0, 90.0)], s95=[(-480.0, 5.0)], open_loop=[(-40.0, 0.0)])
+    text = verdict(table_of(first_cost=-20.0, **cartpole))
+    assert text.startswith("**Perhaps**") and "above the -250" in text and "one seed, no interval" in text
+
+
+def test_a_policy_that_carries_no_information_has_nothing_to_leave_out():
+    table = table_of(no_penalty=[(10.0, 0.001)], s95=[(10.0, 0.0)], open_loop=[(10.0, 0.0)])
+    assert verdict(table).startswith("**Probably not**: without a penalty the policy carries 0.001 nats")
+    assert knee(table) is None
+
+
+def test_the_knee_is_the_limit_farthest_below_the_line_of_mixtures():
+    ends = dict(no_penalty=[(10.0, 8.0)], open_loop=[(20.0, 0.0)])
+    assert knee(table_of(s99=[(10.5, 6.0)], s95=[(12.0, 2.0)], s90=[(16.0, 1.0)], **ends)) == "95 %"
+    assert knee(table_of(s99=[(10.2, 1.0)], s95=[(12.0, 0.9)], **ends)) == "99 %"
+    assert knee(table_of(s99=[(12.0, 5.8)], s95=[(16.0, 4.0)], **ends)) is None  # hardly below it, and above
+    ends["open_loop"] = [(9.0, 0.0)]
+    assert knee(table_of(s95=[(10.0, 2.0)], **ends)) is None
+
+
+def test_without_an_improvement_no_share_of_it_is_kept():
+    table = table_of(first_cost=9.0, no_penalty=FREE, s95=FREE, open_loop=BLIND)
+    assert all(math.isnan(share) for share in table["improvement"])
+    assert verdict(table).startswith("**Perhaps**")
