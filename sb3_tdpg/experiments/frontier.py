@@ -193,11 +193,8 @@ def verdict(table: pd.DataFrame) -> str:
     dear = start["cost"] + PRICE * abs(start["cost"])
     is_cheap = bool(end["best"] <= dear)
     word = ("Probably not", "Perhaps", "Probably")[int(len(spare) > 0) + is_cheap]
-    shown = (
-        spare.loc[spare["cost"].idxmin()]
-        if len(spare)
-        else limits.loc[(good if len(good) else limits)["kept"].idxmin()]
-    )
+    cheapest, least = spare["cost"], (good if len(good) else limits)["kept"]
+    shown = limits.loc[cheapest.idxmin() if len(spare) else least.idxmin()]
     interval = f"{_percent(shown['kept_low'])} to {_percent(shown['kept_high'])}"
     return (
         f"**{word}**: a limit of {shown.name} keeps {_percent(shown['improvement'])} of the improvement (cost "

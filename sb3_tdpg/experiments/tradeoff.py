@@ -101,19 +101,19 @@ def frontier_figure(runs: pd.DataFrame, table: pd.DataFrame, knee: str | None) -
     axes.plot(points["nats"], points["cost"], color=INK, linewidth=0.8, zorder=2)
     mixture: dict[str, Any] = dict(color=LIMIT_COLOR, linestyle=(0, (1, 2)), linewidth=1.2, zorder=1)
     axes.plot([start["nats"], 0], [start["cost"], end["best"]], label="mixtures of the two", **mixture)
-    for color, (_, row) in zip([INK, *shades], points.iterrows(), strict=True):
+    sizes = np.linspace(9, 5, len(points))  # rows on top of each other stay visible
+    for color, size, (_, row) in zip([INK, *shades], sizes, points.iterrows(), strict=True):
         seeds = runs[runs["label"] == row["label"]]
         axes.plot(seeds["information"], seeds["cost"], ".", color=color, markersize=5, alpha=0.6, zorder=3)
         errors = [[[row[n] - row[f"{n}_low"]], [row[f"{n}_high"] - row[n]]] for n in ("nats", "cost")]
-        style: dict[str, Any] = dict(fmt="o", color=color, markersize=6, capsize=2, elinewidth=1, zorder=4)
+        style: dict[str, Any] = dict(fmt="o", color=color, markersize=size, capsize=2, elinewidth=1, zorder=4)
         axes.errorbar(row["nats"], row["cost"], yerr=errors[1], xerr=errors[0], label=row["label"], **style)
         if row["label"] == knee:
             ring: dict[str, Any] = dict(facecolors="none", edgecolors=LIMIT_COLOR, linewidths=2, zorder=5)
             axes.scatter(row["nats"], row["cost"], s=170, label="knee", **ring)
-    axes.scatter(0, end["best"], marker="D", s=36, color=LIMIT_COLOR, zorder=4, label="best open loop", clip_on=False)
+    axes.scatter(0, end["best"], marker="D", s=90, color=LIMIT_COLOR, zorder=3, label="best open loop")
     axes.axhline(end["best"], color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
-    axes.set_xlim(left=0)
-    axes.margins(y=0.08)
+    axes.margins(x=0.04, y=0.08)
     axes.grid(alpha=0.25)
     axes.set_xlabel("information in the TRVs (nat)", fontsize=9)
     axes.set_ylabel("mean episode cost", fontsize=9)
