@@ -173,7 +173,8 @@ def test_the_table_pairs_the_seeds_and_a_blind_policy_has_no_information():
             "keeps 98 % of the improvement (cost 12) with 44 % of the information",
         ),
         ([(12.0, 2.0), (12.0, 3.0)], [(15.5, 0), (16.0, 0)], "Perhaps", "costs 15.5, above the 15"),
-        ([(12.0, 2.0), (12.0, 5.0)], BLIND, "Perhaps", "(50 % to 62 %)"),  # one seed keeps more than half
+        ([(12.0, 2.0), (12.0, 3.0)], [(14.5, 0), (18.0, 0)], "Probably", "costs 14.5, within the 15"),  # the best seed
+        ([(12.0, 1.0), (12.0, 5.0)], BLIND, "Perhaps", "44 % of the information (25 % to 62 %)"),  # one keeps more
         ([(25.0, 0.0), (25.0, 0.0)], BLIND, "Perhaps", "keeps 85 % of the improvement"),
         ([(12.0, 4.0), (12.0, 8.0)], [(99.0, 0), (99.0, 0)], "Probably not", "costs 99, above the 15"),
     ],
@@ -183,6 +184,11 @@ def test_the_verdict_asks_for_information_to_spare_and_a_cheap_open_loop(limit, 
     assert text.startswith(f"**{word}**: ")
     assert why in text
     assert "\n" not in text
+
+
+def test_of_limits_with_information_to_spare_the_cheapest_is_shown():
+    limits = dict(s99=[(13.0, 0.1)], s95=[(11.0, 0.2)], s90=[(12.0, 0.1)])
+    assert "a limit of 95 % keeps" in verdict(table_of(no_penalty=[(10.0, 4.0)], **limits, open_loop=[(12.0, 0.0)]))
 
 
 def test_returns_are_judged_as_costs_are():
