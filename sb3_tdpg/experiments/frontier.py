@@ -84,7 +84,7 @@ def frontier(
         shared.pop("policy")
     if n_timesteps is not None or block is None:
         shared["n_timesteps"] = n_timesteps or 1
-    model, _, length = build_once(_task(env_id, block, shared, NO_PENALTY, 0, out)[0])
+    model, _, length = build_once(lambda: _task(env_id, block, shared, NO_PENALTY, 0, out)[0])
     if n_timesteps is None and block is None:
         preset = preset_of(model.observation_space, model.horizon)
         length = shared["n_timesteps"] = DEFAULTS[preset].total_epochs * model.epoch_size
@@ -95,7 +95,7 @@ def frontier(
         )
     keys = [(label, seed) for label in labels for seed in range(n_seeds)]
     tasks = [_task(env_id, block, shared, label, seed, out) for label, seed in keys]
-    build_once(tasks[-1][0])
+    build_once(lambda: tasks[-1][0])
     for task in tasks:
         check_folder(*task, n_eval_episodes)
     with threads(1):

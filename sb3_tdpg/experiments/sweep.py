@@ -9,7 +9,7 @@ share a file system: then the selected model is at hand, and a killed run goes o
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from fractions import Fraction
@@ -206,7 +206,7 @@ def sweep(
         out=out or Path("results", f"sweep-{block}"),
         study=None if storage is None else (storage, study_name or f"sweep-{block}", grace_period),
     )
-    build_once(plan.run(1.0, 0))
+    build_once(lambda: plan.run(1.0, 0))
     if plan.study is not None:
         _open_study(plan)
     tasks = [plan.task(*job) for job in wanted]
@@ -244,9 +244,10 @@ def _cost_limit(env_id: str, given: float | None) -> float:
     return -float(threshold or 0.0) if given is None else given
 
 
-def build_once(run: Run) -> Training:
+def build_once(make_run: Callable[[], Run]) -> Training:
     """Build the model of a run, so that errors in the settings are found before any training."""
     try:
+        run = make_run()
         training = make_training(run.env_id, run.settings, seed=0, device="cpu")
     except gym.error.Error as e:
         raise ValueError(f"env={run.env_id!r} cannot be made: {e}") from e
