@@ -15,13 +15,13 @@ from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, save_figure
 from sb3_tdpg.evaluation.figures import new_figure, tidy
+from sb3_tdpg.experiments.blind import BlindVecEnv
 from sb3_tdpg.experiments.runs import Task, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.baselines import training_times
 from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.robustness import PERTURBATIONS, PerturbedVecEnv
-from sb3_tdpg.robustness.mixtures import BlindVecEnv
 
 # Seeds below 100 chose the defaults; faults and methods were fixed before the first of these was run.
 FIRST_SEED = 500
@@ -110,7 +110,7 @@ class Problem:
             ours("TDPG, beta=auto", beta="auto"),
             ours("VIB", mi_estimator="vib"),
             ours(NO_PENALTY, **no_penalty),
-            ours(BLIND, f"{_MIXTURES}.BlindVecEnv", **no_penalty),
+            ours(BLIND, "sb3_tdpg.experiments.blind.BlindVecEnv", **no_penalty),
             ours("PG", **no_penalty, **narrow),
             *(ours(f"PG, noise to {name}", noise(high), **no_penalty) for name, high in NOISE_RANGES.items()),
             ours("PG, told the faults", told, **no_penalty),

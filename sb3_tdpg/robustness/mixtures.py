@@ -1,5 +1,5 @@
 """
-Perturbations in training: noise whose strength is drawn for each episode, a mixture of the registry's, nothing at all.
+Perturbations in training: noise whose strength is drawn for each episode, and a mixture of the registry's.
 
 They make rivals of the bottleneck that know what is coming. Dimension key: N environments, D components of a vector.
 """
@@ -11,13 +11,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tdpg.robustness.core import Perturber, each_part
 from sb3_tdpg.robustness.registry import PERTURBATIONS, Perturbation
-from sb3_tdpg.robustness.sensor import blank
 from sb3_tdpg.robustness.wrappers import PerturbedVecEnv, Scale, make_perturber
 
 
@@ -142,28 +139,3 @@ class NoisyVecEnv(PerturbedVecEnv):
     ) -> None:
         VecEnvWrapper.__init__(self, venv)
         self._perturber = make_perturber(noise_range(low, high), 5, venv, venv.num_envs, seed, scale)
-
-
-class BlindVecEnv(VecEnvWrapper):
-    """Show nothing (0, or a black image) in the place of every observation: what is left is the time."""
-
-    def reset(self) -> Any:
-        """Reset, and show nothing."""
-        return self._nothing(self.venv.reset())
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step, and show nothing."""
-        observations, rewards, dones, infos = self.venv.step_wait()
-        infos = [
-            {**info, "terminal_observation": self._nothing(info["terminal_observation"])}
-            if "terminal_observation" in info
-            else info
-            for info in infos
-        ]
-        self.reset_infos = self.unwrapped.reset_infos
-        return self._nothing(observations), rewards, dones, infos
-
-    def _nothing(self, observations: Any) -> Any:
-        space = self.observation_space
-        blanks = {key: blank(part) for key, part in space.items()} if isinstance(space, spaces.Dict) else blank(space)
-        return each_part(lambda part, nothing: np.broadcast_to(nothing, part.shape).copy(), observations, blanks)

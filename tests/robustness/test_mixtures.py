@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.robustness.mixtures import BlindVecEnv, MixedVecEnv, NoisyVecEnv
+from sb3_tdpg.robustness.mixtures import MixedVecEnv, NoisyVecEnv
 
 
 def episode(env):
@@ -82,23 +82,6 @@ def test_each_episode_draws_one_of_several_highest_strengths():
     std = (noisy - clean)[:4].std(axis=(0, 2))
     assert (std < 0.2).mean() == pytest.approx(0.5 + 0.5 * np.log10(2) / 4, abs=0.03)
     assert (std > 10.0).mean() == pytest.approx(0.25, abs=0.03)
-
-
-def test_blind_policies_see_nothing_and_cost_as_before():
-    env, blind = squeeze(20), BlindVecEnv(squeeze(20))
-    assert not episode(blind).any()
-    for each in (env, blind):
-        each.seed(5)
-        each.reset()
-    for _ in range(4):
-        action = np.ones((20, 1), np.float32)
-        _, expected, _, _ = env.step(action)
-        observations, rewards, dones, infos = blind.step(action)
-        np.testing.assert_array_equal(rewards, expected)
-        assert not observations.any()
-    assert dones.all()
-    assert not any(info["terminal_observation"].any() for info in infos)
-    np.testing.assert_array_equal(blind.reset_infos[3]["state"], env.reset_infos[3]["state"])
 
 
 def test_a_perturbation_of_a_mixture_can_have_a_scale_of_its_own():
