@@ -173,21 +173,19 @@ PROBLEMS: Mapping[str, Problem] = {
 }
 
 
-def reproduce_pays(out: Path, *, n_seeds: int = 10, problems: Sequence[str] = tuple(PROBLEMS), **options: Any) -> str:
+def reproduce_pays(out: Path, *, n_seeds: int = 10, **options: Any) -> str:
     """
     Train all methods on all problems, evaluate them under the faults; write tables, a figure and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``pays.png``, ``config.json``, ``runs/``.
     :param n_seeds: Training seeds of each method, at most five of PPO and RecurrentPPO.
-    :param problems: Names in :data:`PROBLEMS`.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
     given = common.Options(**options)
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     tasks = {}
-    for name in problems:
-        problem = PROBLEMS[name]
+    for name, problem in PROBLEMS.items():
         everything = [(m, seed) for i, seed in enumerate(seeds) for m in problem.methods() if i < m.max_seeds]
         tasks[name] = common.make_tasks(problem.env_id, out / "runs" / name, everything, problem.rows, given.overrides)
     of_all = [task for of_problem in tasks.values() for task in of_problem]
@@ -244,7 +242,7 @@ def _methods_table(by_seed: pd.DataFrame, times: pd.Series) -> pd.DataFrame:
 def _faults_table(by_seed: pd.DataFrame) -> pd.DataFrame:
     """Show the mean over seeds of each fault: one row for each method."""
     names = [row for row in by_seed["scenario"].unique() if row not in (MEAN, WORST)]
-    means = by_seed.groupby(["model", "scenario"], sort=False)["cost"].mean().unstack(sort=False)[names]
+    means = by_seed.pivot_table("cost", "model", "scenario", sort=False).reindex(columns=names)
     return means.map("{:.3g}".format).reset_index().rename(columns=dict(model="method"))
 
 
