@@ -69,6 +69,7 @@ VECTOR = Defaults(
     mi_estimator="mine",
     n_threads=1,
     total_epochs=400,
+    gae_lambda=0.3,  # with 0.95 lava stays in bad open loops
 )
 
 # Images are expensive: PPO's passes over few episodes, and the gradient with the least variance. A policy that has not

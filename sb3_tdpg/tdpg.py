@@ -106,7 +106,7 @@ class TDPG(EpisodicAlgorithm):
         deviation, so that ``beta`` keeps its meaning. Default: no, yes, yes.
     :param gamma: Discount factor; the paper has none. Default: 1, 1, and 1 - 8 / T between 0.9 and 0.995.
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
-        the next state; unused with ``baseline="mean"``. Default: 0.95.
+        the next state; unused with ``baseline="mean"``. Default: 0.3, 0.95, 0.95.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping; default: inf, inf, 0.5.
     :param nuisance: A declared family of changes of the sensor, that the policy is to ignore. ``"auto"``: random
         colours, patterns, contrasts and noise for images, nothing for vectors. ``None``: nothing. A dict of

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, save_figure
-from sb3_tdpg.evaluation.figures import new_figure, tidy
+from sb3_tdpg.evaluation.figures import import_matplotlib, log_axis, new_panels
 from sb3_tdpg.experiments.blind import BlindVecEnv
 from sb3_tdpg.experiments.runs import Task, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
@@ -248,16 +248,21 @@ def _faults_table(by_seed: pd.DataFrame) -> pd.DataFrame:
 
 def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
     """Draw the cost in training against the mean over the faults: a dot for each policy, a panel for each problem."""
-    drawn = new_figure(4.2 * len(frames), 4.6)
-    for i, (name, frame) in enumerate(frames.items()):
-        axes = drawn.add_subplot(1, len(frames), i + 1)
+    drawn, (panels,) = new_panels(4.2 * len(frames), 4.8, 1, len(frames))
+    colours = import_matplotlib().colormaps["tab20"].colors
+    for axes, (name, frame) in zip(panels, frames.items(), strict=True):
         costs = frame.pivot(index=["model", "train_seed"], columns="scenario", values="cost")
-        for label, of_model in costs.groupby(level="model", sort=False):
-            axes.scatter(of_model[TRAINING], of_model[MEAN], s=14, alpha=0.8, label=label)
-        axes.set(title=PROBLEMS[name].title, xlabel="cost in training", xscale="log", yscale="log")
-        axes.axline((1, 1), (10, 10), color="0.8", linewidth=1, zorder=0)
-        tidy(axes)
-    drawn.axes[0].set_ylabel("mean cost of the faults")
-    handles, labels = drawn.axes[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8)
+        for i, label in enumerate(frame["model"].unique()):
+            marker = "o" if "TDPG" in label or label == "VIB" else "^" if "PPO" in label else "s"
+            style: dict[str, Any] = dict(s=18, alpha=0.8, label=label, marker=marker, color=colours[i % len(colours)])
+            axes.scatter(costs.loc[label, TRAINING], costs.loc[label, MEAN], **style)
+        low = costs[[TRAINING, MEAN]].min().min()
+        axes.axline((low, low), (2 * low, 2 * low), color="0.8", linewidth=1, zorder=0)
+        for which in "xy":
+            log_axis(axes, which, subs=(1, 2, 5))
+        axes.set_title(PROBLEMS[name].title, fontsize=10)
+        axes.set_xlabel("cost in training", fontsize=9)
+    panels[0].set_ylabel("mean cost of the faults", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return drawn
