@@ -16,7 +16,7 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, save_figure
 from sb3_tdpg.evaluation.figures import import_matplotlib, log_axis, new_panels
 from sb3_tdpg.experiments.blind import BlindVecEnv
-from sb3_tdpg.experiments.runs import Task, complete_runs
+from sb3_tdpg.experiments.runs import SB3Run, Task, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.baselines import training_times
@@ -99,26 +99,27 @@ class Problem:
         def noise(high: Any) -> Mapping[str, Any]:
             return {f"{_MIXTURES}.NoisyVecEnv": dict(high=high, scale=list(self.scale))}
 
+        block = load_hyperparams(self.block)
+        narrow = dict(policy_kwargs={**block.get("policy_kwargs", {}), "action_log_var_init": -2.0})
         no_penalty: dict[str, Any] = dict(beta=float("inf"))
-        policy = load_hyperparams(self.block).get("policy_kwargs", {})
-        narrow = dict(policy_kwargs={**policy, "action_log_var_init": -2.0})
         told = {f"{_MIXTURES}.MixedVecEnv": dict(perturbations=self._told(), scale=list(self.scale))}
+        # The defaults have MINE.
+        estimators = [
+            name for name in ("mine", "logdet", "directed", "vib") if name != block.get("mi_estimator", "mine")
+        ]
         found = [
             ours("TDPG"),
-            ours("TDPG, log-det", mi_estimator="logdet"),
-            ours("TDPG, MINE", mi_estimator="mine"),
+            *(ours(f"TDPG, {name}", mi_estimator=name) for name in estimators),
             ours("TDPG, beta=auto", beta="auto"),
-            ours("VIB", mi_estimator="vib"),
             ours(NO_PENALTY, **no_penalty),
             ours(BLIND, "sb3_tdpg.experiments.blind.BlindVecEnv", **no_penalty),
             ours("PG", **no_penalty, **narrow),
             *(ours(f"PG, noise to {name}", noise(high), **no_penalty) for name, high in NOISE_RANGES.items()),
             ours("PG, told the faults", told, **no_penalty),
         ]
-        steps = load_hyperparams(self.block)["n_timesteps"]
         for label, algo in (("PPO", "ppo"), ("RecurrentPPO", "ppo_lstm")):
-            for more, wrapper in (("", None), (", told the faults", told)):
-                method = ours(label + more, wrapper, n_timesteps=steps)
+            for more, wrapper in (("", None), (", noise to 4", noise(4.0)), (", told the faults", told)):
+                method = ours(label + more, wrapper, n_timesteps=block["n_timesteps"])
                 found.append(replace(method, algo=algo, max_seeds=N_SB3_SEEDS))
         return found
 
@@ -146,16 +147,6 @@ PROBLEMS: Mapping[str, Problem] = {
         plant=_TURNS,
         goals={TRAINING: 7.9, MEAN: 8.0, WORST: 10.7},
     ),
-    "cue": Problem(
-        title="Squeeze and insert, with a cue",
-        env_id="SqueezeInsert-v0",
-        block="SqueezeInsert-v0-cue",
-        scale=(1.0, 1.0, 0.0),
-        env_kwargs=dict(cue=True),
-        faults=_NO_BLACKOUT,  # the cue itself never fails
-        plant=_TURNS,
-        goals={MEAN: 12.0},
-    ),
     "peg": Problem(
         title="Peg and corner",
         env_id="PegCorner-v0",
@@ -169,6 +160,16 @@ PROBLEMS: Mapping[str, Problem] = {
         block="Lava-v0-default",
         scale=(1.0, 1.0),
         faults={**FAULTS, **GAIN},
+    ),
+    "cue": Problem(
+        title="Squeeze and insert, with a cue",
+        env_id="SqueezeInsert-v0",
+        block="SqueezeInsert-v0-cue",
+        scale=(1.0, 1.0, 0.0),
+        env_kwargs=dict(cue=True),
+        faults=_NO_BLACKOUT,  # the cue itself never fails
+        plant=_TURNS,
+        goals={MEAN: 12.0},
     ),
 }
 
@@ -189,6 +190,7 @@ def reproduce_pays(out: Path, *, n_seeds: int = 10, **options: Any) -> str:
         everything = [(m, seed) for i, seed in enumerate(seeds) for m in problem.methods() if i < m.max_seeds]
         tasks[name] = common.make_tasks(problem.env_id, out / "runs" / name, everything, problem.rows, given.overrides)
     of_all = [task for of_problem in tasks.values() for task in of_problem]
+    of_all.sort(key=lambda task: isinstance(task[0], SB3Run))  # the long runs last
     complete_runs(of_all, **given.of_runs)
 
     sections, frames = {}, {}
