@@ -174,7 +174,7 @@ def panda_camera(path: Path) -> None:
     (test, train) = (PANDA_GRASP_CAMERA[i].env_kwargs["camera_range"] for i in (1, 0))
     env = PandaGraspEnv()
     heights = [test[0], train[0], 0.0, train[1], test[1]]
-    images = env._sensor(np.array([[*MUG, height] for height in heights]))
+    images = env.sensor(np.array([[*MUG, height] for height in heights]))
     env.close()
     Image.fromarray(side_by_side([enlarge(depth_picture(image), 2) for image in images])).save(path, optimize=True)
 

@@ -126,20 +126,20 @@ class BallCatchEnv(POMDPEnv):
         self._pool: WorkPool | None = None  # when it is needed
         self._view: Any = None  # a SideView, when it is needed
 
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         state = np.empty((n, 5))
         state[:, 0] = self.np_random.uniform(self.robot_range[0], self.robot_range[1], n)
         state[:, 1:3] = self.np_random.uniform(self.ball_start_range[0], self.ball_start_range[1], (n, 2))
         state[:, 3:5] = self.np_random.uniform(self.ball_speed_range[0], self.ball_speed_range[1], (n, 2))
         return state
 
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         d, ball_x, ball_y, speed_x, speed_y = state.T
         next_d = d + self.control_gain * action[:, 0]
         next_x, next_y = ball_x + self.dt * speed_x, ball_y + self.dt * speed_y
         return np.stack([next_d, next_x, next_y, speed_x, speed_y - self.dt * self.gravity], axis=1)
 
-    def _sensor(self, state: np.ndarray) -> np.ndarray:
+    def sensor(self, state: np.ndarray) -> np.ndarray:
         seen = self._seen_from(state)
         if self.n_processes == 1 or len(state) == 1:
             images = self._renderer.images(seen)
@@ -157,10 +157,10 @@ class BallCatchEnv(POMDPEnv):
         shown[:, 0], shown[:, 1] = 0.0, state[:, 1] - state[:, 0]
         return shown
 
-    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return 0.01 * np.abs(action[:, 0])
 
-    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+    def terminal_cost(self, state: np.ndarray) -> np.ndarray:
         return 100.0 * np.abs(state[:, 0] - state[:, 1])
 
     def _with_noise(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -28,7 +28,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     A finite-horizon POMDP (Section II of the paper) as a Gymnasium environment.
 
     A subclass sets ``state_space``, ``observation_space`` and ``action_space`` and implements five methods, each for N
-    episodes at once: :meth:`_initial_state`, :meth:`_dynamics`, :meth:`_sensor`, :meth:`_cost`, :meth:`_terminal_cost`.
+    episodes at once: :meth:`initial_state`, :meth:`dynamics`, :meth:`sensor`, :meth:`cost`, :meth:`terminal_cost`.
     All random numbers must come from ``self.np_random``.
 
     This class turns them into ``reset``/``step`` for one episode; :class:`sb3_tdpg.vec_env.BatchedVecEnv` turns them
@@ -50,7 +50,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
     shares_work: bool = False
-    #: Further entries for the info of each episode of the last :meth:`_dynamics`, or none.
+    #: Further entries for the info of each episode of the last :meth:`dynamics`, or none.
     _details: Sequence[Mapping[str, Any]] = ()
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
@@ -62,23 +62,23 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         self._time = 0
 
     @abstractmethod
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         """Draw x_0: ``(N, X)``."""
 
     @abstractmethod
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         """Return a new array x_{t+1} ~ p(. | x_t, u_t): ``(N, X)`` from ``(N, X)`` and ``(N, U)``."""
 
     @abstractmethod
-    def _sensor(self, state: np.ndarray) -> np.ndarray:
+    def sensor(self, state: np.ndarray) -> np.ndarray:
         """Draw y_t ~ s(. | x_t): ``(N, *obs)``, in the dtype of the observation space."""
 
     @abstractmethod
-    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         """c_t(x_t, u_t): ``(N,)``."""
 
     @abstractmethod
-    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+    def terminal_cost(self, state: np.ndarray) -> np.ndarray:
         """c_T(x_T): ``(N,)``."""
 
     def _current_state(self) -> np.ndarray:
@@ -89,8 +89,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def reset_batch(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Start N episodes; return x_0 ``(N, X)`` and y_0 ``(N, *obs)``."""
-        state = self._initial_state(n)
-        return state, self._sensor(state)
+        state = self.initial_state(n)
+        return state, self.sensor(state)
 
     def step_batch(self, state: np.ndarray, action: np.ndarray, *, is_last: bool) -> BatchStep:
         """
@@ -107,11 +107,11 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"{type(self).__name__} received an action that is not finite: {bad}; the policy has probably diverged"
             )
         action = np.clip(np.asarray(action, dtype=np.float64), self.action_space.low, self.action_space.high)
-        cost = self._cost(state, action)
-        next_state = self._dynamics(state, action)
+        cost = self.cost(state, action)
+        next_state = self.dynamics(state, action)
         if is_last:
-            cost = cost + self._terminal_cost(next_state)
-        return BatchStep(next_state, self._sensor(next_state), cost, self._details)
+            cost = cost + self.terminal_cost(next_state)
+        return BatchStep(next_state, self.sensor(next_state), cost, self._details)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -94,7 +94,7 @@ class LavaEnv(POMDPEnv):
         stage = max(farthest, self.lava_stage_cost or 0.0) + self.action_cost * max_action
         return self.horizon * stage + max(100.0 * farthest, self.lava_terminal_cost or 0.0)
 
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, 2))
         if self.start_beta is None:
             state[:, 0] = self.np_random.uniform(WALL, LAVA, n)
@@ -102,7 +102,7 @@ class LavaEnv(POMDPEnv):
             state[:, 0] = WALL + (LAVA - WALL) * self.np_random.beta(*self.start_beta, n)
         return state
 
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         d, v = state.T
         next_state = np.stack([d + v, v + action[:, 0]], axis=1)
         next_d = next_state[:, 0]
@@ -111,18 +111,18 @@ class LavaEnv(POMDPEnv):
         next_state[(d >= LAVA) | (next_d >= LAVA)] = (LAVA, 0.0)
         return next_state
 
-    def _sensor(self, state: np.ndarray) -> np.ndarray:
+    def sensor(self, state: np.ndarray) -> np.ndarray:
         noise = self.sensor_noise_std * self.np_random.standard_normal(state.shape)
         mean = state if self.sensor_bias is None else state + self.sensor_bias
         return (mean + noise).astype(np.float32)
 
-    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         distance = np.linalg.norm(state - GOAL, axis=1)
         if self.lava_stage_cost is not None:
             distance = np.where(state[:, 0] >= LAVA, self.lava_stage_cost, distance)
         return distance + self.action_cost * np.abs(action[:, 0])
 
-    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+    def terminal_cost(self, state: np.ndarray) -> np.ndarray:
         cost = 100.0 * np.linalg.norm(state - GOAL, axis=1)
         if self.lava_terminal_cost is not None:
             cost = np.where(state[:, 0] >= LAVA, self.lava_terminal_cost, cost)

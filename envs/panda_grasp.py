@@ -132,7 +132,7 @@ class PandaGraspEnv(POMDPEnv):
             return self._pool.call(method, *arrays)
         return getattr(self._world, method)(*arrays)
 
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, self.state_space.shape[0]))
         state[:, :2] = WORKSPACE + self.np_random.uniform(-self.xy_half_width, self.xy_half_width, (n, 2))
         state[:, 3] = self.np_random.uniform(self.yaw_range[0], self.yaw_range[1], n)
@@ -140,7 +140,7 @@ class PandaGraspEnv(POMDPEnv):
             state[:, 4] = self.np_random.uniform(*self.camera_range, n)
         return state
 
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         poses = NOMINAL_GRASP + ACTION_SCALE * action
         mugs, camera = state[:, :4], state[:, 4:]
         if self.render_mode is not None and len(state) == 1:
@@ -156,7 +156,7 @@ class PandaGraspEnv(POMDPEnv):
         ]
         return next_state
 
-    def _sensor(self, state: np.ndarray) -> np.ndarray:
+    def sensor(self, state: np.ndarray) -> np.ndarray:
         return self._with_noise(self._shared("images", self._seen(state)), self.np_random)
 
     def _seen(self, state: np.ndarray) -> np.ndarray:
@@ -166,10 +166,10 @@ class PandaGraspEnv(POMDPEnv):
         raised = state[:, 4:] if self.camera_range is not None else np.zeros((len(state), 1))
         return np.concatenate([state[:, :4], raised + self.camera_shift], axis=1)
 
-    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return np.zeros(len(state))
 
-    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+    def terminal_cost(self, state: np.ndarray) -> np.ndarray:
         return np.where(state[:, 2] > LIFTED, 0.0, 1.0)
 
     def _with_noise(self, images: np.ndarray, rng: np.random.Generator) -> np.ndarray:

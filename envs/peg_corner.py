@@ -63,10 +63,10 @@ class PegCornerEnv(POMDPEnv):
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = spaces.Box(-max_action, max_action, (2,), np.float32)
 
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         return self.np_random.uniform(*START, (n, 2))
 
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         move = self.actuator_gain * action
         aim = state + move
         beyond = np.abs(aim - np.clip(aim, 0.0, SIZE))
@@ -74,16 +74,16 @@ class PegCornerEnv(POMDPEnv):
         move = np.sign(move) * np.maximum(0.0, np.abs(move) - self.friction * beyond[:, ::-1])
         return np.clip(state + move, 0.0, SIZE)
 
-    def _sensor(self, state: np.ndarray) -> np.ndarray:
+    def sensor(self, state: np.ndarray) -> np.ndarray:
         return (state + self.sensor_noise_std * self.np_random.standard_normal(state.shape)).astype(np.float32)
 
     def _distance(self, state: np.ndarray) -> np.ndarray:
         return np.linalg.norm(state - HOLE, axis=1)
 
-    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return self._distance(state)
 
-    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+    def terminal_cost(self, state: np.ndarray) -> np.ndarray:
         return 30.0 * np.maximum(0.0, self._distance(state) - self.tolerance)
 
     def render(self) -> np.ndarray | None:

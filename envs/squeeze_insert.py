@@ -90,13 +90,13 @@ class SqueezeInsertEnv(POMDPEnv):
     def _with_yaw(self, yaw: np.ndarray, kind: np.ndarray) -> np.ndarray:
         return np.column_stack([np.sin(2 * yaw), np.cos(2 * yaw), kind])
 
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         self._fingers = None
         yaw = self.np_random.uniform(-RIGHT_ANGLE, RIGHT_ANGLE, n)
         kind = self.np_random.choice([-1.0, 1.0], (n, 1)) if self.cue else np.empty((n, 0))
         return self._with_yaw(yaw, kind)
 
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         self._fingers = float(action[0, 0])
         yaw = self.yaw(state)
         away = wrap(yaw - action[:, 0])
@@ -104,15 +104,15 @@ class SqueezeInsertEnv(POMDPEnv):
         turn = self.np_random.uniform(self.turn[0], self.turn[1], len(state))
         return self._with_yaw(yaw + turn * (rest - away), state[:, 2:])
 
-    def _sensor(self, state: np.ndarray) -> np.ndarray:
+    def sensor(self, state: np.ndarray) -> np.ndarray:
         observation = state.copy()
         observation[:, :2] += self.sensor_noise_std * self.np_random.standard_normal((len(state), 2))
         return observation.astype(np.float32)
 
-    def _cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         return 5.0 * self.error(state)
 
-    def _terminal_cost(self, state: np.ndarray) -> np.ndarray:
+    def terminal_cost(self, state: np.ndarray) -> np.ndarray:
         return 100.0 * np.maximum(0.0, self.error(state) - self.tolerance)
 
     def render(self) -> np.ndarray | None:

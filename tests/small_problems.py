@@ -158,19 +158,19 @@ class LinearProblem(POMDPEnv):
         self.observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
         self.action_space = spaces.Box(-1e6, 1e6, (1,), np.float32)
 
-    def _initial_state(self, n):
+    def initial_state(self, n):
         return self.np_random.standard_normal((n, 1))
 
-    def _dynamics(self, state, action):
+    def dynamics(self, state, action):
         return state + action
 
-    def _sensor(self, state):
+    def sensor(self, state):
         return (state + self.sensor_noise_std * self.np_random.standard_normal(state.shape)).astype(np.float32)
 
-    def _cost(self, state, action):
+    def cost(self, state, action):
         return (state[:, 0] - 1) ** 2 + 0.3 * action[:, 0] ** 2
 
-    def _terminal_cost(self, state):
+    def terminal_cost(self, state):
         return 2 * (state[:, 0] + 0.5) ** 2
 
 

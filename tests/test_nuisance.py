@@ -163,7 +163,7 @@ def test_another_scene_is_seen_in_the_same_state():
     states = np.stack([info["state"] for info in env.reset_infos])
     members = nuisance.members(6)
     (seen,) = shown(members, [images], states=states)
-    others = [BallCatchEnv(renderer="fast", **kwargs)._sensor(states) for kwargs in declared["env_kwargs"]]
+    others = [BallCatchEnv(renderer="fast", **kwargs).sensor(states) for kwargs in declared["env_kwargs"]]
     for i in range(6):
         assert any((seen[i] == other[i]).all() for other in others)
         assert not (seen[i] == images[i]).all()
@@ -176,7 +176,7 @@ def test_a_scene_may_redraw_components_of_the_state():
     states = np.stack([info["state"] for info in env.reset_infos])
     (seen,) = shown(make_nuisance(declared, env.observation_space, env).members(6), [images], states=states)
     states[:, 0] = 1.0
-    np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast")._sensor(states))
+    np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast").sensor(states))
     with pytest.raises(ValueError, match=r"redraw=\['e'\] are no components of the state: use some of \['d \(m\)'"):
         make_nuisance({**declared, "redraw": ["e"]}, env.observation_space, env)
 

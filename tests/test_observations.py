@@ -47,10 +47,10 @@ def test_a_number_that_no_network_can_take_is_named_with_environment_step_and_co
 
 def test_a_bad_state_is_named_as_well():
     env = LavaEnv()
-    dynamics = env._dynamics
-    env._dynamics = lambda state, action: np.where(np.arange(2) == 1, np.nan, dynamics(state, action))
-    env._sensor = lambda state: np.zeros((len(state), 2), np.float32)
-    env._terminal_cost = env._cost = lambda state, action=None: np.zeros(len(state))
+    dynamics = env.dynamics
+    env.dynamics = lambda state, action: np.where(np.arange(2) == 1, np.nan, dynamics(state, action))
+    env.sensor = lambda state: np.zeros((len(state), 2), np.float32)
+    env.terminal_cost = env.cost = lambda state, action=None: np.zeros(len(state))
     with pytest.raises(ValueError, match=r"environment 0 returned the state nan in component \[1\] at step 1"):
         train_epochs(tiny_tdpg(BatchedVecEnv(env, 4), n_episodes=4), 1)
 

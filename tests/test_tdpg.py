@@ -59,19 +59,19 @@ def test_a_memory_is_learnt_where_it_is_needed(encoder_gradient):
             self.observation_space = spaces.Box(-1, 1, (1,), np.float32)
             self.action_space = spaces.Box(-3, 3, (1,), np.float32)
 
-        def _initial_state(self, n):
+        def initial_state(self, n):
             return np.stack([self.np_random.choice([-1.0, 1.0], n), np.zeros(n)], axis=1)
 
-        def _dynamics(self, state, action):
+        def dynamics(self, state, action):
             return np.stack([state[:, 0], np.ones(len(state))], axis=1)
 
-        def _sensor(self, state):
+        def sensor(self, state):
             return (state[:, :1] * (state[:, 1:] == 0)).astype(np.float32)
 
-        def _cost(self, state, action):
+        def cost(self, state, action):
             return (state[:, 1] == 1) * (action[:, 0] - state[:, 0]) ** 2
 
-        def _terminal_cost(self, state):
+        def terminal_cost(self, state):
             return np.zeros(len(state))
 
     model = tiny_tdpg(
@@ -117,10 +117,10 @@ def test_what_is_stored_is_what_the_environment_and_the_policy_produced():
     # The states follow from the actions, clipped as the environment saw them.
     env = model.env.envs[0] if isinstance(model.env, DummyVecEnv) else model.env.env
     for t in range(4):
-        expected = env._dynamics(buffer.states[t].astype(float), np.clip(buffer.actions[t], -0.5, 0.5))
+        expected = env.dynamics(buffer.states[t].astype(float), np.clip(buffer.actions[t], -0.5, 0.5))
         np.testing.assert_allclose(buffer.states[t + 1], expected, atol=1e-5)
         np.testing.assert_allclose(
-            buffer.costs[t], env._cost(buffer.states[t], np.clip(buffer.actions[t], -0.5, 0.5)), rtol=1e-4
+            buffer.costs[t], env.cost(buffer.states[t], np.clip(buffer.actions[t], -0.5, 0.5)), rtol=1e-4
         )
     # The TRVs are those of the policy that acted.
     model.policy.load_state_dict(old_policy)

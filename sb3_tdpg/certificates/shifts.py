@@ -294,8 +294,8 @@ class _UnderNuisance:
     def np_random(self, generator: np.random.Generator) -> None:
         self.env.np_random = generator
 
-    def _sensor(self, state: np.ndarray) -> Any:
-        plain = self.env._sensor(state)
+    def sensor(self, state: np.ndarray) -> Any:
+        plain = self.env.sensor(state)
         with th.random.fork_rng(devices=[]):
             th.set_rng_state(self.random_state)
             if self.members is None:
@@ -308,23 +308,23 @@ class _UnderNuisance:
 def record_episodes(model: Any, env: Any, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:
     """Run n episodes whose start, sensor, dynamics and policy have separate random streams, for :func:`encode`."""
     env.np_random = np.random.default_rng([*seed, _START])
-    state, costs = env._initial_state(n), np.zeros(n)
+    state, costs = env.initial_state(n), np.zeros(n)
     trv = th.zeros(n, model.policy.trv_dim, device=model.device)
     states, prev_trvs, densities = [], [], []
     policy_seed = int(np.random.SeedSequence([*seed, _POLICY]).generate_state(1)[0])
     with isolated_randomness(policy_seed, model), th.no_grad():
         for t in range(env.horizon):
             env.np_random = np.random.default_rng([*seed, _SENSOR, t])
-            step, action = act(model, env._sensor(state), trv, np.full(n, t))
+            step, action = act(model, env.sensor(state), trv, np.full(n, t))
             states.append(state)
             prev_trvs.append(trv)
             densities.append(Normal(step.means, step.stds))
             trv = step.trvs
-            costs += env._cost(state, action)
+            costs += env.cost(state, action)
             env.np_random = np.random.default_rng([*seed, _DYNAMICS, t])
-            state = env._dynamics(state, action)
+            state = env.dynamics(state, action)
         last = _action_density(model.policy, trv)
-    costs += env._terminal_cost(state)
+    costs += env.terminal_cost(state)
     return RecordedEpisodes(costs, np.stack(states), th.stack(prev_trvs), step.noise, [*densities, last], seed)
 
 
@@ -340,7 +340,7 @@ def encode(model: Any, env: Any, recorded: RecordedEpisodes) -> list[Normal]:
     with th.no_grad():
         for t, (state, prev_trv) in enumerate(zip(recorded.states, recorded.prev_trvs, strict=True)):
             env.np_random = np.random.default_rng([*recorded.seed, _SENSOR, t])
-            observation = obs_as_tensor(env._sensor(state), model.device)
+            observation = obs_as_tensor(env.sensor(state), model.device)
             densities.append(Normal(*policy.encoder_density(observation, prev_trv, np.full(n, t))))
         trvs = densities[-1].mean + densities[-1].stddev * recorded.last_trv_noise
         return [*densities, _action_density(policy, trvs)]

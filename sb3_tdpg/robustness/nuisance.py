@@ -185,7 +185,7 @@ class _SceneMembers(Members):
         for scene, chosen in self._by_scene(which):
             scene.np_random = rng
             if self.nuisance.redraw:
-                start = scene._initial_state(len(chosen))
+                start = scene.initial_state(len(chosen))
                 self.redrawn[which[chosen]] = start[:, self.nuisance.redraw]
 
     def _by_scene(self, which: np.ndarray) -> list[tuple[POMDPEnv, np.ndarray]]:
@@ -198,7 +198,7 @@ class _SceneMembers(Members):
         seen[:, self.nuisance.redraw] = self.redrawn[which]
         changed = observations.copy()
         for scene, chosen in self._by_scene(which):
-            changed[chosen] = scene._sensor(seen[chosen])
+            changed[chosen] = scene.sensor(seen[chosen])
         return changed
 
 

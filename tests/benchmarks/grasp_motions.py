@@ -26,7 +26,7 @@ def main() -> None:
     n = parser.parse_args().n
     fast, slow = PandaGraspEnv(), PandaGraspEnv(motion="reference")
     fast.reset(seed=0)
-    states = fast._initial_state(n)
+    states = fast.initial_state(n)
     rng = np.random.default_rng(0)
     at_the_rim = np.tile(NOMINAL_GRASP, (n, 1))
     at_the_rim[:, :2] = states[:, :2] + [0.045, 0.01]

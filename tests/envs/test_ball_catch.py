@@ -87,14 +87,14 @@ def test_an_action_out_of_bounds_counts_as_the_bound():
 
 
 def test_an_episode_starts_with_the_robot_anywhere_in_its_range_and_the_ball_at_its_launch():
-    states = BallCatchEnv()._initial_state(20_000)
+    states = BallCatchEnv().initial_state(20_000)
     np.testing.assert_allclose(np.quantile(states[:, 0], [0, 0.25, 0.5, 0.75, 1]), [-2, -1, 0, 1, 2], atol=0.05)
     np.testing.assert_array_equal(states[:, 1:], np.tile([8.0, 1.0, -4.5, 7.85], (20_000, 1)))
 
 
 def test_a_launch_that_varies_fills_its_ranges_and_moves_the_landing_point():
     env = BallCatchEnv(**BALL_VARYING_LAUNCH)
-    states = env._initial_state(20_000)
+    states = env.initial_state(20_000)
     np.testing.assert_allclose(states[:, [1, 3]].min(axis=0), [7.0, -5.0], atol=0.01)
     np.testing.assert_allclose(states[:, [1, 3]].max(axis=0), [9.0, -4.0], atol=0.01)
     np.testing.assert_array_equal(states[:, [2, 4]], np.tile([1.0, 7.85], (20_000, 1)))
@@ -251,7 +251,7 @@ def test_the_batch_gives_what_a_single_environment_gives_for_the_same_state_and_
     for single, info, observation in zip(singles, vec_env.reset_infos, observations, strict=True):
         single.reset()
         single._state = info["state"][None].copy()
-        np.testing.assert_array_equal(observation, single._sensor(single._state)[0])
+        np.testing.assert_array_equal(observation, single.sensor(single._state)[0])
     for _ in range(3):
         actions = rng.uniform(-3, 3, (6, 1)).astype(np.float32)
         observations, rewards, dones, infos = vec_env.step(actions)
@@ -411,10 +411,10 @@ def test_with_a_wall_at_rest_only_the_ball_tells_where_the_robot_is(renderer):
     state = np.array([[0.5, 4.0, 2.5, -4.5, 1.0]])
     together = state + np.array([[1.0, 1.0, 0.0, 0.0, 0.0]])
     alone = state + np.array([[0.0, 1.0, 0.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(env._sensor(state), env._sensor(together))
-    assert (env._sensor(state) != env._sensor(alone)).any()
+    np.testing.assert_array_equal(env.sensor(state), env.sensor(together))
+    assert (env.sensor(state) != env.sensor(alone)).any()
     ordinary = BallCatchEnv(renderer=renderer)
-    assert (ordinary._sensor(state) != ordinary._sensor(together)).any()
+    assert (ordinary.sensor(state) != ordinary.sensor(together)).any()
     _, info = env.reset(seed=0)
     np.testing.assert_array_equal(info["state"], ordinary.reset(seed=0)[1]["state"])
     env.close()

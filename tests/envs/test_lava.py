@@ -317,5 +317,5 @@ def test_nothing_leaves_the_lava():
     env = LavaEnv()
     state = np.array([[LAVA_EDGE, -1.0], [LAVA_EDGE + 0.1, -1.0]], np.float32)
     for _ in range(3):
-        state = env._dynamics(state, np.full((2, 1), -3.0))
+        state = env.dynamics(state, np.full((2, 1), -3.0))
         assert state[:, 0] == pytest.approx([LAVA_EDGE] * 2)

@@ -147,7 +147,7 @@ def test_depths_are_in_metres_within_the_space_and_finite():
     assert 0.3 < observation.min() < observation.max() < 0.62
     # Wherever the mug has got to: beside the table, lifted before the camera, around the eye.
     for state in ([0.5, 0.0, -3.0, 0.0], [0.4, 0.1, 0.15, 0.0], [*EYE, 0.0], [0.3, 0.25, 0.25, 1.0]):
-        image = env._sensor(np.array([state]))[0]
+        image = env.sensor(np.array([state]))[0]
         assert env.observation_space.contains(image)
     env.close()
 

@@ -64,15 +64,15 @@ def test_a_grasp_in_empty_air_always_fails_and_leaves_the_mug_where_it_was(share
 def test_the_cost_is_one_up_to_a_height_of_five_centimetres(shared):
     heights = np.array([0.0, 0.05, 0.0501, 0.2])
     states = np.c_[np.zeros((4, 2)), heights, np.zeros(4)]
-    np.testing.assert_array_equal(shared._terminal_cost(states), [1, 1, 0, 0])
-    np.testing.assert_array_equal(shared._cost(states, np.zeros((4, 4))), 0)
+    np.testing.assert_array_equal(shared.terminal_cost(states), [1, 1, 0, 0])
+    np.testing.assert_array_equal(shared.cost(states, np.zeros((4, 4))), 0)
 
 
 def test_a_mug_up_to_five_centimetres_above_the_table_is_no_success(shared, monkeypatch):
     heights = np.array([0.0, 0.03, 0.05, 0.0501])
     ends = np.c_[np.zeros((4, 2)), heights, np.zeros(4)]
     monkeypatch.setattr(shared, "_shared", lambda method, mugs, poses: [(end, 0) for end in ends])
-    shared._dynamics(np.zeros((4, 4)), np.zeros((4, 4)))
+    shared.dynamics(np.zeros((4, 4)), np.zeros((4, 4)))
     assert [more["success"] for more in shared._details] == [False, False, False, True]
     assert [more["is_success"] for more in shared._details] == [False, False, False, True]
 
@@ -231,7 +231,7 @@ from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 states, actions = (np.array(part) for part in json.load(sys.stdin))
 env = PandaGraspEnv()
 step = env.step_batch(states, actions, is_last=True)
-print(json.dumps([step.state.tolist(), env._sensor(states).sum(axis=(1, 2, 3), dtype=float).tolist()]))
+print(json.dumps([step.state.tolist(), env.sensor(states).sum(axis=(1, 2, 3), dtype=float).tolist()]))
 """
 
 
@@ -242,20 +242,20 @@ def test_outcomes_and_images_are_the_same_in_another_process(shared):
     given = json.dumps([states[::-1].tolist(), actions[::-1].tolist()])
     final, sums = json.loads(run_python("-c", IN_ANOTHER_PROCESS, input=given).splitlines()[-1])
     np.testing.assert_array_equal(final[::-1], expected)
-    np.testing.assert_array_equal(sums[::-1], shared._sensor(states).sum(axis=(1, 2, 3), dtype=float))
+    np.testing.assert_array_equal(sums[::-1], shared.sensor(states).sum(axis=(1, 2, 3), dtype=float))
 
 
 def test_two_environments_in_one_process_do_not_disturb_each_other(env):
     states = random_states(6, seed=8)
     actions = mixed_actions(states)
     alone, _ = outcomes(env, states, actions)
-    images = env._sensor(states)
+    images = env.sensor(states)
     other = PandaGraspEnv(mug_scale=1.2, friction=0.9, frame_offset=0.0)
     for i in range(6):
         outcomes(other, states[i : i + 1] + 0.01, actions[i : i + 1])
-        other._sensor(states[:1])
+        other.sensor(states[:1])
         np.testing.assert_array_equal(outcomes(env, states[i : i + 1], actions[i : i + 1])[0][0], alone[i])
-        np.testing.assert_array_equal(env._sensor(states[i : i + 1])[0], images[i])
+        np.testing.assert_array_equal(env.sensor(states[i : i + 1])[0], images[i])
     other.close()
     np.testing.assert_array_equal(outcomes(env, states, actions)[0], alone)
 

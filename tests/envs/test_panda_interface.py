@@ -38,7 +38,7 @@ def env():
 ], ids=[row.name for row in PANDA_GRASP])  # fmt: skip
 def test_the_mug_starts_anywhere_in_the_ranges_of_table_three(row, half_width, yaw):
     made = gym.make(PANDA_GRASP[row].env_id, **PANDA_GRASP[row].env_kwargs).unwrapped
-    states = made._initial_state(20_000)
+    states = made.initial_state(20_000)
     low, high = [0.5 - half_width, -half_width, 0, yaw[0]], [0.5 + half_width, half_width, 0, yaw[1]]
     np.testing.assert_allclose(states.min(axis=0), low, atol=2e-3)
     np.testing.assert_allclose(states.max(axis=0), high, atol=2e-3)
@@ -91,7 +91,7 @@ def test_every_kind_of_vectorised_environment_gives_the_same_outcomes_and_detail
     np.testing.assert_array_equal([info["state"] for info in kinds["subprocesses"].reset_infos], states)
     for name in ("batch", "pool"):
         kinds[name]._state = states.copy()
-        first_images[name] = kinds[name].env._sensor(states)
+        first_images[name] = kinds[name].env.sensor(states)
     actions = mixed_actions(states, seed=1)
     actions[0] = oracle_actions(states)[0]
     steps = {name: each.step(actions) for name, each in kinds.items()}

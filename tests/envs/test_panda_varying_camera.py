@@ -21,7 +21,7 @@ def env():
 
 def test_the_heights_are_uniform_and_tell_nothing_of_the_mug(env):
     env.reset(seed=0)
-    state = env._initial_state(20_000)
+    state = env.initial_state(20_000)
     assert env.state_space.shape == (5,) == state[0].shape
     assert env.state_names[4:] == ("camera height (m)",)
     share, _ = np.histogram(state[:, 4], bins=10, range=(LOW, HIGH))
@@ -38,7 +38,7 @@ def test_the_rows_train_on_a_range_and_test_beyond_it():
 def test_a_raised_camera_sees_the_mug_from_where_it_is(env, height):
     """The points and their depth, computed by hand, are those for an eye that is moved upward."""
     x, y = 0.5, 0.0
-    (image,) = env._sensor(np.array([[x, y, 0.0, YAW, height]]))
+    (image,) = env.sensor(np.array([[x, y, 0.0, YAW, height]]))
     camera = env._world.camera
     np.testing.assert_allclose(camera.eye, EYE, atol=1e-6)
     # The cup's wall, and the table beside it.
@@ -53,7 +53,7 @@ def test_a_raised_camera_sees_the_mug_from_where_it_is(env, height):
 
 def test_at_no_height_the_image_is_the_usual_one_and_each_height_has_its_own(env):
     pose = [0.5, 0.0, 0.0, 0.5]
-    usual, same, higher = (env._sensor(np.array([[*pose, *h]]))[0, 0] for h in ([], [0.0], [0.02]))
+    usual, same, higher = (env.sensor(np.array([[*pose, *h]]))[0, 0] for h in ([], [0.0], [0.02]))
     np.testing.assert_array_equal(usual, same)
     is_table = np.isclose(usual, env._world.camera.table_depth()) & (higher > 0.5)
     assert is_table.sum() > 5000
@@ -65,15 +65,15 @@ def test_at_no_height_the_image_is_the_usual_one_and_each_height_has_its_own(env
 @pytest.mark.parametrize("corner", [(-0.05, -0.05), (-0.05, 0.05), (0.05, -0.05), (0.05, 0.05)])
 def test_the_mug_stays_in_sight(env, height, corner):
     state = np.array([[0.5 + corner[0], corner[1], 0.0, 0.0, height]])
-    without = env._sensor(state + np.array([0, 1.0, 0, 0, 0]))
+    without = env.sensor(state + np.array([0, 1.0, 0, 0, 0]))
     # At the usual height it has 2,200 pixels or more, and may be cut off at a corner, too.
-    assert (env._sensor(state) != without).sum() > 1700
+    assert (env.sensor(state) != without).sum() > 1700
 
 
 def test_the_height_does_not_matter_to_a_grasp_and_stays_as_it_is(env):
-    states = np.concatenate([env._initial_state(8)[:, :4], np.linspace(LOW, HIGH, 8)[:, None]], axis=1)
+    states = np.concatenate([env.initial_state(8)[:, :4], np.linspace(LOW, HIGH, 8)[:, None]], axis=1)
     actions = mixed_actions(states[:, :4], seed=2)
-    with_height, without = env._dynamics(states, actions), env._dynamics(states[:, :4], actions)
+    with_height, without = env.dynamics(states, actions), env.dynamics(states[:, :4], actions)
     np.testing.assert_array_equal(with_height[:, :4], without)
     np.testing.assert_array_equal(with_height[:, 4], states[:, 4])
 
@@ -104,9 +104,9 @@ def test_the_oracle_lifts_every_mug_and_the_film_keeps_the_image_of_its_camera()
 
 
 def test_processes_give_the_same_images(env):
-    state = env._initial_state(6)
+    state = env.initial_state(6)
     shared = PandaGraspEnv(**PANDA_CAMERA, n_processes=2)
-    np.testing.assert_array_equal(shared._sensor(state), env._sensor(state))
+    np.testing.assert_array_equal(shared.sensor(state), env.sensor(state))
     shared.close()
 
 
@@ -122,9 +122,9 @@ def test_a_bad_range_is_refused_with_the_mend(camera_range):
 def test_a_camera_that_is_higher_in_every_trial_sees_the_same_and_the_state_does_not_tell(env, shift):
     shifted, both = PandaGraspEnv(camera_shift=shift), PandaGraspEnv(**PANDA_CAMERA, camera_shift=shift)
     pose = [0.5, 0.01, 0.0, 0.4]
-    expected = env._sensor(np.array([[*pose, shift]]))
-    np.testing.assert_array_equal(shifted._sensor(np.array([pose])), expected)
-    np.testing.assert_allclose(both._sensor(np.array([[*pose, 0.01]])), env._sensor(np.array([[*pose, 0.01 + shift]])))
+    expected = env.sensor(np.array([[*pose, shift]]))
+    np.testing.assert_array_equal(shifted.sensor(np.array([pose])), expected)
+    np.testing.assert_allclose(both.sensor(np.array([[*pose, 0.01]])), env.sensor(np.array([[*pose, 0.01 + shift]])))
     assert shifted.state_space.shape == (4,)
     (_, first), (_, second) = PandaGraspEnv().reset(seed=3), shifted.reset(seed=3)
     np.testing.assert_array_equal(first["state"], second["state"])

@@ -11,7 +11,7 @@ def moved(state, *moves, **keywords):
     env = PegCornerEnv(sensor_noise_std=0.0, **keywords)
     state = np.array(state, dtype=float)
     for move in moves:
-        state = env._dynamics(state, np.broadcast_to(move, state.shape))
+        state = env.dynamics(state, np.broadcast_to(move, state.shape))
     return state
 
 

@@ -19,7 +19,7 @@ def parts(*yaws, kind=None):
 def squeeze(env, state, *fingers):
     """Squeeze with the given yaws of the fingers in degrees, without a cost; return the yaws of the parts."""
     for yaw in fingers:
-        state = env._dynamics(state, np.full((len(state), 1), yaw * DEGREE))
+        state = env.dynamics(state, np.full((len(state), 1), yaw * DEGREE))
     return env.yaw(state) / DEGREE
 
 
@@ -75,7 +75,7 @@ def test_the_cue_says_which_way_a_part_must_lie_and_never_changes():
     assert observation[:, :2] == pytest.approx(state[:, :2], abs=2.5)
     assert (observation[:, :2] - state[:, :2]).std() == pytest.approx(0.5, rel=0.05)
     assert abs(state[:, 2].mean()) < 0.06
-    np.testing.assert_array_equal(env._dynamics(state, np.ones((4000, 1)))[:, 2], state[:, 2])
+    np.testing.assert_array_equal(env.dynamics(state, np.ones((4000, 1)))[:, 2], state[:, 2])
     np.testing.assert_allclose(env.error(parts(90.0, 0.0, 80.0, kind=-1.0)) / DEGREE, [0, 90, 10], atol=1e-6)
     np.testing.assert_allclose(env.error(parts(90.0, 0.0, 80.0, kind=1.0)) / DEGREE, [90, 0, 80], atol=1e-6)
 

@@ -93,7 +93,7 @@ def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
     mugs = records[[f"final_mug_{i}" for i in range(4)]].to_numpy()
     grasps = records[[f"final_grasp_{i}" for i in range(4)]].to_numpy()
     env = PandaGraspEnv()
-    outcomes = env._terminal_cost(env._dynamics(mugs, (grasps - [0.5, 0.0, 0.06, np.pi / 6]) / 0.1))
+    outcomes = env.terminal_cost(env.dynamics(mugs, (grasps - [0.5, 0.0, 0.06, np.pi / 6]) / 0.1))
     env.close()
     np.testing.assert_array_equal(outcomes, records["cost"])
 

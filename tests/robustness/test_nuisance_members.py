@@ -24,19 +24,19 @@ class Lamp(POMDPEnv):
         self.state_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
         self.observation_space, self.action_space = VECTOR, spaces.Box(-1, 1, (1,), np.float32)
 
-    def _initial_state(self, n):
+    def initial_state(self, n):
         return self.np_random.uniform(1, 2, (n, 2))
 
-    def _dynamics(self, state, action):
+    def dynamics(self, state, action):
         return state
 
-    def _sensor(self, state):
+    def sensor(self, state):
         return np.tile(self.unit * state, 8).astype(np.float32)
 
-    def _cost(self, state, action):
+    def cost(self, state, action):
         return np.zeros(len(state))
 
-    def _terminal_cost(self, state):
+    def terminal_cost(self, state):
         return np.zeros(len(state))
 
 

@@ -33,7 +33,7 @@ class GraspTrials:
         self.n = n
         self.env = PandaGraspEnv()
         self.env.reset(seed=SEED)
-        self.states = self.env._initial_state(n)
+        self.states = self.env.initial_state(n)
         self.poses, self.actions = some_grasps(self.states, np.random.default_rng(SEED))
 
     def run(self) -> None:
