@@ -100,6 +100,7 @@ reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a
 
 reproduce-pays: $(STAMP) ## where the bottleneck pays: squeeze, cue, peg and lava under faults that nobody declared
 	$(PY) -m sb3_tdpg reproduce pays --out results/pays --publish docs/results/pays
+	$(PY) -m sb3_tdpg reproduce pays-cue --out results/pays_cue --publish docs/results/pays_cue
 
 reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside TDPG, on lava and grasping
 	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines

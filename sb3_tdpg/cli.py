@@ -53,7 +53,7 @@ class Experiment(NamedTuple):
 
     function: str  # below sb3_tdpg.paper
     folder: str  # the default one, in results/
-    arguments: dict[str, str] = {}  # fixed arguments of the function
+    arguments: dict[str, Any] = {}  # fixed arguments of the function
     flags: tuple[str, ...] = ()  # those that not all experiments have
 
 
@@ -64,7 +64,8 @@ EXPERIMENTS = {
     "ball-varying": Experiment("ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)),
     "grasp": Experiment("grasp:reproduce_grasp", "panda_grasp"),
     "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
-    "pays": Experiment("pays:reproduce_pays", "pays"),
+    "pays": Experiment("pays:reproduce_pays", "pays", flags=("controls",)),
+    "pays-cue": Experiment("pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
     "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
 }
 

@@ -173,21 +173,29 @@ PROBLEMS: Mapping[str, Problem] = {
     ),
 }
 
+FUNNELS, CUE = ("squeeze", "peg", "lava"), ("cue",)
 
-def reproduce_pays(out: Path, *, n_seeds: int = 10, **options: Any) -> str:
+
+def reproduce_pays(
+    out: Path, *, n_seeds: int = 10, controls: bool = True, problems: Sequence[str] = FUNNELS, **options: Any
+) -> str:
     """
     Train all methods on all problems, evaluate them under the faults; write tables, a figure and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``pays.png``, ``config.json``, ``runs/``.
     :param n_seeds: Training seeds of each method, at most five of PPO and RecurrentPPO.
+    :param controls: Whether to train PPO and RecurrentPPO, which take most of the time.
+    :param problems: Names in :data:`PROBLEMS`.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
     given = common.Options(**options)
     seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     tasks = {}
-    for name, problem in PROBLEMS.items():
-        everything = [(m, seed) for i, seed in enumerate(seeds) for m in problem.methods() if i < m.max_seeds]
+    for name in problems:
+        problem = PROBLEMS[name]
+        chosen = [method for method in problem.methods() if controls or method.algo == "tdpg"]
+        everything = [(method, seed) for i, seed in enumerate(seeds) for method in chosen if i < method.max_seeds]
         tasks[name] = common.make_tasks(problem.env_id, out / "runs" / name, everything, problem.rows, given.overrides)
     of_all = [task for of_problem in tasks.values() for task in of_problem]
     of_all.sort(key=lambda task: isinstance(task[0], SB3Run))  # the long runs last
@@ -207,7 +215,10 @@ def reproduce_pays(out: Path, *, n_seeds: int = 10, **options: Any) -> str:
         )
     write_frame_atomically(pd.concat(f.assign(problem=n) for n, f in frames.items()), out / "seeds.csv")
     save_figure(figure(frames), out / "pays.png")
-    return common.write_results(out, "pays.md", of_all, "make reproduce-pays", given.publish, sections=sections)
+    command = (
+        "make reproduce-pays" if controls else f"sb3-tdpg reproduce pays{'-cue' * (problems == CUE)} --no-controls"
+    )
+    return common.write_results(out, "pays.md", of_all, command, given.publish, sections=sections)
 
 
 def with_summary(records: pd.DataFrame) -> pd.DataFrame:

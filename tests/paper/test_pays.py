@@ -119,7 +119,6 @@ def test_from_nothing_to_tables_figure_and_records(tmp_path, monkeypatch):
     wanted = {"TDPG", pays.NO_PENALTY, pays.BLIND, "PG, noise to 1, 4 or 10", "PPO, told the faults"}
     methods = pays.Problem.methods
     monkeypatch.setattr(pays.Problem, "methods", lambda problem: [m for m in methods(problem) if m.label in wanted])
-    monkeypatch.setattr(pays, "PROBLEMS", {name: PROBLEMS[name] for name in ("squeeze", "cue")})
     monkeypatch.setattr(pays, "complete_runs", lambda tasks, **given: complete_runs_here(tasks, n_eval_episodes=4))
     for module, name in (
         (pays, "aggregate_seeds"),
@@ -130,8 +129,12 @@ def test_from_nothing_to_tables_figure_and_records(tmp_path, monkeypatch):
     arguments = ["--n-seeds", "2", "--n-timesteps", "2000", "--publish", str(tmp_path / "docs")]
     assert main(["reproduce", "pays", "--out", str(tmp_path / "out"), *arguments]) == 0
     summary = (tmp_path / "out" / "summary.md").read_text()
-    for text in (*wanted, "Squeeze and insert, with a cue", "make reproduce-pays", "| TDPG | Training | <= 7.9 |"):
+    for text in (*wanted, "## Squeeze and insert", "## Lava", "make reproduce-pays", "| TDPG | Training | <= 7.9 |"):
         assert text in summary
+    assert main(["reproduce", "pays-cue", "--no-controls", "--out", str(tmp_path / "cue"), *arguments[:4]]) == 0
+    summary = (tmp_path / "cue" / "summary.md").read_text()
+    assert "sb3-tdpg reproduce pays-cue --no-controls" in summary
+    assert "PPO" not in summary
     seeds = pd.read_csv(tmp_path / "docs" / "seeds.csv")
     seeds = seeds[(seeds["problem"] == "squeeze") & (seeds["model"] == "TDPG")]
     of_tdpg = seeds[seeds["train_seed"] == 500].set_index("scenario")["cost"]
