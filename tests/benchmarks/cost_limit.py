@@ -36,9 +36,8 @@ def main() -> None:
             mean, _ = evaluate_policy(model, env, given.n_eval_episodes, deterministic=False)
             is_met = -float(mean) <= model.auto_weight.limit
             n_met += is_met
-            print(
-                f"{env_id}, seed {seed}: {-float(mean):.4g}, {model.auto_weight.kept()}, {'met' if is_met else 'MISSED'}"
-            )
+            verdict = "met" if is_met else "MISSED"
+            print(f"{env_id}, seed {seed}: {-float(mean):.4g}, {model.auto_weight.kept()}, {verdict}")
         print(f"{env_id}: {n_met} of {given.seeds} policies keep the limit")
 
 
