@@ -16,6 +16,8 @@ from sb3_tdpg.envs.peg_corner import HOLE, PegCornerEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
+from sb3_tdpg.evaluation import save_figure
+from sb3_tdpg.evaluation.figures import new_figure
 from sb3_tdpg.robustness import perturbation_gallery
 
 Policy = Callable[[np.ndarray, int], Sequence[float] | np.ndarray]
@@ -86,6 +88,41 @@ def peg_corner(path: Path) -> None:
     starts = [(5.6, 5.2), (2.4, 5.0), (4.0, 2.6), (3.2, 3.8)]
     env = PegCornerEnv(render_mode="rgb_array")
     ways(path, env, starts, lambda state, t: HOLE - state, lambda state, t: fixed[t])
+
+
+def when(path: Path) -> None:
+    """Draw the decision tree of "When to use what"."""
+    figure = new_figure(9.0, 2.9)
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    axes.set(xlim=(0.05, 3.95), ylim=(0.15, 1.85))
+    steps = [
+        ("Can you list what will\nchange about the sensor?", "train on it:\nnuisances, noise\nof that range"),
+        ("Does a policy that hardly\nlooks cost little more?\n(sb3-tdpg frontier)", "the bottleneck:\nbeta=1/75"),
+        ("Are velocities or earlier\nobservations hidden?", "a memory:\nTRVs or\nRecurrentPPO"),
+    ]
+    box = dict(boxstyle="round,pad=0.5", facecolor="white", edgecolor="#0072B2")
+    end = dict(boxstyle="round,pad=0.5", facecolor="#E6F1F8", edgecolor="none")
+    arrow = dict(arrowstyle="->", color="0.4", shrinkA=24, shrinkB=24)
+    for i, (question, answer) in enumerate(steps):
+        x = 0.5 + i
+        axes.text(x, 1.5, question, ha="center", va="center", fontsize=8.5, bbox=box)
+        axes.text(x, 0.45, answer, ha="center", va="center", fontsize=8.5, bbox=end)
+        axes.annotate("", (x, 0.45), (x, 1.5), arrowprops=arrow)
+        axes.text(x + 0.06, 0.98, "yes", fontsize=8.5)
+        axes.annotate("", (x + 1, 1.5), (x, 1.5), arrowprops=dict(arrow, shrinkA=62, shrinkB=62))
+        axes.text(x + 0.5, 1.58, "no", fontsize=8.5, ha="center")
+    axes.text(
+        3.5,
+        1.5,
+        "PPO, or TDPG with\nbeta=inf, and a\nsb3-tdpg report",
+        ha="center",
+        va="center",
+        fontsize=8.5,
+        bbox=end,
+    )
+    save_figure(figure, path)
 
 
 def side_by_side(images: list[np.ndarray], gap: int = 6) -> np.ndarray:
@@ -213,5 +250,6 @@ if __name__ == "__main__":
     panda_camera(folder / "panda_camera.png")
     panda_grasp(folder / "panda_grasp.gif")
     guide = Path(__file__).parent / "guide"
+    when(guide / "when.png")
     perturbations(guide / "perturbations_ball.png", "BallCatch-v0", renderer="fast")
     perturbations(guide / "perturbations_grasp.png", "PandaGrasp-v0")
