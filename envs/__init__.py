@@ -1,4 +1,4 @@
-"""The environments, the paper's and two of our own; importing this package registers their Gymnasium ids."""
+"""The environments, the paper's and three of our own; importing this package registers their Gymnasium ids."""
 
 import gymnasium as gym
 
@@ -8,6 +8,7 @@ ENTRY_POINTS = {
     "BallCatch-v0": "sb3_tdpg.envs.ball_catch:BallCatchEnv",
     "PandaGrasp-v0": "sb3_tdpg.envs.panda_grasp:PandaGraspEnv",
     "SqueezeInsert-v0": "sb3_tdpg.envs.squeeze_insert:SqueezeInsertEnv",
+    "PandaSqueeze-v0": "sb3_tdpg.envs.panda_squeeze:PandaSqueezeEnv",
     "PegCorner-v0": "sb3_tdpg.envs.peg_corner:PegCornerEnv",
 }
 
