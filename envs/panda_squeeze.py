@@ -4,7 +4,7 @@ import math
 import os
 import tempfile
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -217,9 +217,9 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
 
     State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv` without a
     cue, so that a policy trained there acts here unchanged. Only the dynamics differ: the contacts and the friction of
-    the engine decide how a squeeze turns the part. A part of 8 by 2.6 by 3 cm and 0.1 kg lies between jaws that are 10 cm apart;
-    they close with 20 N until they stand still, and open again. Nothing else is random: the next yaw is a function of
-    yaw and action.
+    the engine decide how a squeeze turns the part. A part of 8 by 2.6 by 3 cm and 0.1 kg lies between jaws that are
+    10 cm apart; they close with 20 N until they stand still, and open again. The next yaw is a function of yaw and
+    action alone.
 
     Without friction the part would turn towards the jaws if it is within :math:`\arctan(8 / 2.6) = 72°` of them, and
     across them otherwise. With friction, a part within :math:`\arctan(\text{friction})` of 72° jams and stays.
