@@ -11,6 +11,7 @@ from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
+from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.panda_view import depth_picture
 from sb3_tdpg.envs.peg_corner import HOLE, PegCornerEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
@@ -80,6 +81,21 @@ def squeeze_insert(path: Path) -> None:
     starts = np.column_stack([np.sin(2 * yaws), np.cos(2 * yaws)])
     env = SqueezeInsertEnv(render_mode="rgb_array")
     ways(path, env, starts, look, lambda state, t: [fixed[t]])
+
+
+def panda_squeeze(path: Path) -> None:
+    """Draw the Panda before a squeeze, and its closed jaws on a part along them, across them and jammed."""
+    env = PandaSqueezeEnv(render_mode="rgb_array")
+    pictures = []
+    for yaw in np.deg2rad([40.0, 85.0, 72.0]):
+        env.reset(seed=0)
+        env._state = np.array([[np.sin(2 * yaw), np.cos(2 * yaw)]])
+        if not pictures:
+            pictures.append(env.render())
+        env.step(np.zeros(1))
+        pictures.append(env.render())
+    env.close()
+    Image.fromarray(side_by_side(pictures)).save(path, optimize=True)
 
 
 def peg_corner(path: Path) -> None:
@@ -242,6 +258,7 @@ if __name__ == "__main__":
     folder = Path(__file__).parent / "environments"
     lava(folder / "lava.gif")
     squeeze_insert(folder / "squeeze_insert.gif")
+    panda_squeeze(folder / "panda_squeeze.png")
     peg_corner(folder / "peg_corner.gif")
     ball_textures(folder / "ball_textures.png")
     ball_camera(folder / "ball_camera.png")
