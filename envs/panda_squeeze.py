@@ -221,8 +221,8 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
     10 cm apart; they close with 20 N until they stand still, and open again. The next yaw is a function of yaw and
     action alone.
 
-    Without friction the part would turn towards the jaws if it is within :math:`\arctan(8 / 2.6) = 72°` of them, and
-    across them otherwise. With friction, a part within :math:`\arctan(\text{friction})` of 72° jams and stays.
+    Without friction the part would turn towards the jaws if it is within :math:`\arctan(8 / 2.6) = 72^\circ` of them,
+    and across them otherwise. With friction, a part within :math:`\arctan(\text{friction})` of 72° jams and stays.
 
     Each squeeze begins with the part in the middle between the jaws: the state has no position.
 
