@@ -270,11 +270,11 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
         if self._is_closed:  # perhaps before there was a BulletClient, which says the same
             raise RuntimeError("this environment has been closed: make a new one")
 
-    def _initial_state(self, n: int) -> np.ndarray:
+    def initial_state(self, n: int) -> np.ndarray:
         self._squeezed = None
-        return super()._initial_state(n)
+        return super().initial_state(n)
 
-    def _dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         pairs = zip(self.yaw(state).tolist(), action[:, 0].tolist(), strict=True)
         outcomes = [self._simulation.squeeze(part, hand) for part, hand in pairs]
         self._squeezed = outcomes[0][1]

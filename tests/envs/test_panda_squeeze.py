@@ -32,7 +32,7 @@ def squeeze(env, yaws, *fingers):
     """Squeeze parts with jaws of the given yaws, all in degrees; return the yaws of the parts."""
     state = parts(*yaws)
     for yaw in fingers:
-        state = env._dynamics(state, np.full((len(state), 1), yaw * DEGREE))
+        state = env.dynamics(state, np.full((len(state), 1), yaw * DEGREE))
     return env.yaw(state) / DEGREE
 
 
@@ -99,7 +99,7 @@ def test_the_costs_are_those_of_the_model(env):
         if is_last:
             by_hand = by_hand + 100 * np.maximum(0.0, np.abs(env.yaw(step.state)) - 0.05)
         np.testing.assert_allclose(step.cost, by_hand)
-        np.testing.assert_allclose(step.cost, model._cost(state, action) + is_last * model._terminal_cost(step.state))
+        np.testing.assert_allclose(step.cost, model.cost(state, action) + is_last * model.terminal_cost(step.state))
     assert env.yaw(step.state) == pytest.approx([0.2, wrap(np.array(0.1 + math.pi / 2))], abs=0.01)
 
 
