@@ -267,7 +267,8 @@ def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
         costs = frame.pivot(index=["model", "train_seed"], columns="scenario", values="cost")
         for i, label in enumerate(frame["model"].unique()):
             marker = "o" if "TDPG" in label or label == "VIB" else "^" if "PPO" in label else "s"
-            style: dict[str, Any] = dict(s=18, alpha=0.8, label=label, marker=marker, color=colours[i % len(colours)])
+            style: dict[str, Any] = dict(alpha=0.8, label=label, marker=marker, color=colours[i % len(colours)])
+            style |= dict(s=44, zorder=3, edgecolor="black") if label == "TDPG" else dict(s=18)
             axes.scatter(costs.loc[label, TRAINING], costs.loc[label, MEAN], **style)
         low = costs[[TRAINING, MEAN]].min().min()
         axes.axline((low, low), (2 * low, 2 * low), color="0.8", linewidth=1, zorder=0)
