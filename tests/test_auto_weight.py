@@ -73,7 +73,8 @@ def test_the_weight_follows_a_limit_below_zero():
 
 
 def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
-    arguments = dict(n_episodes=200, encoder_gradient="pathwise", n_epochs=4, clip_range=0.2, learning_rate=5e-3)
+    passes = dict(n_epochs=4, clip_range=0.2, learning_rate=5e-3)
+    arguments = dict(n_episodes=200, encoder_gradient="pathwise", gae_lambda=0.95, **passes)
     costs, information = [], []
     for beta in ("auto", 1e6):
         model = tiny_tdpg(beta=beta, cost_limit=40.0 if beta == "auto" else None, **arguments)

@@ -116,7 +116,7 @@ def information_report(
     n_rounds = -(-n_episodes // env.num_envs)
     seeds = [seed, *np.random.SeedSequence([seed, n_rounds]).generate_state(n_rounds)[1:].tolist()]
     batches, costs = zip(*(encode_episodes(model, env, seed=each) for each in seeds), strict=True)
-    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*batches, strict=True)))
+    batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*(each[:5] for each in batches), strict=True)))
     batch = batch.select(th.arange(n_episodes))
     interval = information_interval(batch, seed=seed)
     at_end()

@@ -2,7 +2,9 @@
 
 import json
 import math
+from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -89,8 +91,10 @@ def test_an_environment_without_a_block_is_trained_with_the_defaults(tmp_path, m
         raise StopError(tasks)
 
     monkeypatch.setattr("sb3_tdpg.experiments.frontier.complete_runs", stop)
+    spec = replace(gym.spec("SqueezeInsert-v0"), id="WithoutABlock-v0")
+    monkeypatch.setitem(gym.registry, "WithoutABlock-v0", spec)
     with pytest.raises(StopError) as caught:
-        frontier("SqueezeInsert-v0", shares=[95], n_seeds=1, out=tmp_path)
+        frontier("WithoutABlock-v0", shares=[95], n_seeds=1, out=tmp_path)
     (tasks,) = caught.value.args
     assert [task[0].block for task in tasks] == [None] * 3
     horizon = make_episodes_env("SqueezeInsert-v0", 1).get_attr("horizon")[0]
