@@ -159,7 +159,7 @@ def new_panels(
     return figure, panels
 
 
-def log_axis(axes: Axes, which: str, subs: tuple[int, ...]) -> None:
+def log_axis(axes: Axes, which: str, subs: tuple[float, ...]) -> None:
     """Make an axis logarithmic, with the ticks (10, 30, 100, ...) as plain numbers."""
     axes.set(**{f"{which}scale": "log"})
     axis = getattr(axes, f"{which}axis")

@@ -190,8 +190,8 @@ def verdict(table: pd.DataFrame) -> str:
     limits = rows.drop([NO_PENALTY, OPEN_LOOP])
     good = limits[limits["improvement"] >= IMPROVEMENT]
     spare = good[good["kept_high"] <= INFORMATION]
-    dear = start["cost"] + PRICE * abs(start["cost"])
-    is_cheap = bool(end["best"] <= dear)
+    most = start["cost"] + PRICE * abs(start["cost"])
+    is_cheap = bool(end["best"] <= most)
     word = ("Probably not", "Perhaps", "Probably")[int(len(spare) > 0) + is_cheap]
     cheapest, least = spare["cost"], (good if len(good) else limits)["kept"]
     shown = limits.loc[cheapest.idxmin() if len(spare) else least.idxmin()]
@@ -200,7 +200,7 @@ def verdict(table: pd.DataFrame) -> str:
         f"**{word}**: a limit of {shown.name} keeps {_percent(shown['improvement'])} of the improvement (cost "
         f"{shown['cost']:.4g}) with {_percent(shown['kept'])} of the information "
         f"({interval if shown['seeds'] > 1 else 'one seed, no interval'}), and the best open loop costs "
-        f"{end['best']:.4g}, {'within' if is_cheap else 'above'} the {dear:.4g} that is half more than the "
+        f"{end['best']:.4g}, which is {'cheap' if is_cheap else 'dear'}: the bound is {most:.4g}, half above the "
         f"{start['cost']:.4g} without a penalty."
     )
 

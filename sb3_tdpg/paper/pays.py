@@ -273,7 +273,7 @@ def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
         low = costs[[TRAINING, MEAN]].min().min()
         axes.axline((low, low), (2 * low, 2 * low), color="0.8", linewidth=1, zorder=0)
         for which in "xy":
-            log_axis(axes, which, subs=(1, 2, 5))
+            log_axis(axes, which, subs=(1, 1.5, 2, 3, 5, 7))
         axes.set_title(PROBLEMS[name].title, fontsize=10)
         axes.set_xlabel("cost in training", fontsize=9)
     panels[0].set_ylabel("mean cost of the faults", fontsize=9)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.robustness.core import Perturber, each_part
 from sb3_tdpg.robustness.registry import PERTURBATIONS, Perturbation
@@ -81,9 +81,9 @@ class MixedVecEnv(PerturbedVecEnv):
         seed: int | None = None,
         scale: Scale = None,
     ) -> None:
-        VecEnvWrapper.__init__(self, venv)
         if not perturbations:
             raise ValueError("perturbations=[] is empty: give names with severities, [('vector_noise', 3)]")
+        super().__init__(venv, *perturbations[0][:2], seed=seed, scale=scale)
         perturbers = []
         for name, severity, *factor in perturbations:
             kind = PERTURBATIONS[name].kind if name in PERTURBATIONS else ""
@@ -137,5 +137,4 @@ class NoisyVecEnv(PerturbedVecEnv):
         seed: int | None = None,
         scale: Scale = 1.0,
     ) -> None:
-        VecEnvWrapper.__init__(self, venv)
-        self._perturber = make_perturber(noise_range(low, high), 5, venv, venv.num_envs, seed, scale)
+        super().__init__(venv, noise_range(low, high), 5, seed=seed, scale=scale)

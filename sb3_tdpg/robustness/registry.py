@@ -147,12 +147,16 @@ def find(name: str) -> Perturbation:
 
 
 def find_applicable(
-    name: str, space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None
+    perturbation: str | Perturbation,
+    space: spaces.Space,
+    horizon: int | None = None,
+    action_space: spaces.Space | None = None,
 ) -> Perturbation:
-    """Return a perturbation by its name, if it applies; see :meth:`Perturbation.objection`."""
-    if (objection := find(name).objection(space, horizon, action_space)) is not None:
-        raise ValueError(f"the perturbation {name!r} does not apply: {objection}")
-    return PERTURBATIONS[name]
+    """Return a perturbation, or the one of a name, if it applies; see :meth:`Perturbation.objection`."""
+    found = find(perturbation) if isinstance(perturbation, str) else perturbation
+    if (objection := found.objection(space, horizon, action_space)) is not None:
+        raise ValueError(f"the perturbation {found.name!r} does not apply: {objection}")
+    return found
 
 
 def applicable(space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None) -> list[str]:

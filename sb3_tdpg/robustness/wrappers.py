@@ -78,11 +78,18 @@ class PerturbedVecEnv(VecEnvWrapper):
     Every episode has its own draw, also after an automatic reset; ``info["terminal_observation"]`` is perturbed as the
     last observation of the episode that has ended. A perturbation of observations does not change state, reward, the
     rest of info and the environments' random numbers. ``env.seed(...)`` also seeds the perturbation. Put this wrapper
-    inside a ``VecNormalize`` or a ``VecFrameStack``. The parameters are those of :class:`PerturbedObservation`.
+    inside a ``VecNormalize`` or a ``VecFrameStack``. The parameters are those of :class:`PerturbedObservation`; the
+    perturbation need not be registered.
     """
 
     def __init__(
-        self, venv: VecEnv, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
+        self,
+        venv: VecEnv,
+        perturbation: str | Perturbation,
+        severity: int = 3,
+        *,
+        seed: int | None = None,
+        scale: Scale = None,
     ) -> None:
         if not isinstance(venv, VecEnv):
             name = type(venv).__name__
@@ -149,8 +156,7 @@ def make_perturber(
 ) -> Perturber:
     """Make the perturber of an environment from a perturbation or its name; see :class:`PerturbedObservation`."""
     space, horizon = env.observation_space, horizon_of(env)
-    if isinstance(perturbation, str):
-        perturbation = find_applicable(perturbation, space, horizon, env.action_space)
+    perturbation = find_applicable(perturbation, space, horizon, env.action_space)
     perturbation.value(severity)  # checked before the calibration, which takes time
     if seed is not None and (isinstance(seed, bool) or seed < 0):
         raise ValueError(f"seed={seed} must be None or an integer of at least 0")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.robustness.mixtures import MixedVecEnv, NoisyVecEnv
@@ -90,3 +91,11 @@ def test_a_perturbation_of_a_mixture_can_have_a_scale_of_its_own():
     difference = (mixed - clean)[0]
     assert set(np.round(np.abs(difference[:, 0]), 4)) == {0.0, 8.0}
     assert not difference[:, 1].any()
+
+
+@pytest.mark.parametrize("make", [NoisyVecEnv, lambda env: MixedVecEnv(env, [("vector_noise", 3)])])
+def test_normalised_observations_and_images_are_refused(make):
+    with pytest.raises(ValueError, match="before they are normalised"):
+        make(VecNormalize(squeeze(2)))
+    with pytest.raises(ValueError, match="it is for vectors"):
+        make(make_episodes_env("BallCatch-v0", 2))
