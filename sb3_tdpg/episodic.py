@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.advantages import ValueFunction
 from sb3_tdpg.buffers import EpisodeBuffer, each
+from sb3_tdpg.checks import nearest_multiples
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.information import InformationEstimator
@@ -35,7 +36,6 @@ from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, check_numbers, check_observations, named_shapes, read_problem
 from sb3_tdpg.robustness.nuisance import make_nuisance
-from sb3_tdpg.settings import nearest_multiples
 
 NUISANCE_OPTIMIZER = "nuisance_phase.optimizer"
 

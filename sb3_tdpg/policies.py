@@ -23,9 +23,10 @@ from torch.distributions import Normal
 from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, Observations, PolicyStep, RebuiltTRVs, each
+from sb3_tdpg.checks import check_count, check_floors, check_net_arch
 from sb3_tdpg.features import Changes, ObservationNorm, TRVCnn, flat_action_space, least_side, observation_kind
 from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
-from sb3_tdpg.settings import POLICY_DEFAULTS, check_count, check_floors, check_net_arch, default, fill_in_trvs
+from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_trvs
 
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
@@ -43,7 +44,7 @@ class TRVPolicy(BasePolicy):
     next time step, ``(n_envs,)``.
 
     Four defaults are for the presets "vector", "image" (uint8), "depth" (images of floats) and "long" (vectors over a
-    long horizon, see :mod:`sb3_tdpg.settings`). The network sizes of "vector" and "depth" are the paper's; the preset
+    long horizon, see :mod:`sb3_tdpg.presets`). The network sizes of "vector" and "depth" are the paper's; the preset
     "paper" has those of its ball catching.
 
     :param observation_space: A vector, or an image with channels first.
@@ -75,8 +76,6 @@ class TRVPolicy(BasePolicy):
         TRVs is kept, as the update gate of a GRU: ``mean = g * candidate + (1 - g) * last TRVs``, where the candidate
         is the mean without a gate. The policy then remembers over many steps. Not with ``skip``. Default: no, yes, no,
         no.
-    :param squash_trv_log_var: Whether a tanh also keeps the log-variance in [-1, 1], before ``encoder_log_var_init`` is
-        added, as in the paper's policies for images. The standard deviation is then at least 0.6, which hurts.
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3,
         -10.
     :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -2.
@@ -116,7 +115,6 @@ class TRVPolicy(BasePolicy):
         shared_action_noise: bool | None = None,
         squash_trv_mean: bool | None = None,
         gate: bool | None = None,
-        squash_trv_log_var: bool = False,
         encoder_log_var_init: float | None = None,
         action_log_var_init: float | None = None,
         encoder_var_floor: float | None = None,
@@ -158,7 +156,6 @@ class TRVPolicy(BasePolicy):
         self.shared_action_noise = default(shared_action_noise, defaults.is_long)
         self.squash_trv_mean = default(squash_trv_mean, not defaults.is_long)
         self.gate = default(gate, defaults.gate)
-        self.squash_trv_log_var = squash_trv_log_var
         self.activation_fn = activation_fn
         self.encoder_log_var_init = default(encoder_log_var_init, defaults.encoder_log_var_init)
         self.action_log_var_init = default(action_log_var_init, defaults.action_log_var_init)
@@ -217,7 +214,6 @@ class TRVPolicy(BasePolicy):
         names = (
             "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip", "skip_changes",
             "normalize_observations", "scale_actions", "shared_action_noise", "squash_trv_mean", "gate",
-            "squash_trv_log_var",
             "encoder_log_var_init", "action_log_var_init", "encoder_var_floor", "action_var_floor",
             "features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
         )  # fmt: skip
@@ -250,8 +246,6 @@ class TRVPolicy(BasePolicy):
             mean = th.tanh(mean)
         for gate in gates:
             mean = th.lerp(prev_trv, mean, th.sigmoid(gate))
-        if self.squash_trv_log_var:
-            log_var = th.tanh(log_var)
         variance = self._variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor)
         return mean, variance.sqrt()
 

@@ -25,28 +25,25 @@ from sb3_tdpg.advantages import ValueFunction, get_baseline
 from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer, RebuiltTRVs
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
-from sb3_tdpg.common.threads import threads
-from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
-from sb3_tdpg.information import InformationEstimator, get_estimator_class
-from sb3_tdpg.information.nuisance import NuisancePhase
-from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import Problem, horizon_of
-from sb3_tdpg.robustness.nuisance import resolved
-from sb3_tdpg.settings import (
-    DEFAULTS,
-    Defaults,
+from sb3_tdpg.checks import (
     check_action_space,
     check_arguments,
     check_batch_size,
     check_beta,
     check_count,
-    fill_in,
-    preset_of,
     rate_schedule,
     refuse_others,
     warn_if_short,
     with_keywords,
-)  # fmt: skip
+)
+from sb3_tdpg.common.threads import threads
+from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
+from sb3_tdpg.information import InformationEstimator, get_estimator_class
+from sb3_tdpg.information.nuisance import NuisancePhase
+from sb3_tdpg.policies import TRVPolicy
+from sb3_tdpg.presets import DEFAULTS, Defaults, fill_in, preset_of
+from sb3_tdpg.problem import Problem, horizon_of
+from sb3_tdpg.robustness.nuisance import resolved
 from sb3_tdpg.vec_env import make_episodes_env
 
 __all__ = ["TDPG", "TrainingDivergedError"]
@@ -72,7 +69,7 @@ class TDPG(EpisodicAlgorithm):
     Without these, a vector observation stands in for the state.
 
     Three defaults are for vectors, images, and vectors over a horizon of 50 or more. Depth images (floats) differ in a
-    few more; :mod:`sb3_tdpg.settings` has all defaults.
+    few more; :mod:`sb3_tdpg.presets` has all defaults.
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``.
@@ -87,7 +84,7 @@ class TDPG(EpisodicAlgorithm):
     :param epoch_steps: Steps of a policy epoch instead: no episode begins after that many; default: none, none, 2000.
     :param n_envs: Number of environments to make from an id; default: see :func:`~sb3_tdpg.make_episodes_env`.
     :param mi_estimator: A name in :data:`sb3_tdpg.information.ESTIMATORS` or a subclass of
-        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"mine"``, ``"logdet"``, ``"logdet"``.
+        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"logdet"``.
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: Variance reduction of the gradient. ``"regression"``: subtract a regression of the cost-to-go on
         the true state at each step; ``"value"``: a network of the true state and the time left

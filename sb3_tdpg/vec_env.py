@@ -24,8 +24,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_tdpg.common.processes import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.presets import DEFAULTS, preset_of
 from sb3_tdpg.problem import horizon_of
-from sb3_tdpg.settings import DEFAULTS, preset_of
 
 
 class BatchedVecEnv(VecEnv):

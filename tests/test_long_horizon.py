@@ -16,7 +16,7 @@ from sb3_tdpg import TDPG, InformationCallback
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
 from sb3_tdpg.features import Changes, RunningNorm
 from sb3_tdpg.information import LogDet
-from sb3_tdpg.settings import DEFAULTS, discount_of, preset_of
+from sb3_tdpg.presets import DEFAULTS, discount_of, preset_of
 
 
 def tiny(env="CartPole-v1", **kwargs):

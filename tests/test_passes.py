@@ -141,10 +141,10 @@ def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
 # -- what is left out -------------------------------------------------------------------------------------------------
 
 
-def test_vectors_are_learnt_from_as_in_the_paper():
+def test_vectors_are_learnt_from_with_one_update_an_epoch():
     model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
     assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, None)
-    assert (model.clip_range(1.0), model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "mine")
+    assert (model.clip_range(1.0), model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "logdet")
     assert not model.normalize_advantage
     assert model.env.num_envs == 500
 

@@ -336,16 +336,6 @@ def test_the_kind_of_an_observation_is_that_of_its_space(space, kind):
     assert observation_kind(space) == kind
 
 
-def test_the_log_variance_of_the_trvs_may_be_squashed_as_in_the_paper():
-    parameters = th.tensor([[0.0, 0.0, 50.0, -50.0]])
-    policy = make_policy(trv_dim=2, squash_trv_log_var=True, encoder_var_floor=0.0)
-    _, std = policy._encoder_density(parameters, th.zeros(1, 3), th.zeros(1, 2))
-    assert std.tolist()[0] == pytest.approx([np.exp(0.5), np.exp(-0.5)], rel=0.03)
-    policy = make_policy(trv_dim=2, encoder_var_floor=0.0)
-    _, std = policy._encoder_density(parameters, th.zeros(1, 3), th.zeros(1, 2))
-    assert std[0, 1] < 1e-6
-
-
 def test_a_saved_policy_predicts_the_same(tmp_path):
     policy = make_policy(trv_dim=3, encoder_var_floor=0.5, time_varying=False, action_log_var_init=1.0)
     policy.save(tmp_path / "policy.zip")

@@ -76,6 +76,7 @@ def make_model(case: Case) -> TDPG:
         n_episodes=N_EPISODES,
         seed=SEED,
         device="cpu",
+        mi_estimator="mine",
         policy_kwargs=dict(net_arch=dict(encoder=[8, 8], action_head=[8, 8])),
         mi_kwargs=dict(
             hidden_sizes=(8, 8),

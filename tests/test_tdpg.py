@@ -88,7 +88,7 @@ def test_a_memory_is_learnt_where_it_is_needed(encoder_gradient):
 
 
 def test_a_run_with_the_defaults_makes_one_epoch():
-    model = TDPG(device="cpu", env="Lava-v0", mi_kwargs=dict(warmup_gradient_steps=60))
+    model = TDPG(device="cpu", env="Lava-v0")
     model.learn(2500)
     assert model.epoch == 1
     assert model.rollout_buffer.n_envs == model.env.num_envs == 500

@@ -21,7 +21,7 @@ from sb3_tdpg.experiments.runs import Run, Task, check_folder, complete_runs, re
 from sb3_tdpg.experiments.sweep import TIE, build_once, finished_row
 from sb3_tdpg.experiments.tradeoff import frontier_figure
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.settings import DEFAULTS, preset_of
+from sb3_tdpg.presets import DEFAULTS, preset_of
 
 SHARES = (99, 95, 90, 80)  # per cent
 NO_PENALTY, OPEN_LOOP = "no penalty", "open loop"

@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from tqdm import tqdm
 
 from sb3_tdpg.callbacks import TrainingCheckpointCallback
+from sb3_tdpg.checks import rate_schedule
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
 from sb3_tdpg.common.processes import process_pool, usable_cores
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
@@ -26,7 +27,6 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.training import make_training, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.settings import rate_schedule
 from sb3_tdpg.tdpg import TDPG
 
 # A checkpoint resets the environments, so the number of epochs between checkpoints is part of the run.

@@ -32,8 +32,8 @@ from sb3_tdpg.paper.baselines import baselines_table, training_times
 from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves, sorted_walls
 from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
+from sb3_tdpg.presets import IMAGE_ENCODER
 from sb3_tdpg.robustness.training import VecImagePerturbation
-from sb3_tdpg.settings import IMAGE_ENCODER
 from sb3_tdpg.tdpg import TDPG
 
 # Fixed before any policy was evaluated on the test rows: the defaults were chosen on seeds below 100 and on the walls

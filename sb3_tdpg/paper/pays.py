@@ -21,6 +21,7 @@ from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.baselines import training_times
 from sb3_tdpg.paper.common import NO_PENALTY, Method
+from sb3_tdpg.presets import DEFAULTS
 from sb3_tdpg.robustness import PERTURBATIONS, PerturbedVecEnv
 
 # Seeds below 100 chose the defaults; faults and methods were fixed before the first of these was run.
@@ -103,10 +104,8 @@ class Problem:
         narrow = dict(policy_kwargs={**block.get("policy_kwargs", {}), "action_log_var_init": -2.0})
         no_penalty: dict[str, Any] = dict(beta=float("inf"))
         told = {f"{_MIXTURES}.MixedVecEnv": dict(perturbations=self._told(), scale=list(self.scale))}
-        # The defaults have MINE.
-        estimators = [
-            name for name in ("mine", "logdet", "directed", "vib") if name != block.get("mi_estimator", "mine")
-        ]
+        by_default = block.get("mi_estimator", DEFAULTS["vector"].mi_estimator)
+        estimators = [name for name in ("mine", "logdet", "directed", "vib") if name != by_default]
         found = [
             ours("TDPG"),
             *(ours(f"TDPG, {name}", mi_estimator=name) for name in estimators),

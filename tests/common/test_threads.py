@@ -11,8 +11,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.evaluation.information import state_knowledge
-from sb3_tdpg.measurement import estimate_information, information_interval, trust_checks
-from sb3_tdpg.settings import DEPTH, IMAGE, VECTOR
+from sb3_tdpg.measurement import information_interval, trust_checks
+from sb3_tdpg.presets import DEPTH, IMAGE, VECTOR
 
 
 def in_use():
@@ -85,10 +85,3 @@ def test_what_is_measured_after_the_training_takes_one_thread(estimate):
         estimate(Samples())
     assert told.value.args == (1, {1})
     assert in_use() == (2, {2})
-
-
-def test_the_information_between_pairs_takes_one_thread(monkeypatch):
-    seen = []
-    monkeypatch.setattr("sb3_tdpg.measurement.pairs._cross_fit", lambda *_: seen.append(in_use()) or (th.zeros(1),) * 2)
-    estimate_information(th.randn(60, 1), th.randn(60, 1))
-    assert seen == [(1, {1})]

@@ -10,6 +10,7 @@ from sb3_contrib import RecurrentPPO
 from small_problems import complete_runs_here
 from stable_baselines3 import PPO
 
+from sb3_tdpg.checks import rate_schedule
 from sb3_tdpg.cli import main
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -21,7 +22,6 @@ from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import baselines, grasp
 from sb3_tdpg.paper.baselines import GRASP_BASELINES, LAVA_BASELINES, training_time, training_times
 from sb3_tdpg.paper.common import Method
-from sb3_tdpg.settings import rate_schedule
 
 COMPARISONS = (LAVA_BASELINES, GRASP_BASELINES)
 RESULTS = Path(__file__).parents[2] / "docs" / "results"

@@ -27,8 +27,7 @@ import numpy as np
 import pandas as pd
 import torch as th
 from compare import HERE, KEYS  # before all else it sees to it that there is one thread
-
-from sb3_tdpg.measurement import estimate_information
+from pairs import estimate_information
 
 RESULTS = HERE / "beside.csv"
 COLUMNS = [*KEYS, "truth", "theirs", "ours", "cpu_seconds_theirs", "cpu_seconds_ours"]

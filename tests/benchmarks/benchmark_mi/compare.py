@@ -25,8 +25,7 @@ sys.path.insert(0, str(HERE.parents[2]))
 import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 import torch as th  # noqa: E402
-
-from sb3_tdpg.measurement import estimate_information  # noqa: E402
+from pairs import estimate_information  # noqa: E402
 
 # Name in the table, arguments of estimate_information, seeds of the benchmark.
 PLAN = (

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from copula_start import NORMAL, Start, add_up, choose_start, degrees_of_freedom, t_scores
 from torch import nn
 
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information import InfoNCE, InformationBatch, InformationEstimator, Nwj, get_estimator_class
 from sb3_tdpg.information.critic import CriticEstimator, Scores
-from sb3_tdpg.measurement.copula_start import NORMAL, Start, add_up, choose_start, degrees_of_freedom, t_scores
 from sb3_tdpg.networks import BatchedMLP, flatten_parameters
 
 STEPS_PER_CHECK = 50

@@ -1,4 +1,4 @@
-"""Arguments of TDPG: the defaults for each kind of observation, and checks that say how to mend a bad value."""
+"""Checks of TDPG's arguments, with errors that say how to mend a bad value."""
 
 from __future__ import annotations
 
@@ -8,208 +8,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
-from torch import nn
 
 from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.auto_weight import share_of
-from sb3_tdpg.features import TRVCnn, observation_kind
 from sb3_tdpg.information import get_estimator_class
 
 ENCODER_GRADIENTS = ("score", "pathwise")
+
+
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
-# From this horizon on the problem is an ordinary one of reinforcement learning, and no longer one of the paper's kind.
-LONG_HORIZON = 50
-EPOCH_STEPS = 2000
 MIN_BATCH_STEPS = 32  # the information of a minibatch is that of as many samples
-
-
-class Defaults(NamedTuple):
-    """Arguments of :class:`~sb3_tdpg.tdpg.TDPG` that depend on the kind of problem, and the length of training."""
-
-    beta: float | str
-    learning_rate: str
-    n_episodes: int | None
-    epoch_steps: int | None
-    n_epochs: int
-    batch_size: int | None
-    clip_range: float
-    normalize_advantage: bool
-    encoder_gradient: str
-    mi_estimator: str
-    n_threads: int | None
-    total_epochs: int  # policy epochs
-    baseline: str = "regression"
-    bptt_steps: int | None = None
-    gamma: float | None = 1.0  # None: by the horizon
-    gae_lambda: float = 0.95
-    max_grad_norm: float = float("inf")
-    share: str = "95%"  # the cost_limit of beta="auto"
-
-
-# One update per epoch, as in the paper; the falling learning rate improves the last epochs.
-VECTOR = Defaults(
-    beta=1 / 75,
-    learning_rate="lin_2e-3_2e-5",
-    n_episodes=500,
-    epoch_steps=None,
-    n_epochs=1,
-    batch_size=None,
-    clip_range=float("inf"),
-    normalize_advantage=False,
-    encoder_gradient="score",
-    mi_estimator="mine",
-    n_threads=1,
-    total_epochs=400,
-    gae_lambda=0.3,  # with 0.95 lava stays in bad open loops
-)
-
-# Images are expensive: PPO's passes over few episodes, and the gradient with the least variance. A policy that has not
-# learnt costs a hundred times as much as one that has, so that 95 % of the improvement would be a bad policy.
-IMAGE = Defaults(
-    beta="auto",
-    share="99.8%",
-    learning_rate="lin_1e-3_5e-5",
-    n_episodes=160,
-    epoch_steps=None,
-    n_epochs=4,
-    batch_size=40,
-    clip_range=0.2,
-    normalize_advantage=True,
-    encoder_gradient="pathwise",
-    mi_estimator="logdet",
-    n_threads=None,
-    total_epochs=75,
-    baseline="value",
-)
-
-# Depth images come from environments that simulate each trial: even more expensive.
-DEPTH = IMAGE._replace(share="95%", n_episodes=400, batch_size=200, total_epochs=100, baseline="regression")
-
-
-# Ordinary environments: PPO's update, with minibatches of short segments and a value network.
-LONG = Defaults(
-    beta=float("inf"),
-    learning_rate="lin_1e-3_1e-4",
-    n_episodes=None,
-    epoch_steps=EPOCH_STEPS,
-    n_epochs=10,
-    batch_size=250,
-    clip_range=0.2,
-    normalize_advantage=True,
-    encoder_gradient="pathwise",
-    mi_estimator="logdet",
-    n_threads=1,
-    total_epochs=100,
-    baseline="value",
-    bptt_steps=5,
-    gamma=None,
-    max_grad_norm=0.5,
-)
-DEFAULTS = dict(vector=VECTOR, image=IMAGE, depth=DEPTH, long=LONG)
-
-
-class PolicyDefaults(NamedTuple):
-    """Arguments of :class:`~sb3_tdpg.TRVPolicy` that depend on the kind of observation; for images the paper's."""
-
-    trv_dim: int
-    encoder: Sequence[int]
-    action_head: Sequence[int]
-    encoder_activation_fn: type[nn.Module]
-    action_head_activation_fn: type[nn.Module]
-    encoder_log_var_init: float
-    action_log_var_init: float
-    features_extractor_class: type[BaseFeaturesExtractor]
-    features_extractor_kwargs: dict[str, Any]
-    encoder_var_floor: float = 1e-3
-    is_long: bool = False
-    gate: bool = False
-    time_varying: bool | None = None  # None: by the horizon
-
-
-# SB3's NatureCNN with half the channels and a layer norm, behind means of 2 x 2 pixels. Three layers and a linear one
-# generalise better to walls that were never seen than the paper's two (docs/results/ball_catch.md).
-IMAGE_ENCODER = dict(
-    pool=2, layers=((16, 4, 2), (32, 4, 2), (32, 3, 1)), activation_fn=nn.ReLU, features_dim=256, layer_norm=True
-)
-
-# Images start with narrow TRVs: training with wide ones takes twice as long.
-POLICY_DEFAULTS = dict(
-    vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
-    image=PolicyDefaults(
-        32, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, IMAGE_ENCODER, gate=True, time_varying=False
-    ),
-    # The number of TRVs beside those that keep the observation. These are nearly free of noise at the start: a velocity
-    # is a small difference of them.
-    long=PolicyDefaults(
-        16,
-        (64, 64),
-        (64, 64),
-        nn.Tanh,
-        nn.Tanh,
-        -10.0,
-        -2.0,
-        FlattenExtractor,
-        {},
-        1e-5,
-        is_long=True,
-        time_varying=False,
-    ),
-    depth=PolicyDefaults(
-        16, (128, 64), (64, 64), nn.Tanh, nn.ELU, -3.0, -2.0, TRVCnn, dict(layers=((6, 6, 2), (6, 4, 2)))
-    ),
-    paper=PolicyDefaults(8, (32,), (), nn.Tanh, nn.Tanh, 0.0, 0.0, TRVCnn, {}),  # of ball catching
-)
-
-
-def preset_of(observation_space: spaces.Space | None, horizon: int | None) -> str:
-    """
-    Name the defaults for a problem: ``"vector"``, ``"image"``, ``"depth"`` or ``"long"``.
-
-    :param observation_space: The environment's.
-    :param horizon: Its time limit T, if it is known.
-    """
-    kind = observation_kind(observation_space)
-    return "long" if kind == "vector" and horizon is not None and horizon >= LONG_HORIZON else kind
-
-
-def discount_of(horizon: int) -> float:
-    """Return the default discount of a long horizon T: it looks ahead for an eighth of it, and 10 to 200 steps."""
-    return min(max(1 - 8 / horizon, 0.9), 0.995)
-
-
-def fill_in(
-    given: Mapping[str, Any], preset: str, cost_limit: float | str | None, n_envs: int, horizon: int
-) -> dict[str, Any]:
-    """
-    Replace ``None`` by the defaults.
-
-    :param given: Arguments by name.
-    :param preset: See :func:`preset_of`.
-    :param cost_limit: With a limit the default of beta is "auto".
-    :param n_envs: Number of environments, whose multiple the default of ``n_episodes`` is.
-    :param horizon: T, which the default of ``gamma`` depends on.
-    """
-    defaults = DEFAULTS[preset]
-    settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
-    if settings["gamma"] is None:
-        settings["gamma"] = discount_of(horizon)
-    if given["beta"] is None and cost_limit is not None:
-        settings["beta"] = "auto"
-    for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
-        if given[one] is not None and given[other] is None:
-            settings[other] = None
-    if given["n_episodes"] is None and settings["n_episodes"] is not None:
-        settings["n_episodes"] = math.ceil(settings["n_episodes"] / n_envs) * n_envs
-    return {**settings, "cost_limit": cost_limit}
 
 
 # What users of PPO and RecurrentPPO look for, and what it is here.
@@ -439,38 +255,6 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
         known = {key for cls in make.func.__mro__[:-1] for key in signature(cls).parameters}  # type: ignore[attr-defined]
         hints = (nearest_name(key, known) for key in kwargs if key not in known)
         raise ValueError(f"{what}: {e}{next(filter(None, hints), '')}") from e
-
-
-def default(value: Any, otherwise: Any) -> Any:
-    """Return the value of an argument, or its default if there is none."""
-    return otherwise if value is None else value
-
-
-def fill_in_trvs(
-    defaults: PolicyDefaults, n_features: int, trv_dim: int | None, skip: bool | None, skip_changes: bool | None
-) -> tuple[int, bool, bool]:
-    """
-    Return ``trv_dim``, ``skip`` and ``skip_changes`` with their defaults.
-
-    :param defaults: Those of the preset.
-    :param n_features: Number of features of an observation.
-    :raises ValueError: if there are too few TRVs for what is to be added to them.
-    """
-    if trv_dim is not None:
-        check_count("policy_kwargs: trv_dim", trv_dim)
-    room = default(trv_dim, math.inf)
-    skip = default(skip, defaults.is_long and room >= n_features)
-    skip_changes = default(skip_changes, skip and defaults.is_long and room >= 2 * n_features)
-    if skip_changes and not skip:
-        raise ValueError("policy_kwargs: skip_changes=True needs skip=True: changes are those of the kept features")
-    n_skipped = n_features * (skip + skip_changes)
-    trv_dim = default(trv_dim, max(n_features + defaults.trv_dim, n_skipped) if skip else defaults.trv_dim)
-    if n_skipped > trv_dim:
-        raise ValueError(
-            f"policy_kwargs: skip={skip} and skip_changes={skip_changes} add {n_skipped} features to as many TRVs, but "
-            f"trv_dim={trv_dim}: give trv_dim={n_skipped} or more, or turn them off"
-        )
-    return trv_dim, skip, skip_changes
 
 
 def check_floors(**floors: float | None) -> None:

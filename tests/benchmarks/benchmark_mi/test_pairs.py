@@ -6,23 +6,23 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from copula_start import Start, _scatter, degrees_of_freedom
 from information_problems import CRITICS
-from scipy import stats
-
-from sb3_tdpg.information.critic import CriticEstimator
-from sb3_tdpg.measurement import estimate_information
-from sb3_tdpg.measurement.copula_start import Start, _scatter, degrees_of_freedom
-from sb3_tdpg.measurement.pairs import (
+from pairs import (
     StartedMLP,
     _average,
     _Choice,
     _features,
     _ranks,
     _whiten,
+    estimate_information,
 )
+from scipy import stats
+
+from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.networks import flatten_parameters
 
-BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "benchmark_mi"
+BENCHMARK = Path(__file__).parent
 EASY = (  # of these the benchmark's CCA or KSG is within 10 % of the truth
     "1v1-bimodal-0.75",
     "half_cube-1v1-normal-0.75",
