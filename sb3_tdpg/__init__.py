@@ -23,7 +23,7 @@ from sb3_tdpg import envs, hyperparams
 
 if TYPE_CHECKING:
     from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
-    from sb3_tdpg.measurement.callback import InformationCallback
+    from sb3_tdpg.evaluation.information_callback import InformationCallback
     from sb3_tdpg.policies import TRVPolicy
     from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
     from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
@@ -47,7 +47,7 @@ __all__ = [
 _MODULES = {
     "TDPG": "tdpg",
     "BatchedVecEnv": "vec_env",
-    "InformationCallback": "measurement.callback",
+    "InformationCallback": "evaluation.information_callback",
     "MINECallback": "callbacks",
     "SelectionCallback": "callbacks",
     "TRVPolicy": "policies",

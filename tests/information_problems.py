@@ -5,12 +5,12 @@ import math
 import numpy as np
 import torch as th
 
+from sb3_tdpg.evaluation.density_critic import Encoded
 from sb3_tdpg.information import (
     ESTIMATORS,
     CriticEstimator,
     InformationBatch,
 )
-from sb3_tdpg.measurement.density_critic import Encoded
 
 CRITICS = sorted(name for name, cls in ESTIMATORS.items() if issubclass(cls, CriticEstimator))
 CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))

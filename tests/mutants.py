@@ -29,7 +29,7 @@ TREE = ROOT / "build" / "mutants"
 GOAL = 0.9
 CODE = [
     "losses.py", "advantages.py", "auto_weight.py", "buffers.py", "features.py", "episodic.py", "tdpg.py",
-    "information/*.py", "robustness/nuisance.py", "measurement/interval.py", "measurement/interval_bounds.py",
+    "information/*.py", "robustness/nuisance.py", "evaluation/interval.py", "evaluation/interval_bounds.py",
     "certificates/certificate.py", "certificates/nuisance.py", "certificates/shifts.py", "envs/*.py",
 ]  # fmt: skip
 # What people look at; and the table of scenarios, which is read with the module, before a change is switched on.
@@ -37,7 +37,8 @@ LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|show_window|_figure__")
 TESTS = [
     "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
     "test_passes.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py", "test_episodic.py",
-    "test_features.py", "test_nuisance.py", "information", "robustness/test_nuisance_members.py", "measurement",
+    "test_features.py", "test_nuisance.py", "information", "robustness/test_nuisance_members.py",
+    "evaluation/test_interval.py", "evaluation/test_interval_bounds.py", "evaluation/test_trust_badge.py",
     "certificates", "envs",
 ]  # fmt: skip
 SETTINGS = """
@@ -67,7 +68,11 @@ def stage() -> None:
     for source, target in {"sb3_tdpg": "sb3_tdpg", **inside, "tests": "tests"}.items():
         shutil.copytree(ROOT / source, TREE / target, ignore=ignore, dirs_exist_ok=True)
     code = "\n    ".join(f"sb3_tdpg/{path}" for path in CODE)
-    tests = "\n    ".join(f"tests/{path}" for path in TESTS if (ROOT / "tests" / path).exists())
+    missing = [path for path in TESTS if not (ROOT / "tests" / path).exists()]
+    missing += [path for path in CODE if not list(ROOT.glob(path)) + list((ROOT / "sb3_tdpg").glob(path))]
+    if missing:
+        raise FileNotFoundError(f"{missing} are not there: mend CODE and TESTS in {__file__}")
+    tests = "\n    ".join(f"tests/{path}" for path in TESTS)
     (TREE / "setup.cfg").write_text((ROOT / "setup.cfg").read_text() + SETTINGS.format(code=code, tests=tests))
 
 

@@ -20,16 +20,16 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation.density_critic import Regression
 from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
+from sb3_tdpg.evaluation.interval import InformationInterval, component_estimates, information_interval
+from sb3_tdpg.evaluation.interval_bounds import MAX_TRAINING
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
+from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
 from sb3_tdpg.information import InformationBatch, LogDet
 from sb3_tdpg.information.loo import log_density_matrix
-from sb3_tdpg.measurement import InformationInterval, TrustBadge, TrustCheck, information_interval, trust_checks
-from sb3_tdpg.measurement.density_critic import Regression
-from sb3_tdpg.measurement.interval import component_estimates
-from sb3_tdpg.measurement.interval_bounds import MAX_TRAINING
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import read_problem
 

@@ -20,7 +20,7 @@ sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "tests")]
 import numpy as np  # noqa: E402
 from information_problems import gaussian_channels  # noqa: E402
 
-from sb3_tdpg.measurement import information_interval  # noqa: E402
+from sb3_tdpg.evaluation import information_interval  # noqa: E402
 
 COLUMNS = ("N", "d", "truth", "held", "lower above", "upper below", "mean lower", "mean upper", "mean width",
            "95 % of widths below", "widest")  # fmt: skip

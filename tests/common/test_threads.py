@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.evaluation import information_interval, trust_checks
 from sb3_tdpg.evaluation.information import state_knowledge
-from sb3_tdpg.measurement import information_interval, trust_checks
 from sb3_tdpg.presets import DEPTH, IMAGE, VECTOR
 
 

@@ -15,6 +15,7 @@ from sb3_tdpg import BatchedVecEnv, InformationCallback, SelectionCallback, make
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.evaluation import information as information_module
 from sb3_tdpg.evaluation import (
+    information_interval,
     information_report,
     information_timeline,
     interval_frame,
@@ -22,8 +23,7 @@ from sb3_tdpg.evaluation import (
     save_figure,
     state_knowledge,
 )
-from sb3_tdpg.measurement import information_interval
-from sb3_tdpg.measurement.interval import component_estimates, min_episodes
+from sb3_tdpg.evaluation.interval import component_estimates, min_episodes
 
 PROBLEM = "Lava-v0"
 

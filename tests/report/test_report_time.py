@@ -10,7 +10,7 @@ from small_problems import CountdownEnv, tiny_tdpg
 from stable_baselines3 import PPO
 
 from sb3_tdpg.cli import main
-from sb3_tdpg.measurement import TrustBadge, TrustCheck
+from sb3_tdpg.evaluation import TrustBadge, TrustCheck
 from sb3_tdpg.report import main as report_main
 from sb3_tdpg.report import records, robustness_report
 

@@ -14,9 +14,8 @@ import torch as th
 from scipy.special import owens_t
 
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.measurement.density_critic import Encoded, varies
-from sb3_tdpg.measurement.interval_bounds import (
+from sb3_tdpg.evaluation.density_critic import Encoded, varies
+from sb3_tdpg.evaluation.interval_bounds import (
     Estimate,
     critic_bounds,
     draw_trvs,
@@ -24,6 +23,7 @@ from sb3_tdpg.measurement.interval_bounds import (
     leave_one_out_bound,
     log_det_bound,
 )
+from sb3_tdpg.information.base import InformationBatch
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
@@ -169,9 +169,9 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
     on the others. There are two kinds, and the larger bound counts:
 
-    - ``"critic"``: :class:`~sb3_tdpg.measurement.density_critic.DensityCritic`, fitted to each half of the episodes and
+    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to each half of the episodes and
       evaluated on the other. Up to 300 episodes are divided in three ways, since each division misses some pairs.
-    - ``"gaussian"``: :class:`~sb3_tdpg.measurement.density_critic.GaussianCritic`, which is fitted fast and therefore
+    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, which is fitted fast and therefore
       to more episodes: to all but two of eight groups, and evaluated on these two (of five groups with more than 300
       episodes). It is tighter where states and TRVs are about jointly Gaussian.
 

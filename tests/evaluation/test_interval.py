@@ -7,9 +7,8 @@ import pytest
 import torch as th
 from information_problems import channel, gaussian_batch, gaussian_channels, generator, half_dead, random_batch
 
-from sb3_tdpg.information import LeaveOneOut, own_sample_bound
-from sb3_tdpg.measurement import information_interval
-from sb3_tdpg.measurement.interval import (
+from sb3_tdpg.evaluation import information_interval
+from sb3_tdpg.evaluation.interval import (
     LOWER_BOUNDS,
     UPPER_BOUNDS,
     _gap,
@@ -19,7 +18,8 @@ from sb3_tdpg.measurement.interval import (
     miss_of_each_limit,
     normal_quantile,
 )
-from sb3_tdpg.measurement.interval_bounds import Estimate
+from sb3_tdpg.evaluation.interval_bounds import Estimate
+from sb3_tdpg.information import LeaveOneOut, own_sample_bound
 
 
 def test_the_interval_holds_the_information_of_gaussian_channels_and_is_narrow():

@@ -7,9 +7,9 @@ import pytest
 import torch as th
 from information_problems import channel, gaussian_batch, generator, random_batch
 
-from sb3_tdpg.measurement import information_interval
-from sb3_tdpg.measurement import interval as interval_module
-from sb3_tdpg.measurement.checks import TrustBadge, TrustCheck, trust_checks
+from sb3_tdpg.evaluation import information_interval
+from sb3_tdpg.evaluation import interval as interval_module
+from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
 
 
 def test_a_sound_batch_passes_every_check():

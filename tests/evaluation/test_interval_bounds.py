@@ -8,11 +8,10 @@ import torch as th
 from information_problems import channel, encoded, gaussian_batch, gaussian_channels, generator, random_batch
 from scipy.stats import multivariate_normal
 
-from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet
-from sb3_tdpg.measurement import density_critic, information_interval
-from sb3_tdpg.measurement import interval_bounds as bounds_module
-from sb3_tdpg.measurement.density_critic import DensityCritic, GaussianCritic, Regression
-from sb3_tdpg.measurement.interval_bounds import (
+from sb3_tdpg.evaluation import density_critic, information_interval
+from sb3_tdpg.evaluation import interval_bounds as bounds_module
+from sb3_tdpg.evaluation.density_critic import DensityCritic, GaussianCritic, Regression
+from sb3_tdpg.evaluation.interval_bounds import (
     Estimate,
     FreshPairs,
     critic_bounds,
@@ -23,6 +22,7 @@ from sb3_tdpg.measurement.interval_bounds import (
     log_det_bound,
     noise_controls,
 )
+from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet
 
 
 def test_the_jackknife_of_the_log_det_bound_is_that_of_its_definition():

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logsumexp, softmax
 
+from sb3_tdpg.evaluation.density_critic import LOG_2_PI, DensityCritic, Encoded, GaussianCritic, log_gaussians
 from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.measurement.density_critic import LOG_2_PI, DensityCritic, Encoded, GaussianCritic, log_gaussians
 
 MAX_DRAWS = 12  # of the TRVs for each episode
 GROUPS = (8, 5)  # groups of episodes, two of which evaluate a Gaussian critic; five above MAX_REDIVIDED episodes

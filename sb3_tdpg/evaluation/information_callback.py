@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_tdpg.callbacks import TDPGCallback
-from sb3_tdpg.measurement.interval import InformationInterval, component_estimates, information_interval, min_episodes
+from sb3_tdpg.evaluation.interval import InformationInterval, component_estimates, information_interval, min_episodes
 from sb3_tdpg.problem import read_problem
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.evaluation.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
 from sb3_tdpg.information.base import InformationBatch
-from sb3_tdpg.measurement.interval import LOWER_BOUNDS, InformationInterval, information_interval, normal_quantile
 
 NEAR_THE_CAP = 0.9  # share of ln N
 FALSE_ALARM = 0.01  # probability that a check of a sound interval fails, over all time steps
@@ -86,7 +86,7 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
     steps together.
 
     :param batch: The rollouts ``(T, N, ...)`` of the interval.
-    :param interval: The result of :func:`~sb3_tdpg.measurement.information_interval`; computed if not given.
+    :param interval: The result of :func:`~sb3_tdpg.evaluation.information_interval`; computed if not given.
     :param seed: Seed of the shuffling and of the intervals.
     :raises ValueError: if no time step has enough episodes.
     """
