@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 TREE = ROOT / "build" / "mutants"
 GOAL = 0.9
 CODE = [
-    "losses.py", "advantages.py", "auto_weight.py", "buffers.py", "features.py", "episodic.py", "tdpg.py",
-    "information/*.py", "robustness/nuisance.py", "evaluation/interval.py", "evaluation/interval_bounds.py",
+    "losses.py", "advantages.py", "auto_weight.py", "buffers.py", "features.py", "running_norms.py", "episodic.py",
+    "tdpg.py", "information/*.py", "robustness/nuisance.py", "evaluation/interval.py", "evaluation/interval_bounds.py",
     "certificates/certificate.py", "certificates/nuisance.py", "certificates/shifts.py", "envs/*.py",
 ]  # fmt: skip
 # What people look at; and the table of scenarios, which is read with the module, before a change is switched on.
@@ -37,8 +37,9 @@ LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|show_window|_figure__")
 TESTS = [
     "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
     "test_passes.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py", "test_episodic.py",
-    "test_features.py", "test_nuisance.py", "information", "robustness/test_nuisance_members.py",
-    "evaluation/test_interval.py", "evaluation/test_interval_bounds.py", "evaluation/test_trust_badge.py",
+    "test_running_norms.py", "test_pooling.py", "test_nuisance.py", "information",
+    "robustness/test_nuisance_members.py",    "evaluation/test_interval.py",
+    "evaluation/test_interval_bounds.py", "evaluation/test_trust_badge.py",
     "certificates", "envs",
 ]  # fmt: skip
 SETTINGS = """

@@ -1,0 +1,148 @@
+"""Running statistics of what was seen in training, and what they standardise: observations and their changes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_tdpg.features import observation_kind
+
+
+class RunningNorm(nn.Module):
+    """
+    Standardise vectors by the mean and the standard deviation of all that were seen, as SB3's ``VecNormalize``.
+
+    The statistics are saved with the network. They change only in :meth:`update`, so that an epoch's rollouts and its
+    gradients see the same inputs.
+
+    :param dim: Number of components.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", th.zeros(dim))
+        self.register_buffer("var", th.ones(dim))
+        self.register_buffer("count", th.tensor(1e-4))
+
+    mean: th.Tensor
+    var: th.Tensor
+    count: th.Tensor
+
+    @th.no_grad()
+    def update(self, x: th.Tensor) -> None:
+        """Include a batch, ``(n, dim)``, with n of at least 1."""
+        n, var, mean = len(x), *th.var_mean(x, dim=0, correction=0)
+        total, shift = self.count + n, mean - self.mean
+        self.var.copy_((self.count * self.var + n * var + shift.square() * self.count * n / total) / total)
+        self.mean.add_(shift * n / total)
+        self.count.copy_(total)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """``(..., dim) -> (..., dim)``, clipped to [-10, 10]."""
+        return ((x - self.mean) / th.sqrt(self.var + 1e-8)).clamp(-10.0, 10.0)
+
+
+class Changes(nn.Module):
+    """
+    The standardised change of each component since the last step, as far as it says what the components do not.
+
+    Where the velocities of a system are hidden, its last change says how it will go on changing; where they are
+    observed, it does not, and would only be noise. Two predictions of the next change measure this: one from the
+    components and their products, one from the last change as well. The change of a component is multiplied by the
+    share of the variance of its next change that the second explains and the first does not.
+
+    :param dim: F
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.norm = RunningNorm(dim)
+        self.register_buffer("share", th.zeros(dim))
+        self.register_buffer("n_updates", th.zeros(()))
+
+    share: th.Tensor
+    n_updates: th.Tensor
+
+    def forward(self, x: th.Tensor, before: th.Tensor) -> th.Tensor:
+        """``(..., F)`` of this step and of the one before ``-> (..., F)``, clipped to [-10, 10]."""
+        return ((x - before) * self.share / th.sqrt(self.norm.var + 1e-8)).clamp(-10.0, 10.0)
+
+    @th.no_grad()
+    def update(self, x: th.Tensor, alive: th.Tensor) -> None:
+        """
+        Include an epoch: ``share`` becomes the mean over the epochs.
+
+        :param x: ``(T, N, F)``
+        :param alive: ``(T, N)``
+        """
+        # Episode by episode, so that the two halves are of different episodes, or of different parts of one.
+        x, alive = x.transpose(0, 1).double(), alive.transpose(0, 1).bool()
+        changes = x[:, 1:] - x[:, :-1]
+        if not alive[:, 1:].any():
+            return
+        self.norm.update(changes[alive[:, 1:]].float())
+        now, last, following = (y[alive[:, 2:]] for y in (x[:, 1:-1], changes[:, :-1], changes[:, 1:]))
+        half, dim = len(now) // 2, now.shape[1]
+        if half > 4 * (dim + dim * (dim + 1) // 2):  # otherwise a linear prediction has to do
+            now = th.cat([now, _products(now)], dim=1)
+        if half > 4 * dim:
+            alone, together = (_unexplained(inputs, following, half) for inputs in (now, th.cat([now, last], dim=1)))
+            variance = following[half:].var(0).clamp(min=1e-12)
+            share = ((alone - together) / variance).clamp(0.0, 1.0).float()
+            self.n_updates += 1
+            self.share += (share - self.share) / self.n_updates
+
+
+def _products(x: th.Tensor) -> th.Tensor:
+    """Multiply the standardised components with each other: ``(n, F) -> (n, F (F + 1) / 2)``."""
+    x = (x - x.mean(0)) / x.std(0).clamp(min=1e-6)
+    i, j = th.triu_indices(x.shape[1], x.shape[1])
+    return x[:, i] * x[:, j]
+
+
+def _unexplained(inputs: th.Tensor, targets: th.Tensor, half: int) -> th.Tensor:
+    """Fit a linear prediction to the first samples; return its mean squared error on the others, ``(F,)``."""
+    inputs = (inputs - inputs.mean(0)) / inputs.std(0).clamp(min=1e-6)
+    inputs = th.cat([inputs, th.ones_like(inputs[:, :1])], dim=1)
+    fit, test = inputs[:half], inputs[half:]
+    ridge = 0.1 * th.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
+    coefficients = th.linalg.solve(fit.T @ fit + ridge, fit.T @ targets[:half])
+    return (targets[half:] - test @ coefficients).square().mean(0)
+
+
+class ObservationNorm(nn.Module):
+    """
+    A :class:`RunningNorm` for each vector of an observation; images and one-hot inputs pass through.
+
+    :param space: The observation space, which may be a ``Dict``.
+    """
+
+    def __init__(self, space: spaces.Space) -> None:
+        super().__init__()
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        vectors = {k: x for k, x in parts.items() if isinstance(x, spaces.Box) and observation_kind(x) == "vector"}
+        self.norms = nn.ModuleDict({key: RunningNorm(math.prod(x.shape)) for key, x in vectors.items()})
+
+    def forward(self, observation: Any) -> Any:
+        """``(n, *obs) -> (n, *obs)``, or a dict of such."""
+        if isinstance(observation, dict):
+            return {key: self._standardized(x, key) for key, x in observation.items()}
+        return self._standardized(observation, "observation")
+
+    def _standardized(self, x: th.Tensor, key: str) -> th.Tensor:
+        return self.norms[key](x.flatten(1).float()).view(x.shape) if key in self.norms else x
+
+    def update(self, observations: Any, alive: th.Tensor) -> None:
+        """
+        Include an epoch's observations.
+
+        :param observations: ``(T, N, *obs)``, or a dict of such
+        :param alive: ``(T, N)``
+        """
+        for key, norm in self.norms.items():
+            x = observations[key] if isinstance(observations, dict) else observations
+            cast(RunningNorm, norm).update(x[alive.bool()].flatten(1).float())
