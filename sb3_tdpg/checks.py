@@ -20,13 +20,8 @@ from sb3_tdpg.auto_weight import share_of
 from sb3_tdpg.information import get_estimator_class
 
 ENCODER_GRADIENTS = ("score", "pathwise")
-
-
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-
-
 MIN_BATCH_STEPS = 32  # the information of a minibatch is that of as many samples
-
 
 # What users of PPO and RecurrentPPO look for, and what it is here.
 OF_PPO = dict(

@@ -44,45 +44,37 @@ class TRVPolicy(BasePolicy):
     ``predict`` takes and returns the memory as ``state=(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the index of the
     next time step, ``(n_envs,)``.
 
-    Four defaults are for the presets "vector", "image" (uint8), "depth" (images of floats) and "long" (vectors over a
-    long horizon, see :mod:`sb3_tdpg.presets`). The network sizes of "vector" and "depth" are the paper's; the preset
-    "paper" has those of its ball catching.
+    The defaults depend on the preset: "vector", "image" (uint8), "depth" (images of floats) or "long" (vectors over a
+    long horizon), see the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The network sizes
+    of "vector" and "depth" are the paper's; the preset "paper" has those of its ball catching.
 
     :param observation_space: A vector, or an image with channels first.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: Number of time steps T; the algorithm passes the environment's.
     :param preset: Which defaults to use; the algorithm passes that of the problem. ``None``: by the observation alone.
-    :param trv_dim: Number of TRVs Z; default: 2, 32, 16, and as many more than the features as
-        there are, but at least 16.
-    :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``; default: ``[64, 64]`` and ``[64, 64]``,
-        ``[32]`` and none, ``[128, 64]`` and ``[64, 64]``, ``[64, 64]`` and ``[64, 64]``.
-    :param activation_fn: Nonlinearity of the hidden layers; default: ELU, tanh, tanh (encoder) and ELU (head), tanh.
-    :param time_varying: Whether each time step has its own weights; default: up to a horizon of 50, but not with the
-        presets "image" and "long". The feature extractor is always shared.
+    :param trv_dim: Number of TRVs Z.
+    :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``.
+    :param activation_fn: Nonlinearity of the hidden layers.
+    :param time_varying: Whether each time step has its own weights. The feature extractor is always shared.
     :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
-        store an observation before the action head can use it; default: no, no, no, yes if there are enough TRVs.
+        store an observation before the action head can use it.
     :param skip_changes: Whether the next TRVs get the change of the features since the last step, as far as it says
-        what the features do not (:class:`~sb3_tdpg.running_norms.Changes`): hidden velocities. Default: as
-        for ``skip``.
+        what the features do not (:class:`~sb3_tdpg.running_norms.Changes`): hidden velocities.
     :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all that
-        were seen in training, as by SB3's ``VecNormalize``; default: no, no, no, yes.
+        were seen in training, as by SB3's ``VecNormalize``.
     :param scale_actions: Whether the head's outputs are in units of the bounds of the action space: 0 is their middle,
-        1 the upper one, and a standard deviation of 1 half of their distance; default: no, no, no, yes.
+        1 the upper one, and a standard deviation of 1 half of their distance.
     :param shared_action_noise: Whether the variance of each action is one parameter, as in SB3's PPO, instead of an
-        output of the head, which depends on the TRVs (Box actions); default: no, no, no, yes.
+        output of the head, which depends on the TRVs (Box actions).
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
-        Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen. Default: yes,
-        yes, yes, no.
+        Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen.
     :param gate: Whether a gate g in [0, 1] for each TRV, another output of the encoder, decides how much of the last
         TRVs is kept, as the update gate of a GRU: ``mean = g * candidate + (1 - g) * last TRVs``, where the candidate
-        is the mean without a gate. The policy then remembers over many steps. Not with ``skip``. Default: no, yes, no,
-        no.
-    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0; default: 0, -3, -3,
-        -10.
-    :param action_log_var_init: The same for the action head (Box actions); default: 0, -1, -2, -2.
-    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above; default:
-        1e-3, 1e-3, 1e-3, 1e-5.
+        is the mean without a gate. The policy then remembers over many steps. Not with ``skip``.
+    :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0.
+    :param action_log_var_init: The same for the action head (Box actions).
+    :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
     :param action_var_floor: Smallest variance of an action, likewise.
     :param features_extractor_class: Network in front of the encoder; default: flatten for vectors,
         :class:`~sb3_tdpg.features.TRVCnn` for images.

@@ -15,8 +15,6 @@ from sb3_tdpg.features import TRVCnn, observation_kind
 
 # From this horizon on the problem is an ordinary one of reinforcement learning, and no longer one of the paper's kind.
 LONG_HORIZON = 50
-
-
 EPOCH_STEPS = 2000
 
 
@@ -60,7 +58,6 @@ VECTOR = Defaults(
     gae_lambda=0.3,  # with 0.95 lava stays in bad open loops
 )
 
-
 # Images are expensive: PPO's passes over few episodes, and the gradient with the least variance. A policy that has not
 # learnt costs a hundred times as much as one that has, so that 95 % of the improvement would be a bad policy.
 IMAGE = Defaults(
@@ -80,10 +77,8 @@ IMAGE = Defaults(
     baseline="value",
 )
 
-
 # Depth images come from environments that simulate each trial: even more expensive.
 DEPTH = IMAGE._replace(share="95%", n_episodes=400, batch_size=200, total_epochs=100, baseline="regression")
-
 
 # Ordinary environments: PPO's update, with minibatches of short segments and a value network.
 LONG = Defaults(
@@ -104,7 +99,6 @@ LONG = Defaults(
     gamma=None,
     max_grad_norm=0.5,
 )
-
 
 DEFAULTS = dict(vector=VECTOR, image=IMAGE, depth=DEPTH, long=LONG)
 
@@ -132,7 +126,6 @@ class PolicyDefaults(NamedTuple):
 IMAGE_ENCODER = dict(
     pool=2, layers=((16, 4, 2), (32, 4, 2), (32, 3, 1)), activation_fn=nn.ReLU, features_dim=256, layer_norm=True
 )
-
 
 # Images start with narrow TRVs: training with wide ones takes twice as long.
 POLICY_DEFAULTS = dict(

@@ -68,43 +68,41 @@ class TDPG(EpisodicAlgorithm):
     the true state as ``info["state"]`` in ``reset`` and ``step`` and describes it by an attribute ``state_space``.
     Without these, a vector observation stands in for the state.
 
-    Three defaults are for vectors, images, and vectors over a horizon of 50 or more. Depth images (floats) differ in a
-    few more; :mod:`sb3_tdpg.presets` has all defaults.
+    Most defaults depend on the problem: a vector, an image, a depth image (floats), or a vector over a horizon of 50 or
+    more. See the table in "TDPG: Defaults" of the documentation, made from :mod:`sb3_tdpg.presets`.
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``.
     :param beta: Weight of the cost against the information: a positive number or a function of the remaining progress
         (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
-        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default: ``"auto"`` with a ``cost_limit``; else 1/75, auto, inf.
+        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default with a ``cost_limit``: ``"auto"``.
     :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training to keep,
-        ``"90%"``; default: ``"95%"``, for images of bytes ``"99.8%"``.
+        ``"90%"``.
     :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
-        linearly; default: ``"lin_2e-3_2e-5"``, ``"lin_1e-3_5e-5"``, ``"lin_1e-3_1e-4"``.
-    :param n_episodes: Episodes N of a policy epoch; default: 500, 160, none.
-    :param epoch_steps: Steps of a policy epoch instead: no episode begins after that many; default: none, none, 2000.
+        linearly.
+    :param n_episodes: Episodes N of a policy epoch.
+    :param epoch_steps: Steps of a policy epoch instead: no episode begins after that many.
     :param n_envs: Number of environments to make from an id; default: see :func:`~sb3_tdpg.make_episodes_env`.
     :param mi_estimator: A name in :data:`sb3_tdpg.information.ESTIMATORS` or a subclass of
-        :class:`~sb3_tdpg.information.InformationEstimator`; default: ``"logdet"``.
+        :class:`~sb3_tdpg.information.InformationEstimator`.
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: Variance reduction of the gradient. ``"regression"``: subtract a regression of the cost-to-go on
         the true state at each step; ``"value"``: a network of the true state and the time left
         (:class:`~sb3_tdpg.advantages.ValueFunction`); ``"mean"``: the batch mean of the episode cost, as in the paper.
-        Default: regression, value, value; for depth images regression.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper;
         ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both are unbiased; the second
-        has less variance. Default: score, pathwise, pathwise.
+        has less variance.
     :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons; the time
-        steps must share their weights (``time_varying=False``). Default: none (whole episodes), none, 5.
-    :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO; default: 1, 4, 10.
-    :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own; default:
-        all, 40 episodes, 250 steps.
-    :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping. Default: inf, 0.2, 0.2.
+        steps must share their weights (``time_varying=False``). ``None``: whole episodes.
+    :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO.
+    :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own.
+    :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
-        deviation, so that ``beta`` keeps its meaning. Default: no, yes, yes.
-    :param gamma: Discount factor; the paper has none. Default: 1, 1, and 1 - 8 / T between 0.9 and 0.995.
+        deviation, so that ``beta`` keeps its meaning.
+    :param gamma: Discount factor; the paper has none.
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
-        the next state; unused with ``baseline="mean"``. Default: 0.3, 0.95, 0.95.
-    :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping; default: inf, inf, 0.5.
+        the next state; unused with ``baseline="mean"``.
+    :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping.
     :param nuisance: A declared family of changes of the sensor, that the policy is to ignore. ``"auto"``: random
         colours, patterns, contrasts and noise for images, nothing for vectors. ``None``: nothing. A dict of
         perturbations and severities, a function, ...: see :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`.

@@ -259,3 +259,11 @@ def test_no_latex_label_of_the_paper_is_cited(folder):
     label = re.compile(r"\b(eq|alg|thm|tab|fig|ssec):(?=[a-zA-Z])")
     cited = [path for path in paths if path != Path(__file__) and label.search(path.read_text(encoding="utf-8"))]
     assert not cited
+
+
+def test_the_table_of_defaults_is_that_of_the_presets():
+    spec = importlib.util.spec_from_file_location("make_defaults", ROOT / "docs" / "make_defaults.py")
+    make_defaults = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_defaults)
+    assert make_defaults.page() == make_defaults.PAGE.read_text(encoding="utf-8"), "run python docs/make_defaults.py"
+    assert "| `gae_lambda` | 0.3 | 0.95 | 0.95 | 0.95 |" in make_defaults.page()
