@@ -13,10 +13,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_tdpg.certificates.lava import certificate_figure
 from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS, LAVA, PANDA_GRASP, PANDA_GRASP_CAMERA
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.figures import PALETTE
+from sb3_tdpg.paper.certificates import certificate_figure
 from sb3_tdpg.paper.figures import diagnosis_bars, failures_by_camera, failures_by_yaw, robustness_curves
 
 RESULTS = Path(__file__).parent / "results"

@@ -132,8 +132,8 @@ def _certify(
     models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, nuisance: str | None, n_members: int,
     **options: Any,
 ) -> None:  # fmt: skip
-    from sb3_tdpg.certificates.lava import certify_lava
     from sb3_tdpg.certificates.nuisance import certify_nuisance
+    from sb3_tdpg.paper.certificates import certify_lava
 
     say_what_is_trusted(*models)
     if nuisance is not None:

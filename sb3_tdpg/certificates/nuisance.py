@@ -11,9 +11,8 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.lava import wall_cost
 from sb3_tdpg.certificates.models import load_models
-from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes
+from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, wall_cost
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config

@@ -31,6 +31,7 @@ from sb3_tdpg.certificates.certificate import (
     worst_mean,
 )
 from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
@@ -114,6 +115,11 @@ def gaussian_kl(bias: np.ndarray, std: float, training_std: float) -> float:
 def beta_kl(a: float, b: float) -> float:
     """Compute D[Beta(a, b) || uniform] in nats."""
     return float(-betaln(a, b) + (a - 1) * digamma(a) + (b - 1) * digamma(b) - (a + b - 2) * digamma(a + b))
+
+
+def wall_cost(horizon: int) -> float:
+    """Return the cost of standing at the wall for a whole episode, the worst place, in both cost definitions."""
+    return (horizon + 100.0) * float(GOAL[0] - WALL)
 
 
 def lava_shift(

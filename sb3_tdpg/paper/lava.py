@@ -7,7 +7,6 @@ from typing import Any
 
 import pandas as pd
 
-from sb3_tdpg.certificates.lava import PAPER_INVERSE_BETAS
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically, write_run_config
@@ -22,6 +21,7 @@ from sb3_tdpg.evaluation import (
     training_curves,
 )
 from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
+from sb3_tdpg.paper.certificates import PAPER_INVERSE_BETAS
 from sb3_tdpg.paper.common import RECORD_COLUMNS, Options, folders_of, met, read_records, write_results
 from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG

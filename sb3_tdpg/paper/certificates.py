@@ -13,12 +13,11 @@ import pandas as pd
 from tqdm import tqdm
 
 from sb3_tdpg.certificates.models import load_models
-from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts
+from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts, wall_cost
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, legend_above, log_axis, new_panels
@@ -30,11 +29,6 @@ PAPER_INVERSE_BETAS = (25, 50, 75, 100)
 # Recorded episodes for the divergence: in the paper's rows, and in each of many random shifts.
 N_BUDGET_EPISODES = 100_000
 N_RANDOM_BUDGET_EPISODES = 20_000
-
-
-def wall_cost(horizon: int) -> float:
-    """Return the cost of standing at the wall for a whole episode, the worst place, in both cost definitions."""
-    return (horizon + 100.0) * float(GOAL[0] - WALL)
 
 
 def certify_lava(
