@@ -84,18 +84,22 @@ def squeeze_insert(path: Path) -> None:
 
 
 def panda_squeeze(path: Path) -> None:
-    """Draw the Panda before a squeeze, and its closed jaws on a part along them, across them and jammed."""
+    """Animate an episode without looking: two squeezes across the slot and two along it, then the insertion."""
     env = PandaSqueezeEnv(render_mode="rgb_array")
-    pictures = []
-    for yaw in np.deg2rad([40.0, 85.0, 72.0]):
-        env.reset(seed=0)
-        env._state = np.array([[np.sin(2 * yaw), np.cos(2 * yaw)]])
-        if not pictures:
-            pictures.append(env.render())
-        env.step(np.zeros(1))
-        pictures.append(env.render())
+    env.reset(seed=0)
+    env._state = env._with_yaw(np.array([np.radians(-70.0)]), np.empty((1, 0)))
+    frames, durations = [env.render()], [800]  # ms
+    for jaws in (45.0, 55.0, 0.0, 0.0):
+        env.step(np.radians([jaws]))
+        shown = list(env.film())[::3]
+        frames += shown
+        durations += [100] * len(shown)
+    frames.append(env.render())
+    durations.append(2000)
     env.close()
-    Image.fromarray(side_by_side(pictures)).save(path, optimize=True)
+    palette = Image.fromarray(np.concatenate(frames[::8])).quantize(96, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
 
 
 def peg_corner(path: Path) -> None:
@@ -258,7 +262,7 @@ if __name__ == "__main__":
     folder = Path(__file__).parent / "environments"
     lava(folder / "lava.gif")
     squeeze_insert(folder / "squeeze_insert.gif")
-    panda_squeeze(folder / "panda_squeeze.png")
+    panda_squeeze(folder / "panda_squeeze.gif")
     peg_corner(folder / "peg_corner.gif")
     ball_textures(folder / "ball_textures.png")
     ball_camera(folder / "ball_camera.png")

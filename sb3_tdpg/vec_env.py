@@ -191,7 +191,7 @@ def make_episodes_env(
     :param epoch_steps: Steps per epoch, instead; then at most 10 environments by default.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether PandaGrasp uses one process per core, with the same numbers as without.
+    :param use_processes: Whether the Panda environments use one process per core, with the same numbers as without.
     :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
     :raises gymnasium.error.Error: if the id is not registered.
     """

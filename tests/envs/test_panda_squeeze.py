@@ -1,22 +1,25 @@
-"""The squeeze in PyBullet: where parts end, that nothing else matters, and the interface of SqueezeInsert-v0."""
+"""Squeezing with the simulated arm: the funnel, the slot, and that nothing but state and action matters."""
 
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE
+from sb3_tdpg.envs.squeeze_bullet import Inserted
+from sb3_tdpg.envs.squeeze_fit import fit_angles, fit_squeeze
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv, wrap
+from sb3_tdpg.envs.squeeze_scene import PART, SqueezeScene
 
 DEGREE = math.pi / 180
 
 
 @pytest.fixture(scope="module")
 def env():
-    """For tests that need no fresh environment: outcomes do not depend on the squeezes before."""
-    env = PandaSqueezeEnv(sensor_noise_std=0.0)
+    """One environment for all tests: outcomes do not depend on the squeezes before."""
+    env = PandaSqueezeEnv()
     env.reset(seed=0)
     yield env
     env.close()
@@ -28,150 +31,273 @@ def parts(*yaws):
     return np.column_stack([np.sin(2 * yaw), np.cos(2 * yaw)])
 
 
-def squeeze(env, yaws, *fingers):
-    """Squeeze parts with jaws of the given yaws, all in degrees; return the yaws of the parts."""
-    state = parts(*yaws)
-    for yaw in fingers:
-        state = env.dynamics(state, np.full((len(state), 1), yaw * DEGREE))
-    return env.yaw(state) / DEGREE
+def squeeze(env, state, jaws):
+    """Angles between parts and jaws in degrees after a squeeze; the yaws of the jaws are in degrees."""
+    jaws = np.broadcast_to(jaws, len(state)) * DEGREE
+    return wrap(env.yaw(env.dynamics(state, jaws[:, None])) - jaws) / DEGREE
 
 
-def between(yaw, other):
-    """Angles in degrees between rectangles of two yaws."""
-    return np.abs(wrap((np.asarray(yaw) - other) * DEGREE)) / DEGREE
+def episode(env, *jaws):
+    """The infos of an episode whose jaws have the given yaws in degrees."""
+    return [env.step(np.array([yaw * DEGREE]))[4] for yaw in jaws]
 
 
-# -- one squeeze -----------------------------------------------------------------------------------------------------
+# -- the funnel ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("hand", [0.0, 50.0, -120.0, 180.0])
-def test_a_part_within_the_basin_ends_aligned(env, hand):
-    ends = squeeze(env, hand + np.array([-65.0, -40.0, -5.0, 0.0, 20.0, 65.0]), hand)
-    assert between(ends, hand).max() < 0.5
-    assert all(more["jaw_gap"] == pytest.approx(0.026, abs=1e-3) for more in env._details)
+def test_a_part_within_the_basin_turns_to_the_jaws_for_any_yaw_of_the_hand(env):
+    away = np.array([-60.0, -45.0, -20.0, 0.0, 10.0, 30.0, 50.0, 60.0])
+    for jaws in (-180.0, -130.0, -90.0, -45.0, 0.0, 46.0, 89.0, 135.0):
+        assert np.abs(squeeze(env, parts(*(jaws + away)), jaws)).max() < 1.0
 
 
-@pytest.mark.parametrize("hand", [0.0, 50.0])
-def test_a_part_far_outside_the_basin_ends_across(env, hand):
-    assert between(squeeze(env, hand + np.array([-80.0, 80.0, 88.0]), hand), hand).min() > 89.5
-    assert all(more["jaw_gap"] == pytest.approx(0.08, abs=1e-3) for more in env._details)
+def test_a_part_far_outside_the_basin_turns_across_the_jaws(env):
+    away = np.array([-89.0, -80.0, -72.0, 72.0, 80.0, 89.0])
+    for jaws in (-100.0, 0.0, 45.0):
+        assert np.abs(squeeze(env, parts(*(jaws + away)), jaws)).min() > 89.0
 
 
-def test_a_part_whose_diagonal_is_nearly_across_the_jaws_jams_and_stays(env):
-    yaws = np.array([-74.0, 72.0, 69.0])
-    np.testing.assert_allclose(squeeze(env, yaws, 0.0), yaws, atol=0.5)
-    assert all(more["jaw_gap"] > 0.083 for more in env._details)
-    assert np.abs(squeeze(env, yaws, 45.0, 0.0)).max() < 0.5  # not from another side
+def test_friction_holds_a_part_whose_diagonal_is_across_the_jaws_and_without_friction_it_turns(env):
+    diagonal = 90.0 - math.atan2(PART[1], PART[0]) / DEGREE
+    np.testing.assert_allclose(squeeze(env, parts(diagonal, -diagonal), 0.0), [diagonal, -diagonal], atol=1.0)
+    smooth = PandaSqueezeEnv(friction=0.0)
+    smooth.reset(seed=0)
+    left = squeeze(smooth, parts(diagonal - 1.0, 1.0 - diagonal, diagonal + 3.0, -diagonal - 3.0), 0.0)
+    np.testing.assert_allclose(np.abs(left), [0.0, 0.0, 90.0, 90.0], atol=1.0)
+    smooth.close()
 
 
-@pytest.mark.parametrize(("friction", "aligned", "stays"), [(0.0, 70.0, None), (0.4, 48.0, 55.0)])
-def test_friction_decides_what_jams(friction, aligned, stays):
-    env = PandaSqueezeEnv(friction=friction)
-    assert abs(squeeze(env, [aligned], 0.0)[0]) < 0.5
-    if stays is None:
-        assert between(squeeze(env, [74.0], 0.0), 0.0)[0] > 89.5
-    else:
-        assert squeeze(env, [stays], 0.0)[0] == pytest.approx(stays, abs=0.5)
+def test_a_squeeze_also_centres_the_part_and_leaves_it_flat_on_the_table(env):
+    env.dynamics(parts(0.0, 30.0, -50.0, 80.0), np.zeros((4, 1)))
+    for more in env._details:
+        assert abs(more["offset"][1]) < 1e-3  # across the jaws
+        assert abs(more["offset"][0]) < 1e-2
+        assert more["tilt"] < 0.01
+
+
+def test_the_jaws_are_longer_than_the_part_and_open_by_77_millimetres(env):
+    simulation = env._simulation
+    simulation._put_part((0.0, 2.0, 0.5), 0.0)  # out of the way
+    simulation._put_arm(simulation._low)
+    for along in (-0.044, -0.035, 0.0, 0.035, 0.044):
+        for side in (-1, 1):
+            start, end = (0.5 + along, 0.0, 0.02), (0.5 + along, side * 0.1, 0.02)
+            body, _, _, position, _ = simulation.client.rayTest(start, end)[0]
+            assert body == simulation._robot
+            assert position[1] == pytest.approx(side * 0.0385, abs=1e-4)
+
+
+def test_the_part_lies_off_the_middle_of_the_hand_by_the_centring_error():
+    env = PandaSqueezeEnv(centring_error=0.003)
+    env.reset(seed=0)
+    # Parts that lie along the jaws slide across them only: along them the offset stays.
+    env.dynamics(parts(*[0.0] * 40), np.zeros((40, 1)))
+    along = np.array([more["offset"][0] for more in env._details])
+    assert 0.0023 < np.abs(along).max() < 0.0035
+    assert along.std() == pytest.approx(0.003 / math.sqrt(3), rel=0.25)
     env.close()
 
 
-def test_the_fitted_model_agrees_outside_the_jam(env):
-    model = SqueezeInsertEnv(**PANDA_SQUEEZE)
+def test_the_fit_of_the_batched_model_holds(env):
+    fit = fit_squeeze(env, n=72)
+    np.testing.assert_allclose(fit.turn, PANDA_SQUEEZE["turn"], atol=0.003)
+    assert fit.basin == pytest.approx(PANDA_SQUEEZE["basin"], abs=2 * DEGREE)
+    assert fit.aligned_up_to < fit.across_from
+    assert fit.residual < 0.5 * DEGREE
+    assert 0.02 < fit.stuck < 0.09
+    SqueezeInsertEnv(**PANDA_SQUEEZE)
+
+
+def test_the_fit_finds_the_keywords_of_the_batched_model():
+    model = SqueezeInsertEnv(turn=(0.96, 1.0), basin=50 * DEGREE)
     model.reset(seed=0)
-    yaws = np.array([-88.0, -79.0, -66.0, -30.0, 10.0, 50.0, 66.0, 79.0])
-    assert between(squeeze(env, yaws, 0.0), squeeze(model, yaws, 0.0)).max() < 1.0
+    away = (np.arange(4000) + 0.5) / 4000 * math.pi - math.pi / 2
+    fit = fit_angles(away, model.yaw(model.dynamics(parts(*(away / DEGREE)), np.zeros((4000, 1)))))
+    np.testing.assert_allclose(fit.turn, (0.962, 0.998), atol=1e-3)  # 5 % and 95 % of the range
+    assert fit.basin / DEGREE == pytest.approx(50.0, abs=0.1)
+    assert fit.stuck == 0.0
+    # A uniform share of 4 % has a standard deviation of 4 % / sqrt(12); the ways are between 0 and 50 degrees.
+    assert fit.residual / DEGREE == pytest.approx(0.04 / math.sqrt(12) * 27.0, rel=0.1)
+    with pytest.raises(ValueError, match="there is nothing to fit"):
+        fit_angles(away, away * 0.0)
 
 
 # -- episodes --------------------------------------------------------------------------------------------------------
 
 
-def test_squeezing_aslant_and_then_along_inserts_every_part_without_looking(env):
-    ends = squeeze(env, np.arange(-88.0, 90.0, 8.0), -50.0, 0.0)
-    assert np.abs(ends).max() < 0.5
+@pytest.mark.parametrize("yaw", [-80.0, -25.0, 20.0, 65.0])
+def test_squeezing_without_looking_inserts_the_part(env, yaw):
+    env.reset(seed=1)
+    env._state = parts(yaw)
+    infos = episode(env, 45.0, 55.0, 0.0, 0.0)
+    assert infos[-1]["success"] and infos[-1]["is_success"]
+    assert infos[-1]["height"] < 0.003
+    assert set(infos[-2]) == {"state", "cost", "offset", "tilt"}
+    assert set(infos[-1]) == {"state", "cost", "offset", "tilt", "success", "is_success", "height"}
 
 
-def test_the_costs_are_those_of_the_model(env):
-    state, action = parts(40.0, -88.0), np.array([[0.2], [0.1]])
-    model = SqueezeInsertEnv()
+def test_a_part_across_the_slot_is_not_inserted(env):
+    env.reset(seed=1)
+    env._state = parts(80.0)
+    info = episode(env, 0.0, 0.0, 0.0, 0.0)[-1]
+    assert not info["success"] and not info["is_success"]
+    assert info["height"] > 0.015
+    assert info["cost"] > 100 * (89 * DEGREE - 0.05)
+
+
+def test_the_cost_is_the_batched_model_s_of_the_engine_s_yaw(env):
+    state = parts(40.0, 2.0)
     for is_last in (False, True):
-        step = env.step_batch(state, action, is_last=is_last)
-        by_hand = 5 * np.array([40.0, 88.0]) * DEGREE
-        if is_last:
-            by_hand = by_hand + 100 * np.maximum(0.0, np.abs(env.yaw(step.state)) - 0.05)
-        np.testing.assert_allclose(step.cost, by_hand)
-        np.testing.assert_allclose(step.cost, model.cost(state, action) + is_last * model.terminal_cost(step.state))
-    assert env.yaw(step.state) == pytest.approx([0.2, wrap(np.array(0.1 + math.pi / 2))], abs=0.01)
+        step = env.step_batch(state, np.array([[20 * DEGREE], [0.02]]), is_last=is_last)
+        error = np.abs(env.yaw(step.state))
+        terminal = 100 * np.maximum(0.0, error - 0.05)
+        assert (terminal > 0).tolist() == [True, False]
+        np.testing.assert_allclose(step.cost, 5 * np.array([40.0, 2.0]) * DEGREE + is_last * terminal)
 
 
-def test_the_info_says_whether_the_part_fits(env):
-    step = env.step_batch(parts(40.0, 40.0), np.array([[0.03], [0.2]]), is_last=True)
-    assert [more["success"] for more in step.details] == [more["is_success"] for more in step.details] == [True, False]
-    np.testing.assert_array_equal([more["yaw_error"] for more in step.details], env.error(step.state))
-
-
-def test_the_spaces_are_those_of_the_model(env):
+def test_a_policy_for_the_batched_model_fits_this_environment(env):
     model = SqueezeInsertEnv()
     for name in ("observation_space", "action_space", "state_space", "state_names", "horizon", "tolerance"):
         assert getattr(env, name) == getattr(model, name)
 
 
-def test_an_episode_repeats_from_its_seed_whatever_was_squeezed_before(env):
-    def episode(env):
-        observation, _ = env.reset(seed=5)
-        steps = [env.step(np.array([u])) for u in (0.9, -0.4, 2.0, 0.0)]
-        assert [step[2] for step in steps] == [False, False, False, True]
-        return np.array([observation, *(step[0] for step in steps)])
-
-    first = episode(env)
-    squeeze(env, [71.0, 20.0], 33.0)
-    np.testing.assert_array_equal(episode(env), first)
-    fresh = gym.make("PandaSqueeze-v0", sensor_noise_std=0.0)
-    np.testing.assert_array_equal(episode(fresh.unwrapped), first)
-    fresh.close()
-
-
-def test_the_picture_shows_the_hand_come_down_and_close():
+@pytest.mark.filterwarnings("ignore:.*Box (action|observation) space")
+def test_the_checker_finds_nothing():
     env = PandaSqueezeEnv(render_mode="rgb_array")
-    with pytest.raises(ValueError, match="nothing to render before the first reset"):
-        env.render()
-    env.reset(seed=3)
-    before = env.render()
-    env.step(np.zeros(1))
-    after = env.render()
-    assert before.shape == after.shape == (240, 320, 3)
-    assert before.dtype == np.uint8
-    assert (before != after).any(-1).mean() > 0.1
-    orange = [((p[..., 0] > 130) & (p[..., 2] < 0.4 * p[..., 0])).sum() for p in (before, after)]
-    assert orange[0] > orange[1] > 50  # the jaws hide a part of it
+    check_env(env, skip_render_check=True)
     env.close()
-    assert PandaSqueezeEnv().render() is None
+
+
+# -- the slot --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tolerance", [0.02, 0.05, 0.1])
+def test_the_slot_forgives_its_tolerance_and_no_more(tolerance):
+    env = PandaSqueezeEnv(tolerance=tolerance)
+    angles = tolerance * np.array([-1.3, -1.1, -0.95, -0.5, 0.0, 0.5, 0.95, 1.1, 1.3])
+    inserted = [outcome.success for outcome in env._simulation.inserts(angles)]
+    assert inserted == (np.abs(angles) < tolerance).tolist()
+    env.close()
+
+
+def test_the_corners_of_a_part_turned_by_the_tolerance_meet_the_edge_of_the_chamfer():
+    for tolerance in (0.03, 0.05, 0.2):
+        boxes = SqueezeScene(0.05, tolerance).slot_boxes()
+        # The high wall of a long side begins where the chamfer ends.
+        edge = min(abs(box["position"][1]) - box["half_extents"][1] for box in boxes if is_high_long_wall(box))
+        corner = complex(PART[0] / 2, PART[1] / 2) * complex(math.cos(tolerance), math.sin(tolerance))
+        assert edge == pytest.approx(corner.imag)
+
+
+def is_high_long_wall(box):
+    return box["position"][1] != 0 and box["euler"] == (0.0, 0.0, 0.0) and box["half_extents"][2] == 0.01
+
+
+def test_a_part_is_inserted_below_three_millimetres():
+    assert [Inserted(height, 0.0).success for height in (-1e-3, 0.0029, 0.0031, 0.01)] == [True, True, False, False]
+
+
+# -- an outcome depends on nothing else ------------------------------------------------------------------------------
+
+
+def test_episodes_are_the_same_from_a_seed_in_any_environment_and_differ_between_seeds(env):
+    other = PandaSqueezeEnv()
+
+    def states(env, seed):
+        env.reset(seed=seed)
+        return np.array([info["state"] for info in episode(env, 30.0, -100.0, 10.0, 0.0)])
+
+    expected = states(env, 5)
+    squeeze(env, parts(13.0), 20.0)
+    np.testing.assert_array_equal(states(env, 5), expected)
+    np.testing.assert_array_equal(states(other, 5), expected)
+    assert (states(env, 6) != expected).any(axis=1).all()
+    other.close()
+
+
+def test_squeezes_do_not_depend_on_their_order(env):
+    rng = np.random.default_rng(0)
+    given = rng.uniform(-1.5, 1.5, 40), rng.uniform(-3.0, 3.0, 40), rng.uniform(-0.003, 0.003, (40, 2))
+    expected = [outcome.yaw for outcome in env._simulation.squeezes(*given)]
+    order = rng.permutation(40)
+    for k in order:
+        env._simulation.insert(0.3 * k)
+        (outcome,) = env._simulation.squeezes(*(array[k : k + 1] for array in given))
+        assert outcome.yaw == expected[k]
+
+
+def test_several_processes_give_the_same_results(env):
+    shared = PandaSqueezeEnv(n_processes=2)
+    steps = []
+    for each in (env, shared):
+        each.reset(seed=3)
+        state, _ = each.reset_batch(6)
+        steps.append(each.step_batch(state, np.linspace(-1.0, 1.0, 6)[:, None], is_last=True))
+    np.testing.assert_array_equal(steps[0].state, steps[1].state)
+    np.testing.assert_array_equal(steps[0].cost, steps[1].cost)
+    assert [more["height"] for more in steps[0].details] == [more["height"] for more in steps[1].details]
+    assert "_pool" in shared.__dict__ and "_simulation" not in shared.__dict__
+    shared.close()
+
+
+def test_half_a_turn_of_the_hand_changes_nothing_and_the_wrist_stays_within_its_range(env):
+    simulation = env._simulation
+    for yaw in np.linspace(-math.pi, math.pi, 25):
+        low, high = simulation._turned(yaw)
+        assert abs(low[6]) < 1.6 and abs(high[6]) < 1.6
+        assert low[6] - high[6] == pytest.approx(simulation._low[6] - simulation._high[6])
+        np.testing.assert_allclose(simulation._turned(yaw + math.pi + 1e-9)[0], low, atol=1e-6)
+        simulation._put_arm(low)
+        orientation = simulation.client.getLinkState(simulation._robot, 8, computeForwardKinematics=True)[5]
+        along = simulation._axes(orientation)[:2, 0]
+        assert abs(math.cos(yaw) * along[0] + math.sin(yaw) * along[1]) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_watched_episode_has_the_same_outcome_and_pictures_that_differ(env):
+    watched = PandaSqueezeEnv(render_mode="rgb_array")
+    outcomes = []
+    for each in (env, watched):
+        each.reset(seed=2)
+        if each is watched:
+            pictures = [each.render()]
+            with pytest.raises(ValueError, match=r"no squeeze to show before step\(\)"):
+                next(each.film())
+        for info in (episode(each, 0.0)[0], *episode(each, 0.0, 0.0, 0.0)):
+            outcomes.append(info["state"])
+    np.testing.assert_array_equal(outcomes[:4], outcomes[4:])
+    assert 20 < len(watched._film) < 60  # of one squeeze and the insertion, not of the episode
+    pictures += [watched.render(), *list(watched.film())[::16]]
+    assert all(picture.shape == (256, 384, 3) and picture.dtype == np.uint8 for picture in pictures)
+    assert all((pictures[0] != other).any() for other in pictures[1:])
+    orange = (pictures[0][..., 0] > 150) & (pictures[0][..., 2] < 60)
+    assert orange.sum() > 200  # the part is visible
+    watched.close()
+    with pytest.raises(ValueError, match="must be 'rgb_array' for a video"):
+        next(env.film())
 
 
 def test_a_closed_environment_says_so():
     env = PandaSqueezeEnv()
+    env.close()
+    env.close()
     env.reset(seed=0)
-    env.close()
-    env.close()
-    with pytest.raises(RuntimeError, match="has been closed: make a new one"):
+    with pytest.raises(RuntimeError, match="has been closed"):
         env.step(np.zeros(1))
 
 
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        (dict(friction=-0.1), "friction=-0.1 must be finite and not negative"),
-        (dict(tolerance=-0.1), "tolerance=-0.1 must be finite and not negative"),
-        (dict(sensor_noise_std=math.nan), "sensor_noise_std=nan must be finite"),
+        (dict(friction=-0.1), "friction=-0.1 must be between 0 and 1"),
+        (dict(friction=math.nan), "friction=nan must be between"),
+        (dict(centring_error=0.01), "centring_error=0.01 must be between 0 and 0.0035 m: else a jaw may come down"),
+        (dict(tolerance=0.3), "tolerance=0.3 must be between 0 and 0.2 rad"),
+        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite and not negative"),
         (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
+        (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
         (dict(render_mode="human"), "render_mode='human' must be None or one of"),
     ],
 )
 def test_a_bad_keyword_is_named(keywords, message):
     with pytest.raises(ValueError, match=message):
         PandaSqueezeEnv(**keywords)
-
-
-@pytest.mark.parametrize("keyword", ["turn", "basin", "cue"])
-def test_what_the_engine_decides_is_no_keyword(keyword):
-    with pytest.raises(TypeError, match=keyword):
-        PandaSqueezeEnv(**{keyword: 1.0})
