@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-baselines reproduce-public wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-baselines reproduce-public wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -101,6 +101,9 @@ reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a
 reproduce-pays: $(STAMP) ## where the bottleneck pays: squeeze, cue, peg and lava under faults that nobody declared
 	$(PY) -m sb3_tdpg reproduce pays --out results/pays --publish docs/results/pays
 	$(PY) -m sb3_tdpg reproduce pays-cue --out results/pays_cue --publish docs/results/pays_cue
+
+reproduce-panda-squeeze: $(STAMP) ## policies of the batched model in PyBullet's Panda, under faults of the sensor
+	$(PY) -m sb3_tdpg reproduce panda-squeeze --n-seeds 5 --out results/panda_squeeze --publish docs/results/panda_squeeze
 
 reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside TDPG, on lava and grasping
 	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines

@@ -66,6 +66,7 @@ EXPERIMENTS = {
     "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
     "pays": Experiment("pays:reproduce_pays", "pays", flags=("controls",)),
     "pays-cue": Experiment("pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
+    "panda-squeeze": Experiment("pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",)), ("controls",)),
     "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
 }
 

@@ -204,11 +204,13 @@ def complete_run(
         model, selected = run.train(attempt, attempt_folder, progress_bar)
         if selected:
             break
+    env_kwargs = run.settings.get("env_kwargs") or {}
+    # Another environment may not have the keywords of the training.
+    rows = [row.with_kwargs(**env_kwargs) if row.env_id == run.env_id else row for row in scenarios]
     records = evaluate_scenarios(
         {run.method: model},
-        scenarios,
+        rows,
         n_eval_episodes,
-        env_kwargs=run.settings.get("env_kwargs"),
         labels=dict(train_seed=run.seed, attempts=attempt + 1, selected=selected),
         progress_bar=progress_bar,
     )

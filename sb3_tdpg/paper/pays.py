@@ -1,6 +1,6 @@
-"""Where the bottleneck pays: funnels, a cue, lava, against every range of training noise and rivals that were told."""
+"""Where the bottleneck pays: funnels, a cue, lava, an arm; against every range of training noise and told rivals."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.common.provenance import write_frame_atomically
-from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, save_figure
 from sb3_tdpg.evaluation.figures import import_matplotlib, log_axis, new_panels
 from sb3_tdpg.experiments.blind import BlindVecEnv
@@ -65,6 +65,9 @@ class Problem:
     :param faults: Of the sensor, and of the actuator.
     :param plant: Keywords of the environment that change the plant, by name.
     :param goals: The largest interquartile mean of TDPG over seeds, by row.
+    :param tested_in: Another environment, with its default keywords, into which the policies are carried.
+    :param n_episodes: Number of episodes of each row, if it is not that of all problems.
+    :param labels: The methods, by their labels; default: all.
     """
 
     title: str
@@ -75,19 +78,22 @@ class Problem:
     faults: Mapping[str, Fault] = field(default_factory=lambda: dict(FAULTS))
     plant: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     goals: Mapping[str, float] = field(default_factory=dict)
+    tested_in: str | None = None
+    n_episodes: int | None = None
+    labels: Collection[str] | None = None
 
     def rows(self, method: Method) -> list[Scenario]:
         """Return training and the faults; a blind policy stays blind."""
         is_blind = method.label == BLIND
         plain, faulty = (BlindVecEnv, _BlindFaulty) if is_blind else (None, PerturbedVecEnv)
-        rows = [Scenario(TRAINING, self.env_id, self.env_kwargs, sensor=plain)]
+        env_id, env_kwargs = (self.tested_in, {}) if self.tested_in else (self.env_id, self.env_kwargs)
+        how: dict[str, Any] = dict(n_episodes=self.n_episodes)
+        rows = [Scenario(TRAINING, env_id, env_kwargs, sensor=plain, **how)]
         for fault, (name, severity, unit) in self.faults.items():
             scale = unit * np.array(self.scale) if PERTURBATIONS[name].kind == "vector" else None
             sensor = partial(faulty, perturbation=name, severity=severity, seed=0, scale=scale)
-            rows.append(Scenario(fault, self.env_id, self.env_kwargs, sensor=sensor))
-        rows += [
-            Scenario(name, self.env_id, {**self.env_kwargs, **kw}, sensor=plain) for name, kw in self.plant.items()
-        ]
+            rows.append(Scenario(fault, env_id, env_kwargs, sensor=sensor, **how))
+        rows += [Scenario(name, env_id, {**env_kwargs, **kw}, sensor=plain, **how) for name, kw in self.plant.items()]
         return rows
 
     def methods(self) -> list[Method]:
@@ -120,7 +126,7 @@ class Problem:
             for more, wrapper in (("", None), (", noise to 4", noise(4.0)), (", told the faults", told)):
                 method = ours(label + more, wrapper, n_timesteps=block["n_timesteps"])
                 found.append(replace(method, algo=algo, max_seeds=N_SB3_SEEDS))
-        return found
+        return [method for method in found if self.labels is None or method.label in self.labels]
 
     def _told(self) -> list[list[Any]]:
         """List the faults of the sensor for training."""
@@ -170,9 +176,22 @@ PROBLEMS: Mapping[str, Problem] = {
         plant=_TURNS,
         goals={MEAN: 12.0},
     ),
+    # Trained in the batched model that fits PyBullet's squeezes, and carried over unchanged.
+    "panda": Problem(
+        title="Squeezing with the Panda",
+        env_id="SqueezeInsert-v0",
+        block="SqueezeInsert-v0",
+        scale=(1.0, 1.0),
+        env_kwargs=PANDA_SQUEEZE,
+        faults={name: fault for name, fault in FAULTS.items() if name not in ("dropout .35", "group failure")},
+        tested_in="PandaSqueeze-v0",
+        n_episodes=200,
+        labels=("TDPG", NO_PENALTY, "PG", "PG, noise to 1", "PG, noise to 4"),
+    ),
 }
 
-FUNNELS, CUE = ("squeeze", "peg", "lava"), ("cue",)
+FUNNELS, CUE, PANDA = ("squeeze", "peg", "lava"), ("cue",), ("panda",)
+NAMES = {FUNNELS: "pays", CUE: "pays-cue", PANDA: "panda-squeeze"}  # of the experiments on the command line
 
 
 def reproduce_pays(
@@ -210,13 +229,12 @@ def reproduce_pays(
             methods=common.markdown_table(_methods_table(by_seed, _cpu_times(of_problem))),
             comparisons=common.comparisons_table(table, [("TDPG", other) for other in others], KINDS),
             faults=common.markdown_table(_faults_table(by_seed)),
+            successes=common.markdown_table(_successes_table(records)) if "failure" in records else "",
             goals=common.goals_table(aggregate_seeds(table[table["model"] == "TDPG"]), {"TDPG": problem.goals}),
         )
     write_frame_atomically(pd.concat(f.assign(problem=n) for n, f in frames.items()), out / "seeds.csv")
     save_figure(figure(frames), out / "pays.png")
-    command = (
-        "make reproduce-pays" if controls else f"sb3-tdpg reproduce pays{'-cue' * (problems == CUE)} --no-controls"
-    )
+    command = f"sb3-tdpg reproduce {NAMES[tuple(problems)]}{'' if controls else ' --no-controls'}"
     return common.write_results(out, "pays.md", of_all, command, given.publish, sections=sections)
 
 
@@ -258,6 +276,17 @@ def _faults_table(by_seed: pd.DataFrame) -> pd.DataFrame:
     return means.map("{:.3g}".format).reset_index().rename(columns=dict(model="method"))
 
 
+def _successes_table(records: pd.DataFrame) -> pd.DataFrame:
+    """Show the share of the episodes that succeed in %, means over seeds, and the largest fall by a fault in points."""
+    shares = 100 * (1 - records.groupby(["model", "train_seed", "scenario"], sort=False)["failure"].mean().unstack())
+    falls = -shares.drop(columns=TRAINING).sub(shares[TRAINING], axis=0).min(axis=1)
+    table = shares.groupby("model", sort=False).mean().map("{:.1f}".format)
+    of_model = falls.groupby("model", sort=False)
+    ends = zip(of_model.mean(), of_model.min(), of_model.max(), strict=True)
+    table["largest fall"] = ["{:.1f} ({:.1f} to {:.1f})".format(*each) for each in ends]
+    return table.reset_index().rename(columns=dict(model="method"))
+
+
 def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
     """Draw the cost in training against the mean over the faults: a dot for each policy, a panel for each problem."""
     drawn, (panels,) = new_panels(4.2 * len(frames), 4.8, 1, len(frames))
@@ -277,5 +306,5 @@ def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
         axes.set_xlabel("cost in training", fontsize=9)
     panels[0].set_ylabel("mean cost of the faults", fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    drawn.legend(handles, labels, loc="outside lower center", ncols=2 * len(frames), fontsize=8, frameon=False)
     return drawn

@@ -9,7 +9,7 @@ from small_problems import complete_runs_here
 
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.cli import main
-from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE, Scenario
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common, pays
@@ -140,3 +140,26 @@ def test_from_nothing_to_tables_figure_and_records(tmp_path, monkeypatch):
     of_tdpg = seeds[seeds["train_seed"] == 500].set_index("scenario")["cost"]
     assert of_tdpg[WORST] == pytest.approx(of_tdpg.drop([TRAINING, MEAN, WORST]).max())
     assert (tmp_path / "docs" / "pays.png").stat().st_size > 5000
+
+
+def test_policies_of_the_fitted_model_are_carried_over_to_pybullet():
+    problem = PROBLEMS["panda"]
+    assert {row.env_id for row in rows("panda").values()} == {"PandaSqueeze-v0"}
+    assert all(not row.env_kwargs and row.n_episodes == 200 for row in rows("panda").values())
+    for method in problem.methods():
+        run = method.run(problem.env_id, 0)
+        assert run.env_id == "SqueezeInsert-v0"
+        assert run.settings["env_kwargs"] == dict(PANDA_SQUEEZE)
+
+
+def test_the_largest_fall_is_that_of_the_worst_fault_of_each_seed():
+    shares = {(0, TRAINING): 0.0, (0, "noise"): 0.5, (0, "bias"): 0.25, (1, TRAINING): 0.25, (1, "noise"): 0.0}
+    shares[1, "bias"] = 0.5
+    records = pd.DataFrame(
+        dict(model="A", train_seed=seed, scenario=row, failure=i < 4 * share)
+        for (seed, row), share in shares.items()
+        for i in range(4)
+    )
+    table = pays._successes_table(records).iloc[0]
+    assert table[["method", TRAINING, "noise", "bias"]].tolist() == ["A", "87.5", "75.0", "62.5"]
+    assert table["largest fall"] == "37.5 (25.0 to 50.0)"
