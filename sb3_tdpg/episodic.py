@@ -35,7 +35,7 @@ from sb3_tdpg.information import InformationEstimator
 from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, check_numbers, check_observations, named_shapes, read_problem
-from sb3_tdpg.robustness.nuisance import make_nuisance
+from sb3_tdpg.robustness.nuisance import Nuisance, make_nuisance
 
 NUISANCE_OPTIMIZER = "nuisance_phase.optimizer"
 
@@ -61,8 +61,10 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     """With ``baseline="value"``."""
     nuisance: Any = None
     """The declared nuisance, see :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`."""
+    nuisance_family: Nuisance | None = None
+    """What was declared, once there is an environment."""
     nuisance_phase: NuisancePhase | None = None
-    """With a ``nuisance``."""
+    """With ``nuisance_level="action"``."""
     n_episodes: int | None
     """Episodes of an epoch."""
     epoch_steps: int | None = None
@@ -151,13 +153,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     def _make_nuisance(self) -> None:
         """Make the members of the declared nuisance; some kinds of it need the environment."""
-        if self.nuisance_phase is not None and self.env is not None:
-            self.nuisance_phase.nuisance = make_nuisance(self.nuisance, self.observation_space, self.env)
-
-    @property
-    def perturbs_rollouts(self) -> bool:
-        """Whether the policy of the rollouts sees perturbed observations."""
-        return self.nuisance_phase is not None and self.nuisance_phase.level != "action"
+        if self.env is not None:
+            self.nuisance_family = make_nuisance(self.nuisance, self.observation_space, self.env)
 
     # -- rollouts ---------------------------------------------------------------------------------------------
 
@@ -202,9 +199,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         column = np.arange(n_envs)  # of the buffer, for the current episode of each environment
         n_columns, n_stored = n_envs, 0
         members = None
-        if self.perturbs_rollouts:
-            assert self.nuisance_phase is not None
-            members = self.nuisance_phase.nuisance.members(n_envs)
+        if self.nuisance_family is not None and self.nuisance_phase is None:
+            members = self.nuisance_family.members(n_envs)
         # An epoch that ends early cannot be continued: leave the environments to be reset.
         self._last_obs = None
 
@@ -239,7 +235,6 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 "costs": -rewards,
             }
             if members is not None:
-                stored["plain_observations"] = obs
                 members.begin(np.flatnonzero(dones))
             rollout_buffer.add_step(
                 t[running], column[running], **{k: each(v, lambda x: x[running]) for k, v in stored.items()}
@@ -396,7 +391,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             ) from e
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_problem"]
+        return [*super()._excluded_save_params(), "_problem", "nuisance_family"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         # The estimator's state dict holds its optimiser, too.

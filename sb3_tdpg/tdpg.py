@@ -107,8 +107,7 @@ class TDPG(EpisodicAlgorithm):
         colours, patterns, contrasts and noise for images, nothing for vectors. ``None``: nothing. A dict of
         perturbations and severities, a function, ...: see :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`.
     :param nuisance_level: Where it is removed. ``"rollouts"``: roll out under the nuisance. ``"action"``: roll out
-        plainly, and make the actions the same under the nuisance in a phase of its own after the passes of an epoch.
-        ``"trv"``: roll out under the nuisance, and minimise an upper bound on what the TRVs know of it in that phase
+        plainly, and make the actions the same under the nuisance in a phase of its own after the passes of an epoch
         (:class:`~sb3_tdpg.information.nuisance.NuisancePhase`). ``"auto"``: ``"rollouts"`` with ``nuisance="auto"``,
         where every image has a change of its own; ``"action"`` for a declared nuisance.
     :param nuisance_steps: Gradient steps of the phase; unused with ``"rollouts"``.
@@ -277,8 +276,9 @@ class TDPG(EpisodicAlgorithm):
         self.nuisance_phase = None
         if self.nuisance is not None:
             self.nuisance_level = level
-            self.nuisance_phase = NuisancePhase(self.policy, self.nuisance_steps, level)
-            self._make_nuisance()
+            if level == "action":
+                self.nuisance_phase = NuisancePhase(self.policy, self.nuisance_steps)
+        self._make_nuisance()
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         n_critics = 1 if self.pools_information else self.horizon
@@ -287,7 +287,7 @@ class TDPG(EpisodicAlgorithm):
         n_columns = self.n_episodes or math.ceil(self.epoch_size / self.horizon)
         self.rollout_buffer = EpisodeBuffer(
             self.horizon, self.observation_space, self.action_space, device=self.device, gamma=self.gamma,
-            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim, keeps_plain=self.perturbs_rollouts,
+            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim,
         )  # fmt: skip
 
     @property
@@ -355,7 +355,7 @@ class TDPG(EpisodicAlgorithm):
         if in_segments:
             batch = batch.segments(self.bptt_steps or len(batch.costs))
         # What the passes need of it: images are pooled once.
-        passes = batch._replace(observations=self.policy.pooled(batch.observations), plain_observations=None)
+        passes = batch._replace(observations=self.policy.pooled(batch.observations))
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
@@ -394,9 +394,8 @@ class TDPG(EpisodicAlgorithm):
                 self.logger.record_mean("train/loss", loss.item())
                 self.logger.record_mean("train/grad_norm", grad_norm.item())
         if self.nuisance_phase is not None:
-            known = self.nuisance_phase.remove(batch, self.rollout_buffer.mean_length, self._check_finite)
-            for name, value in known.items():
-                self.logger.record(f"nuisance/{name}", value)
+            left = self.nuisance_phase.remove(batch, self.nuisance_family, self._check_finite)
+            self.logger.record("nuisance/action_kl", left)
         # Last: the rollouts and all of their gradients saw the same inputs.
         self.policy.update_statistics(whole)
 

@@ -46,7 +46,7 @@ ARGUMENTS = {
     "nuisance of another kind": (dict(nuisance="contrast"), "'contrast' does not apply", "images"),
     "nuisance a number": (dict(nuisance=3), "nuisance=3 must be None, 'auto'", "a function of the observations"),
     "nuisance_steps zero": (dict(nuisance="vector_noise", nuisance_steps=0), "nuisance_steps=0", "nuisance=None"),
-    "nuisance_level unknown": (dict(nuisance="vector_noise", nuisance_level="all"), "nuisance_level='all'", "trv"),
+    "nuisance_level unknown": (dict(nuisance="vector_noise", nuisance_level="all"), "nuisance_level='all'", "rollouts"),
     "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
     "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
     "cost_limit of all": (dict(cost_limit="100%"), "cost_limit='100%'", "between 0 and 100 %", "'95%'"),

@@ -27,14 +27,13 @@ class Counting(Nuisance, Members):
         return observations + self.begun[which, None]
 
 
-@pytest.mark.parametrize("level", ["rollouts", "trv"])
-def test_an_episode_of_a_rollout_has_one_member_and_the_next_one_another(level):
+def test_an_episode_of_a_rollout_has_one_member_and_the_next_one_another():
     env = DummyVecEnv([partial(CountdownEnv, 0, [4, 2, 3]), partial(CountdownEnv, 1, [1, 4, 2])])
-    model = tiny_tdpg(env, n_episodes=6, beta=math.inf, nuisance=Counting(), nuisance_level=level)
+    model = tiny_tdpg(env, n_episodes=6, beta=math.inf, nuisance=Counting(), nuisance_level="rollouts")
     model.train = lambda: None
     train_epochs(model, 1)
     batch = model.rollout_buffer.episode_batch()
-    added = (batch.observations - batch.plain_observations)[..., 0]
+    added = (batch.observations + batch.states)[..., 0]
     number = th.arange(6) // 2  # of the episode, in its environment
     th.testing.assert_close(added, batch.alive * number, rtol=0, atol=0)
 
@@ -44,7 +43,7 @@ def test_another_environment_brings_its_own_scenes():
     model = tiny_tdpg(make_episodes_env("Lava-v0", 20), nuisance=scenes)
     model.set_env(make_episodes_env("Lava-v0", 20, env_kwargs=dict(sensor_noise_std=0.0)))
     observations, states = np.zeros((3, 2), np.float32), np.array([[1.0, 0.5], [2.0, 0.0], [4.0, -1.0]])
-    seen = model.nuisance_phase.nuisance.members(3)(observations, states, np.arange(3))
+    seen = model.nuisance_family.members(3)(observations, states, np.arange(3))
     np.testing.assert_array_equal(seen, states + np.array([10.0, -10.0]))
 
 

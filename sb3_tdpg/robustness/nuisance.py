@@ -28,6 +28,7 @@ from sb3_tdpg.robustness.training import Drawn, ImageMixture
 Observations = Any
 """An array ``(n, *obs)``, or a dict of such."""
 
+LEVELS = ("auto", "rollouts", "action")
 IMAGES = "images"  # the name of ImageMixture in a declaration
 
 
@@ -334,6 +335,8 @@ def resolved(declared: Any, level: str, space: spaces.Space) -> tuple[Any, str]:
     In rollouts every image then has a change of its own, as in docs/results/ball_catch.md; in the phase a change is
     held for the episode.
     """
+    if level not in LEVELS:
+        raise ValueError(f"nuisance_level={level!r} is unknown: use one of {list(LEVELS)}")
     if level == "auto":
         level = "rollouts" if declared == "auto" else "action"
     return declaration(declared, space, held=level != "rollouts"), level

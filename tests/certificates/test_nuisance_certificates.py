@@ -9,7 +9,7 @@ from sb3_tdpg.cli import main
 
 
 def test_certified_bounds_hold_for_random_members(tmp_path):
-    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias", nuisance_level="trv")
+    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias", nuisance_level="rollouts")
     train_epochs(model, 3)
     model.save(tmp_path / "model.zip")
     declared = "{vector_noise: [1, 5], vector_bias: 2}"
