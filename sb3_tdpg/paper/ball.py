@@ -33,7 +33,7 @@ from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves, sorted_walls
 from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
 from sb3_tdpg.presets import IMAGE_ENCODER
-from sb3_tdpg.robustness.training import VecImagePerturbation
+from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 
 # Fixed before any policy was evaluated on the test rows: the defaults were chosen on seeds below 100 and on the walls
@@ -98,7 +98,7 @@ def methods(launch: str) -> tuple[Method, ...]:
         block = load_hyperparams(BLOCK, algo)
         overrides = dict(
             n_timesteps=load_hyperparams(BLOCK)["n_timesteps"],
-            vec_env_wrapper=["sb3_tdpg.robustness.training.VecImagePerturbation"],
+            vec_env_wrapper=[{"sb3_tdpg.robustness.PerturbedVecEnv": dict(perturbation="images")}],
             policy_kwargs={**block["policy_kwargs"], **policy_kwargs},
             env_kwargs=env_kwargs,
         )
@@ -148,8 +148,8 @@ SHIFTS: tuple[Scenario, ...] = (
         Scenario(name, BLOCK, dict(texture=f"random-{i}"), n_episodes=N_WALL_EPISODES)
         for name, i in zip(WALL_ROWS, WALLS, strict=True)
     ),
-    Scenario(HELD, BLOCK, sensor=partial(VecImagePerturbation, held=True)),
-    Scenario(REDRAWN, BLOCK, sensor=VecImagePerturbation),
+    Scenario(HELD, BLOCK, sensor=partial(PerturbedVecEnv, perturbation={"images": dict(held=True)})),
+    Scenario(REDRAWN, BLOCK, sensor=partial(PerturbedVecEnv, perturbation="images")),
     Scenario(GAMMA, BLOCK, sensor=VecGamma),
 )
 """Rows of our own: walls that no policy was trained or tuned on, the changes of the training, and one that is not."""
