@@ -1,6 +1,8 @@
 """The nuisance of a training: what TDPG puts around its environment, and what the policy then sees and stores."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -36,6 +38,11 @@ def wrappers(model):
         found.append(type(env))
         env = env.venv
     return found
+
+
+def test_the_algorithm_is_imported_without_any_perturbation():
+    code = "import sys, sb3_tdpg.tdpg; assert not [name for name in sys.modules if 'robustness' in name]"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_default_is_a_nuisance_for_images_of_bytes_and_none_for_vectors_and_depth():

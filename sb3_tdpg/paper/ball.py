@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.vec_env import VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -122,25 +120,9 @@ def methods(launch: str) -> tuple[Method, ...]:
 WITHOUT_CONTROLS = ("TDPG", "PG", "RecurrentPPO")
 
 
-def gamma(images: np.ndarray) -> np.ndarray:
+def gamma(images: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
     """Square the brightness of every pixel, which the declared changes do not contain: uint8, any shape."""
     return np.rint(images.astype(np.float32) ** 2 / 255).astype(np.uint8)
-
-
-class VecGamma(VecEnvWrapper):
-    """A camera with :func:`gamma`."""
-
-    def reset(self) -> np.ndarray:
-        """Reset, and change the first images."""
-        images = self.venv.reset()
-        assert isinstance(images, np.ndarray)
-        return gamma(images)
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step, and change the images."""
-        images, rewards, dones, infos = self.venv.step_wait()
-        assert isinstance(images, np.ndarray)
-        return gamma(images), rewards, dones, infos
 
 
 SHIFTS: tuple[Scenario, ...] = (
@@ -150,7 +132,7 @@ SHIFTS: tuple[Scenario, ...] = (
     ),
     Scenario(HELD, BLOCK, sensor=partial(PerturbedVecEnv, perturbation={"images": dict(held=True)})),
     Scenario(REDRAWN, BLOCK, sensor=partial(PerturbedVecEnv, perturbation="images")),
-    Scenario(GAMMA, BLOCK, sensor=VecGamma),
+    Scenario(GAMMA, BLOCK, sensor=partial(PerturbedVecEnv, perturbation=gamma)),
 )
 """Rows of our own: walls that no policy was trained or tuned on, the changes of the training, and one that is not."""
 

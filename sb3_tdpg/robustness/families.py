@@ -80,6 +80,8 @@ class Family:
                 self._makers.append(self._scenes(value, redraw))
             else:
                 self._makers += self._named(name, value, *factor)
+                continue
+            self._kinds.add(False)
         if len(self._kinds) > 1:
             raise ValueError(f"{declared!r} perturbs actions and observations: wrap the environment once for each")
 

@@ -7,7 +7,7 @@ Dimension key: T horizon, N episodes, Z TRVs, U action.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -22,32 +22,26 @@ from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, automatic
 BATCH_STEPS = 400  # of a gradient step: 16 episodes of 25 steps
 
 
-class Behaviour(NamedTuple):
-    """What a policy does in N episodes, for given noise of the TRVs."""
-
-    trvs: th.Tensor  #: ``(T, N, Z)``
-    actions: list[Distribution]  #: pi(. | x~_t), ``(T * N, ...)``; several for a ``MultiDiscrete`` space
-
-
-def behaviour(policy: Any, batch: Any, observations: Any) -> Behaviour:
+def actions(policy: Any, batch: Any, observations: Any) -> list[Distribution]:
     """
     Unroll a policy over recorded episodes with the recorded noise of the TRVs, but with these observations.
 
     :param policy: A :class:`~sb3_tdpg.TRVPolicy`.
     :param batch: An :class:`~sb3_tdpg.buffers.EpisodeBatch`.
     :param observations: ``(T, N, *obs)``, or a dict of such
+    :return: pi(. | x~_t), ``(T * N, ...)``; several for a ``MultiDiscrete`` space
     """
     batch = batch._replace(observations=observations)
     trvs, *_ = policy.rebuild_trvs(policy.episode_features(batch), batch)
-    actions = policy.episode_action_density(trvs).distribution
-    return Behaviour(trvs, actions if isinstance(actions, list) else [actions])
+    densities = policy.episode_action_density(trvs).distribution
+    return densities if isinstance(densities, list) else [densities]
 
 
-def action_divergence(p: Behaviour, q: Behaviour) -> th.Tensor:
-    """Compute D[pi_p || pi_q] at each step, ``(T, N)``, in nats."""
-    parts = zip(p.actions, q.actions, strict=True)
-    divergences = [kl_divergence(of_p, of_q).reshape(p.trvs.shape[0] * p.trvs.shape[1], -1) for of_p, of_q in parts]
-    return th.cat(divergences, dim=1).sum(dim=1).view(p.trvs.shape[:2])
+def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.Tensor:
+    """Compute D[pi_p || pi_q], averaged over the living steps, in nats a step."""
+    parts = zip(p, q, strict=True)
+    by_part = [kl_divergence(of_p, of_q).reshape(batch.alive.numel(), -1).sum(dim=1) for of_p, of_q in parts]
+    return (batch.alive * th.stack(by_part).sum(dim=0).view_as(batch.alive)).sum() / batch.alive.sum()
 
 
 class NuisancePhase(TDPGCallback):
@@ -122,13 +116,6 @@ class NuisancePhase(TDPGCallback):
         steps = [members(each_part(lambda x, t=t: x[t], plain), None, states[t]) for t in range(len(states))]
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
-    def divergence(self, batch: Any, perturbed: Any) -> th.Tensor:
-        """Compute the divergence of the actions from those on plain observations, ``(T, N)``."""
-        policy = self.tdpg.policy
-        with th.no_grad():
-            plain = behaviour(policy, batch, batch.observations)
-            return action_divergence(behaviour(policy, batch, perturbed), plain)
-
     def remove(self, batch: Any) -> float:
         """
         Take the gradient steps of an epoch.
@@ -140,20 +127,20 @@ class NuisancePhase(TDPGCallback):
         minibatches = self._minibatches(batch)
         with th.no_grad():  # the policy as it is now, for all steps
             parts = map(batch.select, minibatches)  # one at a time: images need room
-            teachers = [behaviour(policy, part, part.observations) for part in parts]
+            teachers = [actions(policy, part, part.observations) for part in parts]
         for columns, teacher in zip(minibatches, teachers, strict=True):
             part = batch.select(columns)
-            invariance = action_divergence(behaviour(policy, part, self.perturbed(part)), teacher)
-            kept = action_divergence(behaviour(policy, part, part.observations), teacher)
-            loss = (part.alive * (invariance + kept)).sum() / part.alive.sum()
+            seen = (self.perturbed(part), part.observations)
+            loss = th.stack([divergence(actions(policy, part, each), teacher, part) for each in seen]).sum()
             check_finite("nuisance loss", loss)
             self.optimizer.zero_grad()
             loss.backward()
             check_finite("gradient", th.nn.utils.clip_grad_norm_(policy.parameters(), 1.0))
             self.optimizer.step()
         fresh = batch.select(self._minibatches(batch)[0])
-        left = self.divergence(fresh, self.perturbed(fresh))
-        return ((fresh.alive * left).sum() / fresh.alive.sum()).item()
+        with th.no_grad():
+            now, plain = (actions(policy, fresh, each) for each in (self.perturbed(fresh), fresh.observations))
+            return divergence(now, plain, fresh).item()
 
     def _minibatches(self, batch: Any) -> list[th.Tensor]:
         """Draw the columns of each gradient step: about ``BATCH_STEPS`` steps, in as few passes as possible."""

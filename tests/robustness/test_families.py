@@ -6,7 +6,6 @@ import torch as th
 from gymnasium import spaces
 from perturbed_problems import countdown, perturbed, run
 from small_problems import toy_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
@@ -182,12 +181,10 @@ def test_a_declared_family_changes_the_observations_and_keeps_shape_and_type(dec
 
 
 @pytest.mark.parametrize(("declared", "space", "fragment"), [
-    ("fog", IMAGES, "perturbation='fog' is unknown"),
-    ("noise", VECTOR, "'noise' does not apply"),
     ("images", DEPTH, "'images' does not apply: it changes colours"),
     ("images", VECTOR, "'images' does not apply: it is for images"),
     ("vector_noise", spaces.Dict(camera=IMAGES), "it is for vectors"),
-    ({"noise": 6}, IMAGES, "severity=6"),
+    ({"noise": (1, 6)}, IMAGES, "severity=6"),
     ({"noise": (3, 1)}, IMAGES, "the lowest and the highest"),
     ({"images": dict(colour=1)}, IMAGES, "keywords of images"),
     ({"images": 3}, IMAGES, "keywords of images"),
@@ -200,6 +197,7 @@ def test_a_declared_family_changes_the_observations_and_keeps_shape_and_type(dec
     (3, IMAGES, "3 is no perturbation: expected the name"),
     ([3], IMAGES, "3 is no entry of a list"),
     ([("vector_noise", 3), ("actuator_gain", 3)], VECTOR, "perturbs actions and observations"),
+    ([("mine", lambda y, rng: y), ("actuator_gain", 3)], VECTOR, "perturbs actions and observations"),
     ({"env_kwargs": dict(texture="violet_dots")}, IMAGES, "needs an environment that can observe a given state"),
 ])  # fmt: skip
 def test_a_wrong_declaration_is_explained(declared, space, fragment):
@@ -279,10 +277,3 @@ def test_without_any_seed_the_wrapper_follows_torch():
 
     np.testing.assert_array_equal(observations(0), observations(0))
     assert (observations(0) != observations(1)).any()
-
-
-def test_normalised_observations_and_a_scale_for_images_are_refused():
-    with pytest.raises(ValueError, match="before they are normalised"):
-        PerturbedVecEnv(VecNormalize(countdown()), {"noise_range": {}})
-    with pytest.raises(ValueError, match=r"scale=2\.0 is for vectors"):
-        PerturbedVecEnv(toy_vec_env(observation_space=IMAGES), "images", scale=2.0)
