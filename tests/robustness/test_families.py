@@ -157,6 +157,14 @@ def test_an_episode_that_begins_draws_its_family_anew():
     assert 0.55 < changed[begun].mean() < 0.8
 
 
+def test_a_name_alone_stands_for_all_severities_and_no_two_episodes_draw_the_same_numbers():
+    zeros = np.zeros((400, 16), np.float32)
+    sizes = np.abs(family("vector_bias", VECTOR, scale=1.0).members(400, 0)(zeros))[:, 0].round(4)
+    assert set(sizes) == set(np.float32([0.05, 0.1, 0.2, 0.4, 0.8]))
+    noise = family({"vector_noise": (4, 5)}, VECTOR).members(400, 0)(zeros)
+    assert len({(row / np.abs(row).max()).round(3).tobytes() for row in noise}) == 400
+
+
 @pytest.mark.parametrize(("declared", "space"), [
     ({"noise": 1, "dropped_pixels": (1, 4), "brightness": 2}, DEPTH),
     ("images", IMAGES),
