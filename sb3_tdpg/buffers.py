@@ -25,9 +25,7 @@ Observations = th.Tensor | dict[str, th.Tensor]
 
 
 def each(x: Any, function: Callable[[Any], Any]) -> Any:
-    """Apply a function to an array, or to every array of a dict, or to nothing (``None``)."""
-    if x is None:
-        return None
+    """Apply a function to an array, or to every array of a dict."""
     return {key: function(value) for key, value in x.items()} if isinstance(x, dict) else function(x)
 
 
@@ -49,7 +47,6 @@ class EpisodeBatch(NamedTuple):
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
     advantages: th.Tensor  #: ``(T, N)``, zero until they are computed
     prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at t = 0
-    plain_observations: Observations | None = None  #: ``(T, N, *obs)``, if the rollouts saw perturbed ones
 
     def select(self, columns: th.Tensor | slice) -> EpisodeBatch:
         """Select episodes or segments by their columns."""
@@ -112,7 +109,6 @@ class EpisodeBuffer(RolloutBuffer):
 
     :param state_dim: X
     :param trv_dim: Z
-    :param keeps_plain: Whether there are ``plain_observations`` beside the perturbed ones that the policy saw.
     :param kwargs: See :class:`~stable_baselines3.common.buffers.RolloutBuffer`.
     """
 
@@ -124,10 +120,8 @@ class EpisodeBuffer(RolloutBuffer):
         *,
         state_dim: int,
         trv_dim: int,
-        keeps_plain: bool = False,
         **kwargs: Any,
     ) -> None:
-        self.stored = (*STORED, "plain_observations") if keeps_plain else STORED
         self.state_dim = state_dim
         self.trv_dim = trv_dim
         super().__init__(buffer_size, observation_space, flat_action_space(action_space), **kwargs)
@@ -143,8 +137,7 @@ class EpisodeBuffer(RolloutBuffer):
             return np.zeros((self.buffer_size, self.n_envs, *dim), np.float32)
 
         space = self.observation_space
-        for name in {"observations", "plain_observations"} & set(self.stored):
-            setattr(self, name, each(space.spaces if isinstance(space, spaces.Dict) else space, zeros))
+        self.observations = each(space.spaces if isinstance(space, spaces.Dict) else space, zeros)
         self.states = vectors(self.state_dim)
         self.noise, self.trvs, self.means, self.stds = (vectors(self.trv_dim) for _ in range(4))
         self.stds += 1.0
@@ -172,7 +165,7 @@ class EpisodeBuffer(RolloutBuffer):
 
     def _double(self) -> None:
         """Make room for as many episodes again."""
-        for name in self.stored:
+        for name in STORED:
             setattr(self, name, each(getattr(self, name), lambda x: np.concatenate([x, np.zeros_like(x)], axis=1)))
         self.stds[:, self.stds.shape[1] // 2 :] = 1.0
 
@@ -198,7 +191,7 @@ class EpisodeBuffer(RolloutBuffer):
         def tensor(x: np.ndarray) -> th.Tensor:
             return self.to_torch(x[:length, :n_episodes], copy=False)
 
-        stored = {name: each(getattr(self, name), tensor) for name in self.stored}
+        stored = {name: each(getattr(self, name), tensor) for name in STORED}
         trvs = stored["trvs"]
         prev_trvs = th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
         return EpisodeBatch(**stored, advantages=th.zeros_like(stored["costs"]), prev_trvs=prev_trvs)

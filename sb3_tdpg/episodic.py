@@ -22,7 +22,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -32,12 +32,8 @@ from sb3_tdpg.checks import nearest_multiples
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.information import InformationEstimator
-from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import Problem, check_numbers, check_observations, named_shapes, read_problem
-from sb3_tdpg.robustness.nuisance import make_nuisance
-
-NUISANCE_OPTIMIZER = "nuisance_phase.optimizer"
 
 SelfEpisodic = TypeVar("SelfEpisodic", bound="EpisodicAlgorithm")
 
@@ -60,9 +56,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     value_function: ValueFunction | None = None
     """With ``baseline="value"``."""
     nuisance: Any = None
-    """The declared nuisance, see :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`."""
-    nuisance_phase: NuisancePhase | None = None
-    """With a ``nuisance``."""
+    """What the rollouts show beside the state, see :func:`~sb3_tdpg.robustness.nuisance.with_nuisance`."""
     n_episodes: int | None
     """Episodes of an epoch."""
     epoch_steps: int | None = None
@@ -143,21 +137,16 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
-        wrapped = self._wrap_env(env, self.verbose)
+        wrapped = self._with_nuisance(self._wrap_env(env, self.verbose))
         problem = self._check_problem(wrapped)  # before the model's own environment is replaced
         super().set_env(wrapped, force_reset)
         self._set_problem(problem, wrapped)
-        self._make_nuisance()
 
-    def _make_nuisance(self) -> None:
-        """Make the members of the declared nuisance; some kinds of it need the environment."""
-        if self.nuisance_phase is not None and self.env is not None:
-            self.nuisance_phase.nuisance = make_nuisance(self.nuisance, self.observation_space, self.env)
+    def _with_nuisance(self, env: VecEnv) -> VecEnv:
+        """Put the declared nuisance around an environment, which may come from another model."""
+        from sb3_tdpg.robustness.nuisance import with_nuisance  # the algorithm itself knows nothing of perturbations
 
-    @property
-    def perturbs_rollouts(self) -> bool:
-        """Whether the policy of the rollouts sees perturbed observations."""
-        return self.nuisance_phase is not None and self.nuisance_phase.level != "action"
+        return with_nuisance(env, self.nuisance)
 
     # -- rollouts ---------------------------------------------------------------------------------------------
 
@@ -183,9 +172,9 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         :return: False if a callback asked to stop.
         """
         assert self._problem is not None, "the model has no environment: set_env() first"
+        callback.on_rollout_start()
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
-        callback.on_rollout_start()
         if self._last_obs is None:
             with named_shapes(env):
                 self._last_obs = env.reset()  # type: ignore[assignment]
@@ -201,19 +190,14 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         t = np.zeros(n_envs, np.int64)
         column = np.arange(n_envs)  # of the buffer, for the current episode of each environment
         n_columns, n_stored = n_envs, 0
-        members = None
-        if self.perturbs_rollouts:
-            assert self.nuisance_phase is not None
-            members = self.nuisance_phase.nuisance.members(n_envs)
         # An epoch that ends early cannot be continued: leave the environments to be reset.
         self._last_obs = None
 
         while (running := np.flatnonzero(column >= 0)).size > 0:
             check_observations(self.observation_space, obs, t)
             check_numbers("state", states, (self.state_dim,), t)
-            seen = obs if members is None else members(obs, states, np.arange(n_envs))
             with th.no_grad():
-                step = self.policy.step(obs_as_tensor(seen, self.device), trvs, np.minimum(t, self.horizon - 1))
+                step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(t, self.horizon - 1))
             actions = step.actions.cpu().numpy()
             env_actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
             if isinstance(self.action_space, spaces.Box):
@@ -229,7 +213,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             self._update_info_buffer(infos, dones)
 
             stored = {
-                "observations": seen,
+                "observations": obs,
                 "states": states,
                 "noise": step.noise.cpu().numpy(),
                 "trvs": step.trvs.cpu().numpy(),
@@ -238,9 +222,6 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 "actions": actions.reshape(n_envs, -1),
                 "costs": -rewards,
             }
-            if members is not None:
-                stored["plain_observations"] = obs
-                members.begin(np.flatnonzero(dones))
             rollout_buffer.add_step(
                 t[running], column[running], **{k: each(v, lambda x: x[running]) for k, v in stored.items()}
             )
@@ -401,25 +382,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         # The estimator's state dict holds its optimiser, too.
         value = [] if self.value_function is None else ["value_function", "value_function.optimizer"]
-        nuisance = [] if self.nuisance_phase is None else [NUISANCE_OPTIMIZER]
-        return ["policy", "policy.optimizer", "estimator", *value, *nuisance], []
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | TensorDict,
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-    ) -> None:
-        """See SB3; a model with a nuisance may take parameters of one without, and the other way round."""
-        if isinstance(load_path_or_dict, dict):
-            own = self.get_parameters()
-            given: dict[str, Any] = {
-                name: value for name, value in load_path_or_dict.items() if name != NUISANCE_OPTIMIZER
-            }
-            if NUISANCE_OPTIMIZER in own:
-                given[NUISANCE_OPTIMIZER] = load_path_or_dict.get(NUISANCE_OPTIMIZER, own[NUISANCE_OPTIMIZER])
-            load_path_or_dict = given
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        return ["policy", "policy.optimizer", "estimator", *value], []
 
 
 def check_policy(policy: Any, aliases: Collection[str]) -> None:

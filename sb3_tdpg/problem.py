@@ -48,27 +48,28 @@ class Problem:
     def initial_states(self, env: VecEnv, obs: np.ndarray) -> np.ndarray:
         """Return x_0 after a reset or an automatic reset of all environments: ``(E, X)``."""
         # The wrappers' own reset_infos stay empty.
-        return self._states(env.unwrapped.reset_infos, obs)
+        return self._states(env, env.unwrapped.reset_infos, obs)
 
     def next_states(self, env: VecEnv, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Return x_{t+1} after a step, or x_0 of the next episode where one has ended: ``(E, X)``."""
         if dones.any():
             reset_infos = env.unwrapped.reset_infos
             infos = [reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
-        return self._states(infos, obs)
+        return self._states(env, infos, obs)
 
-    def _states(self, infos: list[dict[str, Any]], obs: np.ndarray) -> np.ndarray:
+    def _states(self, env: VecEnv, infos: list[dict[str, Any]], obs: np.ndarray) -> np.ndarray:
         if self.state_is_observation:
+            obs = vars(env).get("unperturbed", obs)  # of a PerturbedVecEnv
             parts = list(obs.values()) if isinstance(obs, dict) else [obs]
             return np.concatenate([x.reshape(len(x), -1) for x in parts], axis=1, dtype=np.float32)
         try:
             states = [info["state"] for info in infos]
         except KeyError as e:
             raise ValueError(f'the environment has a `state_space` but no info["state"]: {BRING_THE_STATE}') from e
-        for env, state in enumerate(states):
+        for i, state in enumerate(states):
             if np.shape(state) != (self.state_dim,):
                 raise ValueError(
-                    f'info["state"] of environment {env} has shape {np.shape(state)}, but `state_space` says '
+                    f'info["state"] of environment {i} has shape {np.shape(state)}, but `state_space` says '
                     f"{(self.state_dim,)}: mend reset() and step(), or the space"
                 )
         return np.stack(states)

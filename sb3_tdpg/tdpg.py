@@ -39,11 +39,9 @@ from sb3_tdpg.checks import (
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
-from sb3_tdpg.information.nuisance import NuisancePhase
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.presets import DEFAULTS, Defaults, fill_in, preset_of
 from sb3_tdpg.problem import Problem, horizon_of
-from sb3_tdpg.robustness.nuisance import resolved
 from sb3_tdpg.vec_env import make_episodes_env
 
 __all__ = ["TDPG", "TrainingDivergedError"]
@@ -103,15 +101,10 @@ class TDPG(EpisodicAlgorithm):
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
         the next state; unused with ``baseline="mean"``.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping.
-    :param nuisance: A declared family of changes of the sensor, that the policy is to ignore. ``"auto"``: random
-        colours, patterns, contrasts and noise for images, nothing for vectors. ``None``: nothing. A dict of
-        perturbations and severities, a function, ...: see :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`.
-    :param nuisance_level: Where it is removed. ``"rollouts"``: roll out under the nuisance. ``"action"``: roll out
-        plainly, and make the actions the same under the nuisance in a phase of its own after the passes of an epoch.
-        ``"trv"``: roll out under the nuisance, and minimise an upper bound on what the TRVs know of it in that phase
-        (:class:`~sb3_tdpg.information.nuisance.NuisancePhase`). ``"auto"``: ``"rollouts"`` with ``nuisance="auto"``,
-        where every image has a change of its own; ``"action"`` for a declared nuisance.
-    :param nuisance_steps: Gradient steps of the phase; unused with ``"rollouts"``.
+    :param nuisance: Changes of the sensor in the rollouts, that the policy is to ignore. ``"auto"``: random colours,
+        patterns, contrasts and noise for images, nothing for vectors. ``None``: nothing. A dict of perturbations and
+        severities, a function, ...: see :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is
+        wrapped in it.
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.
@@ -152,8 +145,6 @@ class TDPG(EpisodicAlgorithm):
         gae_lambda: float | None = None,
         max_grad_norm: float | None = None,
         nuisance: Any = "auto",
-        nuisance_steps: int = 24,
-        nuisance_level: str = "auto",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -224,7 +215,6 @@ class TDPG(EpisodicAlgorithm):
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.n_threads: int | None = settings["n_threads"]
         self.nuisance = nuisance
-        self.nuisance_steps, self.nuisance_level = nuisance_steps, nuisance_level
         self.first_cost: float | None = None
         """Mean episode cost of the first epoch."""
         self.auto_weight: AutoWeight | None = None
@@ -243,6 +233,7 @@ class TDPG(EpisodicAlgorithm):
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._set_problem(self._check_problem(self.env), self.env)
+            self.env = self._with_nuisance(self.env)
         elif self.horizon == 0:
             raise ValueError("TDPG needs an environment to learn the horizon and the spaces from: pass env=...")
         self._setup_beta()
@@ -273,12 +264,6 @@ class TDPG(EpisodicAlgorithm):
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
             value_function = ValueFunction(self.state_dim, self.horizon, with_changes=self.values_see_changes)
             self.value_function = value_function.to(self.device)
-        self.nuisance, level = resolved(self.nuisance, self.nuisance_level, self.observation_space)
-        self.nuisance_phase = None
-        if self.nuisance is not None:
-            self.nuisance_level = level
-            self.nuisance_phase = NuisancePhase(self.policy, self.nuisance_steps, level)
-            self._make_nuisance()
         # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         n_critics = 1 if self.pools_information else self.horizon
@@ -287,7 +272,7 @@ class TDPG(EpisodicAlgorithm):
         n_columns = self.n_episodes or math.ceil(self.epoch_size / self.horizon)
         self.rollout_buffer = EpisodeBuffer(
             self.horizon, self.observation_space, self.action_space, device=self.device, gamma=self.gamma,
-            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim, keeps_plain=self.perturbs_rollouts,
+            n_envs=n_columns, state_dim=self.state_dim, trv_dim=self.policy.trv_dim,
         )  # fmt: skip
 
     @property
@@ -332,7 +317,7 @@ class TDPG(EpisodicAlgorithm):
             were before that step.
         """
         self.policy.set_training_mode(True)
-        self._update_learning_rate([self.policy.optimizer, *(p.optimizer for p in [self.nuisance_phase] if p)])
+        self._update_learning_rate(self.policy.optimizer)
         in_segments = not self.policy.time_varying
         batch = self.rollout_buffer.episode_batch(whole_horizon=not in_segments)
         mean_cost = batch.costs.sum(0).mean().item()
@@ -355,7 +340,7 @@ class TDPG(EpisodicAlgorithm):
         if in_segments:
             batch = batch.segments(self.bptt_steps or len(batch.costs))
         # What the passes need of it: images are pooled once.
-        passes = batch._replace(observations=self.policy.pooled(batch.observations), plain_observations=None)
+        passes = batch._replace(observations=self.policy.pooled(batch.observations))
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
@@ -393,10 +378,6 @@ class TDPG(EpisodicAlgorithm):
                 self.logger.record_mean("train/policy_loss", policy_loss.item())
                 self.logger.record_mean("train/loss", loss.item())
                 self.logger.record_mean("train/grad_norm", grad_norm.item())
-        if self.nuisance_phase is not None:
-            known = self.nuisance_phase.remove(batch, self.rollout_buffer.mean_length, self._check_finite)
-            for name, value in known.items():
-                self.logger.record(f"nuisance/{name}", value)
         # Last: the rollouts and all of their gradients saw the same inputs.
         self.policy.update_statistics(whole)
 

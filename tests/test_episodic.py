@@ -1,51 +1,13 @@
-"""Rollouts of whole episodes: where an epoch ends, the members of a nuisance, and what follows an error."""
+"""Rollouts of whole episodes: where an epoch ends, and what follows an error."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
-import torch as th
-from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env, train_epochs
+from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tdpg import TDPG, TrainingDivergedError, make_episodes_env
-from sb3_tdpg.robustness.nuisance import Members, Nuisance
-
-
-class Counting(Nuisance, Members):
-    """A sensor that adds the number of episodes that an environment has begun since the members were drawn."""
-
-    def members(self, n):
-        self.begun = np.zeros(n, np.float32)
-        return self
-
-    def begin(self, which):
-        self.begun[which] += 1
-
-    def __call__(self, observations, states, which):
-        return observations + self.begun[which, None]
-
-
-@pytest.mark.parametrize("level", ["rollouts", "trv"])
-def test_an_episode_of_a_rollout_has_one_member_and_the_next_one_another(level):
-    env = DummyVecEnv([partial(CountdownEnv, 0, [4, 2, 3]), partial(CountdownEnv, 1, [1, 4, 2])])
-    model = tiny_tdpg(env, n_episodes=6, beta=math.inf, nuisance=Counting(), nuisance_level=level)
-    model.train = lambda: None
-    train_epochs(model, 1)
-    batch = model.rollout_buffer.episode_batch()
-    added = (batch.observations - batch.plain_observations)[..., 0]
-    number = th.arange(6) // 2  # of the episode, in its environment
-    th.testing.assert_close(added, batch.alive * number, rtol=0, atol=0)
-
-
-def test_another_environment_brings_its_own_scenes():
-    scenes = {"env_kwargs": dict(sensor_bias=[10.0, -10.0])}
-    model = tiny_tdpg(make_episodes_env("Lava-v0", 20), nuisance=scenes)
-    model.set_env(make_episodes_env("Lava-v0", 20, env_kwargs=dict(sensor_noise_std=0.0)))
-    observations, states = np.zeros((3, 2), np.float32), np.array([[1.0, 0.5], [2.0, 0.0], [4.0, -1.0]])
-    seen = model.nuisance_phase.nuisance.members(3)(observations, states, np.arange(3))
-    np.testing.assert_array_equal(seen, states + np.array([10.0, -10.0]))
+from sb3_tdpg import TDPG, TrainingDivergedError
 
 
 def test_the_last_epoch_takes_the_steps_that_are_left():

@@ -1,46 +1,27 @@
-"""The nuisance: its declaration, its members, the phase that removes it, and the bound on what is known of it."""
+"""The nuisance of a training: what TDPG puts around its environment, and what the policy then sees and stores."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from small_problems import assert_same_parameters, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
-from torch.distributions import Normal
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG, make_episodes_env
-from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.information.nuisance import action_divergence, behaviour, encoder_divergence
-from sb3_tdpg.robustness.nuisance import Members, Nuisance, OneMember, make_nuisance
+from sb3_tdpg.robustness import PerturbedVecEnv
+from sb3_tdpg.robustness.nuisance import NuisanceVecEnv
 
-IMAGES = spaces.Box(0, 255, (3, 24, 24), np.uint8)
 DEPTH = spaces.Box(0.2, 0.7, (1, 16, 16), np.float32)
-VECTOR = spaces.Box(-1, 1, (2,), np.float32)
-PARTS = spaces.Dict(camera=IMAGES, arm=VECTOR)
+IMAGES_AND_VECTOR = spaces.Dict(camera=spaces.Box(0, 255, (3, 64, 64), np.uint8), arm=spaces.Box(-1, 1, (2,)))
 
 
-def ball_env(n=6, **kwargs):
-    return make_episodes_env("BallCatch-v0", n, env_kwargs=dict(renderer="fast", **kwargs), seed=0)
-
-
-def observed(space, n=4, length=3, seed=0):
-    """Observations of n episodes, a list of steps."""
-    rng = np.random.default_rng(seed)
-
-    def one(part):
-        if isinstance(part, spaces.Dict):
-            return {key: one(x) for key, x in part.items()}
-        high = 256 if part.dtype == np.uint8 else part.high.flat[0]
-        return rng.uniform(part.low.flat[0], high, (n, *part.shape)).astype(part.dtype)
-
-    return [one(space) for _ in range(length)]
-
-
-def shown(members, steps, which=None, states=None):
-    n = len(next(iter(steps[0].values())) if isinstance(steps[0], dict) else steps[0])
-    which = np.arange(n) if which is None else which
-    return [members(step, np.zeros((n, 1)) if states is None else states, which) for step in steps]
+def ball_env(n=20):
+    return make_episodes_env("BallCatch-v0", n, env_kwargs=dict(renderer="fast"), seed=0)
 
 
 def rollouts(model):
@@ -50,384 +31,97 @@ def rollouts(model):
     return model.rollout_buffer.episode_batch()
 
 
-# -- declarations -----------------------------------------------------------------------------------------------
+def wrappers(model):
+    """The classes around the environment, the outermost first."""
+    env, found = model.env, []
+    while hasattr(env, "venv"):
+        found.append(type(env))
+        env = env.venv
+    return found
 
 
-@pytest.mark.parametrize(("declared", "space"), [
-    ("auto", IMAGES),
-    ({"noise": 1, "dropped_pixels": (1, 4), "brightness": 2}, DEPTH),
-    ("auto", PARTS),
-    ("images", IMAGES),
-    ({"images": dict(color=0.0, held=False)}, IMAGES),
-    ("noise", IMAGES),
-    ({"noise": (1, 3), "contrast": 4, "delay": 2}, IMAGES),
-    ({"vector_bias": (4, 5), "noise": (4, 5)}, PARTS),
-    ({"vector_noise": 5}, VECTOR),
-    (lambda y, rng: y + np.asarray(rng.random(), y.dtype), VECTOR),
-])  # fmt: skip
-def test_a_declared_nuisance_changes_the_observations_and_keeps_shape_and_type(declared, space):
-    nuisance = make_nuisance(declared, space, toy_vec_env(observation_space=space))
-    steps = observed(space)
-    before = [{k: v.copy() for k, v in s.items()} if isinstance(s, dict) else s.copy() for s in steps]
-    for step, unchanged, after in zip(steps, before, shown(nuisance.members(4), steps), strict=True):
-        parts = [(step, unchanged, after)]
-        if isinstance(step, dict):
-            parts = [(step[k], unchanged[k], after[k]) for k in step]
-        for y, copy, changed in parts:
-            np.testing.assert_array_equal(y, copy)
-            assert changed.shape == y.shape and changed.dtype == y.dtype
-        if declared != {"noise": (1, 3), "contrast": 4, "delay": 2}:
-            assert any((y != changed).any() for y, _, changed in parts)
+def test_the_algorithm_is_imported_without_any_perturbation():
+    code = "import sys, sb3_tdpg.tdpg; assert not [name for name in sys.modules if 'robustness' in name]"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize(("declared", "space", "fragment"), [
-    ("fog", IMAGES, "perturbation='fog' is unknown"),
-    ("noise", VECTOR, "'noise' does not apply"),
-    ("images", DEPTH, "images of bytes"),
-    ("vector_noise", spaces.Dict(camera=IMAGES), "applies to no part"),
-    ({"noise": 6}, IMAGES, "severity=6"),
-    ("vector_noise", spaces.Dict(arm=spaces.Box(-np.inf, np.inf, (2,))), "needs finite bounds of"),
-    ({"noise": (3, 1)}, IMAGES, "the lowest and the highest"),
-    ({"images": dict(colour=1)}, IMAGES, "keywords of MixtureNuisance"),
-    ({"images": dict(pattern=2)}, IMAGES, "pattern=2 must be between 0 and 1"),
-    ({}, IMAGES, "must be None, 'auto'"),
-    (3, IMAGES, "must be None, 'auto'"),
-    ({"env_kwargs": dict(texture="violet_dots")}, IMAGES, "needs an environment that can observe a given state"),
-])  # fmt: skip
-def test_a_wrong_declaration_is_explained(declared, space, fragment):
-    with pytest.raises(ValueError, match=fragment):
-        make_nuisance(declared, space, toy_vec_env(observation_space=space))
-
-
-def test_a_function_that_changes_the_shape_is_refused():
-    nuisance = make_nuisance(lambda y, rng: y[:, :1], VECTOR, toy_vec_env())
-    with pytest.raises(ValueError, match=r"shape \(4, 1\).*expected those it was given: \(4, 2\)"):
-        shown(nuisance.members(4), observed(VECTOR))
-
-
-@pytest.mark.parametrize(("arguments", "fragment"), [
-    (dict(nuisance="vector_noise", nuisance_steps=0), "nuisance_steps=0 must be an integer of at least 1"),
-    (dict(nuisance="vector_noise", nuisance_level="both"), "nuisance_level='both' is unknown"),
-    (dict(nuisance="noise"), "does not apply"),
-])  # fmt: skip
-def test_wrong_arguments_are_refused_before_training(arguments, fragment):
-    with pytest.raises(ValueError, match=fragment):
-        tiny_tdpg("Lava-v0", **arguments)
-
-
-def test_the_default_is_a_nuisance_for_images_and_none_for_vectors():
-    assert tiny_tdpg("Lava-v0").nuisance is None
-    assert tiny_tdpg("Lava-v0").nuisance_phase is None
-    assert tiny_tdpg(toy_vec_env(observation_space=DEPTH), beta=math.inf).nuisance is None
-    assert tiny_tdpg(ball_env(20)).nuisance == {"images": {"held": False}}
-    assert tiny_tdpg(ball_env(20), nuisance=None).nuisance_phase is None
-
-
-# -- members ----------------------------------------------------------------------------------------------------
-
-
-def test_what_is_held_changes_equal_images_of_an_episode_equally():
-    space = spaces.Box(0, 255, (3, 24, 24), np.uint8)
-    env = toy_vec_env(observation_space=space)
-    steps = [observed(space, length=1)[0]] * 3
-    for held in (True, False):
-        members = make_nuisance({"images": dict(noise=0.0, held=held)}, space, env).members(4)
-        first, second, third = shown(members, steps)
-        assert (first == second).all() == held == (first == third).all()
-    members = make_nuisance({"images": dict(noise=0.0)}, space, env).members(4)
-    first = shown(members, steps[:1])[0]
-    members.begin(np.array([1, 3]))
-    second = shown(members, steps[:1])[0]
-    assert [bool((first[i] == second[i]).all()) for i in range(4)] == [True, False, True, False]
-
-
-def test_every_episode_has_one_family_of_several():
-    space = spaces.Box(-100, 100, (2,), np.float32)
-    declared = dict(vector_bias=5, vector_scale=5)
-    members = make_nuisance(declared, space, toy_vec_env(observation_space=space)).members(400)
-    zeros = [np.zeros((400, 2), np.float32)] * 2
-    first, second = shown(members, zeros)
-    is_biased = (first != 0).any(axis=1)  # a scale leaves zeros as they are
-    np.testing.assert_array_equal(first, second)
-    assert 0.4 < is_biased.mean() < 0.6
-    # Other episodes in another order: the same members.
-    which = np.array([7, 3, 390])
-    np.testing.assert_array_equal(members(zeros[0][:3], np.zeros((3, 1)), which), first[which])
-
-
-def test_another_scene_is_seen_in_the_same_state():
-    env = ball_env()
-    declared = dict(env_kwargs=[dict(texture="violet_dots"), dict(texture="grey_plaster")])
-    nuisance = make_nuisance(declared, env.observation_space, env)
-    images = env.reset()
-    states = np.stack([info["state"] for info in env.reset_infos])
-    members = nuisance.members(6)
-    (seen,) = shown(members, [images], states=states)
-    others = [BallCatchEnv(renderer="fast", **kwargs).sensor(states) for kwargs in declared["env_kwargs"]]
-    for i in range(6):
-        assert any((seen[i] == other[i]).all() for other in others)
-        assert not (seen[i] == images[i]).all()
-
-
-def test_a_scene_may_redraw_components_of_the_state():
-    env = ball_env()
-    declared = {"env_kwargs": dict(robot_range=(1.0, 1.0)), "redraw": ["d (m)"]}
-    images = env.reset()
-    states = np.stack([info["state"] for info in env.reset_infos])
-    (seen,) = shown(make_nuisance(declared, env.observation_space, env).members(6), [images], states=states)
-    states[:, 0] = 1.0
-    np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast").sensor(states))
-    with pytest.raises(ValueError, match=r"redraw=\['e'\] are no components of the state: use some of \['d \(m\)'"):
-        make_nuisance({**declared, "redraw": ["e"]}, env.observation_space, env)
-
-
-def test_the_members_follow_torch_and_leave_the_environment_alone():
-    def train(nuisance):
-        model = tiny_tdpg("Lava-v0", nuisance=nuisance, nuisance_steps=2)
-        train_epochs(model, 2)
-        return model
-
-    declared = {"vector_noise": (1, 5), "vector_dropout": 3}
-    assert_same_parameters(parameters(train(declared).policy), parameters(train(declared).policy))
-    first_rollouts = [rollouts(tiny_tdpg("Lava-v0", nuisance=n)).observations for n in (None, declared)]
-    th.testing.assert_close(*first_rollouts, rtol=0, atol=0)
-
-
-def test_one_member_of_a_family_is_the_same_for_all_episodes_and_every_time():
-    steps = observed(VECTOR, n=1) * 2
-    steps = [np.repeat(step, 4, axis=0) for step in steps]
-    family = make_nuisance("vector_bias", VECTOR, toy_vec_env(observation_space=VECTOR))
-    before = th.get_rng_state()
-    first, again, other = (shown(OneMember(family, seed).members(4), steps) for seed in (1, 1, 2))
-    assert (th.get_rng_state() == before).all()
-    np.testing.assert_array_equal(first, again)
-    assert (first[0] == first[0][:1]).all()
-    assert (np.array(first) != np.array(other)).any()
-
-
-# -- the phase --------------------------------------------------------------------------------------------------
-
-
-class Shifted(Nuisance):
-    """A sensor that adds one of some offsets, which the episode keeps."""
-
-    def __init__(self, *offsets):
-        self.offsets = np.array(offsets, np.float32)
-
-    def members(self, n):
-        return ShiftedMembers(self.offsets, n)
-
-
-class ShiftedMembers(Members):
-    def __init__(self, offsets, n):
-        self.offsets, self.offset = offsets, np.zeros(n, np.float32)
-        self.begin(np.arange(n))
-
-    def begin(self, which):
-        self.offset[which] = self.offsets[th.randint(len(self.offsets), (len(which),)).numpy()]
-
-    def __call__(self, observations, states, which):
-        return observations + self.offset[which, None]
-
-
-@pytest.mark.parametrize("level", ["action", "trv"])
-@pytest.mark.parametrize(("env", "settings"), [
-    ("Lava-v0", {}),
-    ("Lava-v0", dict(beta=math.inf, encoder_gradient="pathwise")),
-    ("Lava-v0", dict(policy_kwargs=dict(time_varying=False), bptt_steps=2)),
-    ("Discrete", {}),
-    ("MultiDiscrete", {}),
-])  # fmt: skip
-def test_the_phase_lowers_what_is_known_of_the_nuisance(env, settings, level):
-    actions = dict(Discrete=spaces.Discrete(3), MultiDiscrete=spaces.MultiDiscrete([2, 3])).get(env)
-    env = "Lava-v0" if actions is None else toy_vec_env(2, action_space=actions)
-    settings = dict(nuisance=Shifted(-1.0, 1.0), nuisance_steps=40, nuisance_level=level, learning_rate=1e-2) | settings
-    model = tiny_tdpg(env, **settings)
-    batch = rollouts(model)
-    if not model.policy.time_varying:
-        batch = batch.segments(2)
-    phase, which = model.nuisance_phase, level == "trv"
-    for group in phase.optimizer.param_groups:
-        group["lr"] = 1e-2
-    with th.no_grad():  # a policy that reacts to its observations
-        for parameter in model.policy.encoder.parameters():
-            parameter.mul_(3.0)
-    th.manual_seed(1)
-    perturbed = phase.perturbed(batch)
-    before = [x.mean().item() for x in phase.divergences(batch, perturbed)]
-    known = phase.remove(batch, 5.0, model._check_finite)
-    after = [x.mean().item() for x in phase.divergences(batch, perturbed)]
-    assert after[which] < 0.5 * before[which]
-    assert known.keys() == {"action_kl", "trv_kl", "information"}
-    assert known["information"] == pytest.approx(5.0 * known["trv_kl"])
-    assert known[("action_kl", "trv_kl")[which]] < 0.7 * before[which]
-
-
-def test_on_plain_observations_the_policy_stays_as_it_was():
-    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-1.0, 1.0), nuisance_steps=40)
-    batch = rollouts(model)
-    with th.no_grad():
-        before = behaviour(model.policy, batch, batch.observations)
-        shift = action_divergence(behaviour(model.policy, batch, batch.observations + 1.0), before).mean()
-    model.nuisance_phase.remove(batch, 5.0, model._check_finite)
-    with th.no_grad():
-        moved = action_divergence(behaviour(model.policy, batch, batch.observations), before).mean()
-    assert moved < 0.3 * shift
-
-
-def test_a_nuisance_that_changes_nothing_changes_no_parameter():
-    model = tiny_tdpg("Lava-v0", nuisance=Shifted(0.0), nuisance_steps=5)
-    batch = rollouts(model)
-    before = parameters(model.policy)
-    known = model.nuisance_phase.remove(batch, 5.0, model._check_finite)
-    for name, value in parameters(model.policy).items():
-        th.testing.assert_close(value, before[name], rtol=0, atol=1e-4)  # rounding, and Adam makes it a step
-    assert known["action_kl"] == known["trv_kl"] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_in_rollouts_the_policy_gradient_alone_removes_the_nuisance_and_what_is_left_is_measured():
-    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-1.0, 1.0), nuisance_level="rollouts")
-    batch = rollouts(model)
-    before = parameters(model.policy)
-    known = model.nuisance_phase.remove(batch, 5.0, model._check_finite)
-    assert all(th.equal(value, before[name]) for name, value in parameters(model.policy).items())
-    assert known["information"] == pytest.approx(5.0 * known["trv_kl"]) and known["trv_kl"] > 0
-
-
-@pytest.mark.parametrize(("nuisance", "level", "expected"), [
-    ("auto", "auto", ("rollouts", {"images": {"held": False}})),
-    ("auto", "action", ("action", {"images": {"held": True}})),
-    ({"noise": 2}, "auto", ("action", {"noise": 2})),
-    (None, "auto", ("auto", None)),
-])  # fmt: skip
-def test_images_have_the_nuisance_in_the_rollouts_unless_one_is_declared(tmp_path, nuisance, level, expected):
-    model = tiny_tdpg(ball_env(4), n_episodes=4, nuisance=nuisance, nuisance_level=level, policy_kwargs={})
-    assert (model.nuisance_level, model.nuisance) == expected
-    assert model.perturbs_rollouts == (expected[0] == "rollouts")
-    model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", env=model.env)
-    assert (loaded.nuisance_level, loaded.nuisance) == expected
-    assert loaded.perturbs_rollouts == model.perturbs_rollouts
-
-
-def test_the_divergences_are_those_of_the_two_densities():
-    model = tiny_tdpg("Lava-v0", nuisance=Shifted(1.0))
-    batch = rollouts(model)
-    phase, policy = model.nuisance_phase, model.policy
-    actions, trvs = phase.divergences(batch, batch.observations + 1.0)
-    trv = plain_trv = th.zeros(20, policy.trv_dim)
-    for t in range(model.horizon):
-        at, y, eps = np.full(20, t), batch.observations[t], batch.noise[t]
-        with th.no_grad():
-            shifted, plain = policy.encoder_density(y + 1.0, trv, at), policy.encoder_density(y, trv, at)
-            expected = th.distributions.kl_divergence(Normal(*shifted), Normal(*plain)).sum(1)
-            th.testing.assert_close(trvs[t], expected, rtol=1e-4, atol=1e-6)
-            mean, std = policy.encoder_density(y, plain_trv, at)
-            trv, plain_trv = shifted[0] + shifted[1] * eps, mean + std * eps
-            p, q = (policy.action_density(x, at).distribution for x in (trv, plain_trv))
-            expected = th.distributions.kl_divergence(p, q).sum(1)
-            th.testing.assert_close(actions[t], expected, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("level", ["rollouts", "trv"])
-def test_under_the_nuisance_the_policy_sees_it_and_the_buffer_keeps_both(level):
-    model = tiny_tdpg("Lava-v0", nuisance=Shifted(-5.0, 5.0), nuisance_level=level)
-    batch = rollouts(model)
-    difference = batch.observations - batch.plain_observations
-    assert (difference.abs() - 5.0).abs().max() < 1e-5
-    assert (difference == difference[:1, :, :1]).float().mean() > 0.5  # one offset for an episode, up to rounding
-    assert (difference[0, :, 0] > 0).float().mean().item() == pytest.approx(0.5, abs=0.4)
-    with th.no_grad():
-        now = behaviour(model.policy, batch, batch.observations)
-    th.testing.assert_close(now.trvs, batch.trvs, rtol=1e-4, atol=1e-5)  # the policy acted on what it was shown
-
-
-def test_the_sum_over_time_bounds_the_information_about_the_nuisance():
-    """Of two equally likely members; the exact information by Monte Carlo, on whole episodes of TRVs."""
-    model = tiny_tdpg("Lava-v0", n_episodes=2000, nuisance=Shifted(-4.0, 4.0), nuisance_level="trv")
-    batch = rollouts(model)
-    policy, plain = model.policy, batch.plain_observations
-    with th.no_grad():
-        p = behaviour(policy, batch, batch.observations)
-        bound = encoder_divergence(policy, p, batch, plain).sum(0).mean().item()
-        # The density of an episode's TRVs under each member, given the states and the plain sensor's noise.
-        log_likelihoods = []
-        for offset in (-4.0, 4.0):
-            shifted = batch._replace(observations=plain + offset)
-            q = policy.episode_encoder_density(policy.episode_features(shifted), shifted)
-            log_likelihoods.append(q.log_prob(batch.trvs).sum((0, 2)))
-    joint = th.stack(log_likelihoods)
-    own = th.where(batch.observations[0, :, 0] < plain[0, :, 0], joint[0], joint[1])
-    information = (own - (th.logsumexp(joint, 0) - math.log(2))).mean().item()
-    assert 0.001 < information <= bound
-    assert information < math.log(2)
-
-
-def test_a_function_that_returns_nan_stops_with_the_parameters_of_before():
-    model = tiny_tdpg("Lava-v0", nuisance=lambda y, rng: y + np.float32(np.nan))
-    batch = rollouts(model)
-    before = parameters(model.policy)
-    with pytest.raises(ValueError, match="the nuisance returned observations that are NaN or infinite"):
-        model.nuisance_phase.remove(batch, 5.0, model._check_finite)
-    assert_same_parameters(parameters(model.policy), before)
-
-
-# -- the model --------------------------------------------------------------------------------------------------
-
-
-def test_a_loaded_model_goes_on_and_the_nuisance_may_be_changed(tmp_path):
-    plain = tiny_tdpg("Lava-v0")
-    train_epochs(plain, 1)
-    plain.save(tmp_path / "plain")
-    env = make_episodes_env("Lava-v0", 20, seed=0)
-    model = TDPG.load(tmp_path / "plain", env=env, nuisance={"vector_noise": 3}, nuisance_steps=2)
-    train_epochs(model, 1)
-    assert model.nuisance_phase.optimizer.state
-    model.save(tmp_path / "model")
-    assert TDPG.load(tmp_path / "model").nuisance == {"vector_noise": 3}  # without an environment
-    again = TDPG.load(tmp_path / "model", env=env)
-    first, second = (m.nuisance_phase.optimizer.state_dict()["state"][0]["exp_avg"] for m in (model, again))
-    th.testing.assert_close(first, second)
-    without = TDPG.load(tmp_path / "model", env=env, nuisance=None)
-    assert without.nuisance_phase is None
-    train_epochs(without, 1)
-
-
-def test_the_log_shows_what_is_known_of_the_nuisance():
-    model = tiny_tdpg("Lava-v0", nuisance="vector_bias", nuisance_steps=2)
-    train_epochs(model, 1)
-    logged = model.logger.name_to_value
-    assert {"nuisance/action_kl", "nuisance/trv_kl", "nuisance/information"} <= logged.keys()
+def test_the_default_is_a_nuisance_for_images_of_bytes_and_none_for_vectors_and_depth():
+    assert wrappers(tiny_tdpg("Lava-v0")) == []
+    assert wrappers(tiny_tdpg(toy_vec_env(observation_space=DEPTH), beta=math.inf)) == []
+    assert wrappers(tiny_tdpg(ball_env())) == [NuisanceVecEnv]
+    assert wrappers(tiny_tdpg(toy_vec_env(observation_space=IMAGES_AND_VECTOR))) == [NuisanceVecEnv]
+    assert wrappers(tiny_tdpg(ball_env(), nuisance=None)) == []
 
 
 def test_with_the_default_for_images_the_policy_sees_changed_ones_each_with_its_own_change():
-    model = tiny_tdpg(ball_env(20), policy_kwargs={})
-    batch = rollouts(model)
-    change = batch.observations.float() - batch.plain_observations.float()
-    by_image = change.abs().mean(dim=(2, 3, 4))
-    assert (by_image > 5).float().mean() > 0.8
-    assert (by_image.std(dim=0) > 5).all()  # an image that is held would have nearly the same at all steps
-    with th.no_grad():
-        now = behaviour(model.policy, batch, batch.observations)
-    th.testing.assert_close(now.trvs, batch.trvs, rtol=1e-3, atol=1e-4)
+    model = tiny_tdpg(ball_env(), policy_kwargs={})
+    first, second = (model.env._perturber(np.full((20, 3, 64, 64), 120, np.uint8)) for _ in range(2))
+    assert (np.abs(first.astype(int) - 120).mean(axis=(1, 2, 3)) > 3).mean() > 0.8
+    assert (np.abs(first.astype(int) - second).mean(axis=(1, 2, 3)) > 5).mean() > 0.8  # more than the noise
 
 
-def test_the_phase_on_images_makes_the_actions_less_sensitive():
-    def known(nuisance):
-        settings = dict(nuisance=nuisance, nuisance_level="action", nuisance_steps=30)
-        model = tiny_tdpg(ball_env(20), **settings, policy_kwargs={}, seed=1)
-        train_epochs(model, 3)
-        judge = TDPG("TRVPolicy", ball_env(20), nuisance_level="action", n_episodes=20, seed=2).nuisance_phase
-        judge.policy = model.policy
-        batch = rollouts(model)
-        th.manual_seed(3)
-        return judge.divergences(batch, judge.perturbed(batch))[0].mean().item()
+def test_the_policy_acts_on_what_it_is_shown_and_the_states_stay_true():
+    env = make_episodes_env("Lava-v0", 20, env_kwargs=dict(sensor_noise_std=0.0))
+    model = tiny_tdpg(env, nuisance=[("vector_bias", 5, 10.0)])
+    batch, policy = rollouts(model), model.policy
+    offset = batch.observations - batch.states
+    assert offset.abs().min() > 1.0
+    th.testing.assert_close(offset, offset[:1].expand_as(offset), rtol=1e-3, atol=1e-5)  # one for an episode
+    trv = th.zeros(20, policy.trv_dim)
+    for t in range(model.horizon):
+        with th.no_grad():
+            mean, std = policy.encoder_density(batch.observations[t], trv, np.full(20, t))
+        th.testing.assert_close(mean + std * batch.noise[t], batch.trvs[t], rtol=1e-4, atol=1e-5)
+        trv = batch.trvs[t]
 
-    assert known("auto") < 0.5 * known(None)
+
+def test_where_the_observation_stands_in_for_the_state_it_is_the_unperturbed_one():
+    batch = rollouts(tiny_tdpg(make_vec_env("CartPole-v1", 4, seed=0), n_episodes=8, nuisance={"vector_bias": 5}))
+    assert batch.states[0].abs().max() <= 0.05 < batch.observations[0].abs().max()  # where a cart starts
+    now, following = batch.states[:-1], batch.states[1:]
+    runs = batch.alive[1:] > 0
+    moved = now[..., 0] + 0.02 * now[..., 1]  # as the cart does
+    th.testing.assert_close(following[..., 0][runs], moved[runs], rtol=1e-4, atol=1e-6)
 
 
-def test_other_seeds_train_other_policies():
-    models = [tiny_tdpg("Lava-v0", nuisance="vector_bias", nuisance_steps=2, seed=seed) for seed in (0, 1)]
-    for model in models:
-        train_epochs(model, 1)
-    assert not same_parameters(*(parameters(model.policy) for model in models))
+def test_the_nuisance_leaves_the_environment_alone_and_follows_the_seed():
+    def train(nuisance, seed=0):
+        model = tiny_tdpg("Lava-v0", nuisance=nuisance, seed=seed)
+        train_epochs(model, 2)
+        return parameters(model.policy)
+
+    declared = {"vector_noise": (1, 5), "vector_dropout": 3}
+    assert_same_parameters(train(declared), train(declared))
+    assert not same_parameters(train(declared), train(declared, seed=1))
+    assert not same_parameters(train(declared), train(None))
+    first_states = [rollouts(tiny_tdpg("Lava-v0", nuisance=n, seed=0)).states[0] for n in (None, declared)]
+    th.testing.assert_close(*first_states, rtol=0, atol=0)
+
+
+def test_an_environment_that_comes_from_another_model_is_wrapped_once(tmp_path):
+    model = tiny_tdpg("Lava-v0", nuisance={"vector_noise": 3})
+    train_epochs(model, 1)
+    model.save(tmp_path / "model")
+    assert TDPG.load(tmp_path / "model").nuisance == {"vector_noise": 3}  # without an environment
+    assert wrappers(TDPG.load(tmp_path / "model", env=model.env)) == [NuisanceVecEnv]
+    without = TDPG.load(tmp_path / "model", env=model.env, nuisance=None)
+    assert wrappers(without) == []
+    train_epochs(without, 1)
+    own = PerturbedVecEnv(make_episodes_env("Lava-v0", 20), "vector_bias")
+    model.set_env(own)
+    model.set_env(model.env)
+    assert wrappers(model) == [NuisanceVecEnv, PerturbedVecEnv]
+    train_epochs(model, 1)
+
+
+def test_another_environment_brings_its_own_scenes():
+    model = tiny_tdpg(make_episodes_env("Lava-v0", 20), nuisance={"env_kwargs": dict(sensor_bias=[10.0, -10.0])})
+    model.set_env(make_episodes_env("Lava-v0", 20, env_kwargs=dict(sensor_noise_std=0.0)))
+    seen = model.env.reset()
+    states = np.stack([info["state"] for info in model.env.reset_infos])
+    np.testing.assert_allclose(seen, states + np.array([10.0, -10.0]), rtol=1e-6)
+
+
+def test_a_nuisance_goes_inside_a_normalisation():
+    with pytest.raises(ValueError, match=r"nuisance='vector_noise': .*VecNormalize\(PerturbedVecEnv"):
+        tiny_tdpg(VecNormalize(make_episodes_env("Lava-v0", 20), norm_reward=False), nuisance="vector_noise")

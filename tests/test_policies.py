@@ -395,19 +395,20 @@ def test_the_log_probability_of_an_action_is_that_of_its_distribution(name):
 
 @pytest.mark.parametrize("space", [CHW, HWC], ids=["CHW", "HWC"])
 def test_images_train_in_either_layout(space, tmp_path):
-    model = tiny_tdpg(toy_vec_env(observation_space=space), beta=0.1, mi_estimator="mine", policy_kwargs={})
+    settings = dict(beta=0.1, mi_estimator="mine", policy_kwargs={}, nuisance=None)
+    model = tiny_tdpg(toy_vec_env(observation_space=space), **settings)
     train_epochs(model, 2)
     assert model.rollout_buffer.observations.dtype == np.uint8
     assert model.rollout_buffer.observations.shape == (3, 20, 3, 20, 16)
     state = model.rollout_buffer.states[0, :, 0]
-    shown = model.rollout_buffer.plain_observations[0, :, 0, 0, 0]
+    shown = model.rollout_buffer.observations[0, :, 0, 0, 0]
     np.testing.assert_array_equal(shown, (127 * (state + 1)).astype(np.uint8))
     env = ToyEnv(observation_space=space)
     observation, _ = env.reset(seed=0)
     for batch in (observation, np.stack([observation] * 3)):  # as the user's environment gives them
         assert model.predict(batch)[0].shape == (*batch.shape[:-3], 1)
     model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", env=toy_vec_env(observation_space=space), device="cpu")
+    loaded = TDPG.load(tmp_path / "model", env=toy_vec_env(observation_space=space), device="cpu", nuisance="auto")
     train_epochs(loaded, 1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomica
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
-from sb3_tdpg.robustness.nuisance import OneMember, make_nuisance
+from sb3_tdpg.robustness.families import Family
+from sb3_tdpg.robustness.nuisance import automatic
 
 FAMILY = "a member for each episode"
 
@@ -46,7 +48,7 @@ def certify_nuisance(
 
     :param models: Files that ``model.save()`` wrote.
     :param env_id: The training environment, one of this package.
-    :param declared: See :func:`~sb3_tdpg.robustness.nuisance.make_nuisance`.
+    :param declared: See :class:`~sb3_tdpg.robustness.families.Family`.
     :param out: Folder for ``summary.md``, ``nuisance.csv`` and ``config.json``.
     :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
         the cost of standing at the wall.
@@ -74,13 +76,15 @@ def certify_nuisance(
     with threads(1):
         for label, model in loaded.items():
             env = scenario_env(training, model, n_episodes=1, n_envs=1)
-            family = make_nuisance(declared, model.observation_space, env)
-            if family is None:
+            if (wanted := automatic(declared, env.observation_space, held=True)) is None:
                 raise ValueError(f"nuisance={declared!r} is none for {model.observation_space}: name the perturbations")
+            family = Family(wanted, env)
+            if family.is_plant:
+                raise ValueError(f"nuisance={declared!r} changes the actions: a certificate is for those of the sensor")
             print(f"{label}: {n_episodes:,} training episodes")
             episodes = TrainingEpisodes(model, training, n_budget_episodes=n_budget_episodes, **settings)
-            shifts = [Shift(FAMILY, nuisance=family)]
-            shifts += [Shift(f"member {i}", nuisance=OneMember(family, seed + i)) for i in range(n_members)]
+            shifts = [Shift(FAMILY, nuisance=partial(family.members, seed=seed))]
+            shifts += [Shift(f"member {i}", nuisance=partial(family.one, seed + i)) for i in range(n_members)]
             for i, shift in enumerate(tqdm(shifts, desc=label)):
                 certified = episodes.certify(shift)
                 costs, measured = episodes.measure(shift, n_test_episodes, seed=seed + 1 + i)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
 from sb3_tdpg.evaluation.rollout import act
 from sb3_tdpg.information import InformationBatch, LogDet
-from sb3_tdpg.robustness.nuisance import Members, Nuisance
+from sb3_tdpg.robustness.core import Members
 from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
@@ -57,14 +57,14 @@ class Shift:
     :param start_kl: D[shifted start || start in training] in nats.
     :param sensor_kl: Largest D[shifted sensor || sensor in training] of one observation over all states; inf if it is
         not known.
-    :param nuisance: A change of the observations on top of the sensor's; every episode has a member of it.
+    :param nuisance: A change of the observations on top of the sensor's: draws what N episodes have of it.
     """
 
     name: str
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     start_kl: float = 0.0
     sensor_kl: float = math.inf
-    nuisance: Nuisance | None = None
+    nuisance: Callable[[int], Members] | None = None
 
 
 class Budget(NamedTuple):
@@ -278,16 +278,15 @@ class TrainingEpisodes:
     def _shifted(self, shift: Shift) -> Any:
         kwargs = {**self.scenario.env_kwargs, **shift.env_kwargs}
         env = _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
-        return env if shift.nuisance is None else _UnderNuisance(env, shift.nuisance, self.seed)
+        return env if shift.nuisance is None else _UnderNuisance(env, shift.nuisance)
 
 
 class _UnderNuisance:
     """An environment whose sensor shows what the members of a nuisance make of it, drawn at the first call."""
 
-    def __init__(self, env: POMDPEnv, nuisance: Nuisance, seed: int) -> None:
+    def __init__(self, env: POMDPEnv, nuisance: Callable[[int], Members]) -> None:
         self.env, self.nuisance = env, nuisance
         self.members: Members | None = None
-        self.random_state = th.Generator().manual_seed(seed).get_state()  # torch's own stays as it is
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)
@@ -301,14 +300,9 @@ class _UnderNuisance:
         self.env.np_random = generator
 
     def sensor(self, state: np.ndarray) -> Any:
-        plain = self.env.sensor(state)
-        with th.random.fork_rng(devices=[]):
-            th.set_rng_state(self.random_state)
-            if self.members is None:
-                self.members = self.nuisance.members(len(state))
-            seen = self.members(plain, state, np.arange(len(state)))
-            self.random_state = th.get_rng_state()
-        return seen
+        if self.members is None:
+            self.members = self.nuisance(len(state))
+        return self.members(self.env.sensor(state), None, state)
 
 
 def record_episodes(model: Any, env: Any, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.vec_env import VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -33,7 +31,7 @@ from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves, sorted_walls
 from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
 from sb3_tdpg.presets import IMAGE_ENCODER
-from sb3_tdpg.robustness.training import VecImagePerturbation
+from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 
 # Fixed before any policy was evaluated on the test rows: the defaults were chosen on seeds below 100 and on the walls
@@ -98,7 +96,7 @@ def methods(launch: str) -> tuple[Method, ...]:
         block = load_hyperparams(BLOCK, algo)
         overrides = dict(
             n_timesteps=load_hyperparams(BLOCK)["n_timesteps"],
-            vec_env_wrapper=["sb3_tdpg.robustness.training.VecImagePerturbation"],
+            vec_env_wrapper=[{"sb3_tdpg.robustness.PerturbedVecEnv": dict(perturbation="images")}],
             policy_kwargs={**block["policy_kwargs"], **policy_kwargs},
             env_kwargs=env_kwargs,
         )
@@ -122,25 +120,9 @@ def methods(launch: str) -> tuple[Method, ...]:
 WITHOUT_CONTROLS = ("TDPG", "PG", "RecurrentPPO")
 
 
-def gamma(images: np.ndarray) -> np.ndarray:
+def gamma(images: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
     """Square the brightness of every pixel, which the declared changes do not contain: uint8, any shape."""
     return np.rint(images.astype(np.float32) ** 2 / 255).astype(np.uint8)
-
-
-class VecGamma(VecEnvWrapper):
-    """A camera with :func:`gamma`."""
-
-    def reset(self) -> np.ndarray:
-        """Reset, and change the first images."""
-        images = self.venv.reset()
-        assert isinstance(images, np.ndarray)
-        return gamma(images)
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step, and change the images."""
-        images, rewards, dones, infos = self.venv.step_wait()
-        assert isinstance(images, np.ndarray)
-        return gamma(images), rewards, dones, infos
 
 
 SHIFTS: tuple[Scenario, ...] = (
@@ -148,9 +130,9 @@ SHIFTS: tuple[Scenario, ...] = (
         Scenario(name, BLOCK, dict(texture=f"random-{i}"), n_episodes=N_WALL_EPISODES)
         for name, i in zip(WALL_ROWS, WALLS, strict=True)
     ),
-    Scenario(HELD, BLOCK, sensor=partial(VecImagePerturbation, held=True)),
-    Scenario(REDRAWN, BLOCK, sensor=VecImagePerturbation),
-    Scenario(GAMMA, BLOCK, sensor=VecGamma),
+    Scenario(HELD, BLOCK, sensor=partial(PerturbedVecEnv, perturbation={"images": dict(held=True)})),
+    Scenario(REDRAWN, BLOCK, sensor=partial(PerturbedVecEnv, perturbation="images")),
+    Scenario(GAMMA, BLOCK, sensor=partial(PerturbedVecEnv, perturbation=gamma)),
 )
 """Rows of our own: walls that no policy was trained or tuned on, the changes of the training, and one that is not."""
 

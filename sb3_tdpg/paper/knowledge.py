@@ -23,7 +23,7 @@ from sb3_tdpg.evaluation.randomness import EvaluationSeeds, evaluation_seeds, is
 from sb3_tdpg.evaluation.rollout import act, rollout
 from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet, Mine, own_sample_bound
 from sb3_tdpg.problem import read_problem
-from sb3_tdpg.robustness.training import VecImagePerturbation
+from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
@@ -89,9 +89,8 @@ def pooled_information(model: Any, env_kwargs: Mapping[str, Any] | None = None, 
 
     It is the log-det bound of the steps of all times together, times the horizon; each image has declared changes.
     """
-    scenario = Scenario(
-        "training", "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast"}, sensor=VecImagePerturbation
-    )
+    sensor = partial(PerturbedVecEnv, perturbation="images")
+    scenario = Scenario("training", "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast"}, sensor=sensor)
     batch = rollout_information(model, scenario, n_episodes)
     pooled = batch.pooled()
     with th.no_grad():

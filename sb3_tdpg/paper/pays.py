@@ -36,7 +36,7 @@ NOISE_RANGES: Mapping[str, Any] = {
     "10": 10.0,
     "1, 4 or 10": [1.0, 4.0, 10.0],
 }  # standard deviations
-_MIXTURES = "sb3_tdpg.robustness.mixtures"
+_PERTURBED = "sb3_tdpg.robustness.PerturbedVecEnv"
 
 # Perturbation, severity, and the scale that makes its parameter the number in the name.
 Fault = tuple[str, int, float]
@@ -104,12 +104,12 @@ class Problem:
             return Method(label, self.block, overrides={**overrides, **wrappers, "env_kwargs": dict(self.env_kwargs)})
 
         def noise(high: Any) -> Mapping[str, Any]:
-            return {f"{_MIXTURES}.NoisyVecEnv": dict(high=high, scale=list(self.scale))}
+            return {_PERTURBED: dict(perturbation={"noise_range": dict(high=high)}, scale=list(self.scale))}
 
         block = load_hyperparams(self.block)
         narrow = dict(policy_kwargs={**block.get("policy_kwargs", {}), "action_log_var_init": -2.0})
         no_penalty: dict[str, Any] = dict(beta=float("inf"))
-        told = {f"{_MIXTURES}.MixedVecEnv": dict(perturbations=self._told(), scale=list(self.scale))}
+        told = {_PERTURBED: dict(perturbation=[None, *self._told()], scale=list(self.scale))}
         by_default = block.get("mi_estimator", DEFAULTS["vector"].mi_estimator)
         estimators = [name for name in ("mine", "logdet", "directed", "vib") if name != by_default]
         found = [

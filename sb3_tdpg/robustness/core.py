@@ -5,6 +5,7 @@ Dimension key: N environments, n of them at a time.
 """
 
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -29,13 +30,54 @@ def each_part(function: Callable[..., Any], *observations: Observations) -> Obse
     return function(*observations)
 
 
-class Perturber:
+class Members(ABC):
+    """
+    What N episodes have of a family of perturbations: a member each.
+
+    It has its own random generator, so the random numbers of the environment do not change.
+
+    :param names: They are part of the seed: nested perturbations and parts must not draw the same numbers.
+    :param seed: ``None``: random, until :meth:`reseed`.
+    """
+
+    uses_states = False
+    """Whether a call needs the true states."""
+
+    def __init__(self, *names: str, seed: int | None) -> None:
+        names = tuple(filter(None, names))
+        self._entropy = [_DOMAIN, *(zlib.crc32(name.encode()) for name in names), *([] if seed is None else [seed])]
+        self._rng = np.random.default_rng(None if seed is None else self._entropy)
+
+    def reseed(self, env_seed: int) -> None:
+        """Restart the random generator from the seeds of the environments and of the perturbation."""
+        self._rng = np.random.default_rng([*self._entropy, env_seed])
+
+    def begin(self, which: np.ndarray) -> None:  # noqa: B027  (a function of the observations has nothing to draw)
+        """Begin episodes in the environments with the indices ``which``, ``(n,)``: draw what is constant in them."""
+
+    def repeat(self, n: int) -> "Members":
+        """Give n episodes the member that the only one has, whose next observation is its first."""
+        return self
+
+    @abstractmethod
+    def __call__(
+        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
+    ) -> Observations:
+        """
+        Perturb the next observations of some episodes: a new array.
+
+        :param observations: ``(n, *obs)``
+        :param which: indices of the episodes, ``(n,)``; default: all.
+        :param states: x_t, ``(n, X)``
+        """
+
+
+class Perturber(Members):
     """
     Apply a perturbation to whole batches, and remember what was drawn for each episode.
 
-    The perturbation applies to the space. It has its own random generator, so the random numbers of the environment do
-    not change. The scales of the components of a vector have the space's shape (by key in a ``Dict``); images and
-    perturbations of the timing need none.
+    The perturbation applies to the space. The scales of the components of a vector have the space's shape (by key in a
+    ``Dict``); images and perturbations of the timing need none.
     """
 
     def __init__(
@@ -51,34 +93,32 @@ class Perturber:
         groups: Mapping[str, Sequence[Any]] | None = None,
         part: str = "",
     ) -> None:
+        super().__init__(perturbation.name, part, seed=seed)
         self.perturbation = perturbation
         self.value = perturbation.value(severity)
         self.n_envs = n_envs
+        self._episode: dict[str, np.ndarray] = {}
         self.parts: dict[str, Perturber] = {}  # of a Dict that has no timing in common
         if isinstance(space, spaces.Dict) and perturbation.kind != "any":
             for key, each in space.items():
                 if perturbation.applies_to(each, horizon):
-                    how: dict[str, Any] = dict(seed=seed, scale=(scale or {}).get(key), horizon=horizon, part=key)
+                    how: dict[str, Any] = dict(
+                        seed=seed, scale=(scale or {}).get(key), horizon=horizon, part=f"{part} {key}".strip()
+                    )
                     self.parts[key] = Perturber(perturbation, severity, each, n_envs, **how)
             return
         self.sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, groups)
-        # The names are part of the seed: nested perturbations and parts must not draw the same numbers.
-        names = [perturbation.name, *([part] if part else [])]
-        self._entropy = [_DOMAIN, *(zlib.crc32(name.encode()) for name in names), *([] if seed is None else [seed])]
-        self._rng = np.random.default_rng(None if seed is None else self._entropy)
-        self._episode: dict[str, np.ndarray] = {}
         self._spaces = dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
         self.begin(np.arange(n_envs))
 
     def reseed(self, env_seed: int) -> None:
-        """Restart the random generator from the seeds of the environments and of the perturbation."""
+        """See :meth:`Members.reseed`."""
+        super().reseed(env_seed)
         for part in self.parts.values():
             part.reseed(env_seed)
-        if not self.parts:
-            self._rng = np.random.default_rng([*self._entropy, env_seed])
 
     def begin(self, which: np.ndarray) -> None:
-        """Begin episodes in the environments with the indices ``which``, ``(n,)``: draw what is constant in them."""
+        """See :meth:`Members.begin`."""
         if self.parts:
             for part in self.parts.values():
                 part.begin(which)
@@ -96,8 +136,18 @@ class Perturber:
         for name, values in drawn.items():
             self._episode[name][which] = values
 
-    def __call__(self, observations: Observations, which: np.ndarray | None = None) -> Observations:
-        """Perturb the next observations of the environments ``which``, ``(n,)``, or all: a new array ``(n, *obs)``."""
+    def repeat(self, n: int) -> Members:
+        """See :meth:`Members.repeat`."""
+        for part in self.parts.values():
+            part.repeat(n)
+        self._episode = {name: values.repeat(n, axis=0) for name, values in self._episode.items()}
+        self.n_envs = n
+        return self
+
+    def __call__(
+        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
+    ) -> Observations:
+        """See :meth:`Members.__call__`."""
         if self.parts:
             return {**observations, **{key: part(observations[key], which) for key, part in self.parts.items()}}
         index = slice(None) if which is None else which

@@ -1,26 +1,23 @@
 """
-Random changes to the images of a training, so that the bottleneck has something to leave out.
+Perturbations for training: with keywords instead of severities, and strengths that are drawn.
 
-Dimension key: N images or episodes, C channels, H and W rows and columns.
+Dimension key: n images or episodes, C channels, H and W rows and columns, D components of a vector.
 """
 
-from __future__ import annotations
-
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch.nn.functional import interpolate
+
+from sb3_tdpg.robustness.registry import N_SEVERITIES, Episode, Perturbation
+from sb3_tdpg.robustness.sensor import Sensor
 
 PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
 
 PATTERN_GROUP = 16  # images whose patterns have cells of one size
-
-Drawn = dict[str, th.Tensor]  # what was drawn for N images or episodes, with a leading dimension of N
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,8 @@ class ImageMixture:
        [0, 1];
     4. noise: Gaussian at every pixel, with a standard deviation uniform up to ``noise``.
 
-    The random numbers are torch's, so a seed and a checkpoint cover them.
+    The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound the information about
+    everything in the image, so what an encoder keeps of these changes counts as information.
 
     :param color: Strength of the mixing; 0 leaves the colours unchanged.
     :param pattern: Largest opacity of the pattern, at most 1.
@@ -59,111 +57,98 @@ class ImageMixture:
             if not 0 <= value <= largest:
                 raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
 
-    def draw(self, n: int, channels: int, height: int, width: int) -> Drawn:
-        """Draw N changes of images of a size: everything but the noise at each pixel."""
+    def draw(self, rng: np.random.Generator, n: int, shape: Sequence[int]) -> dict[str, np.ndarray]:
+        """Draw n changes of images ``(C, H, W)``: everything but the noise at each pixel."""
+        channels, height, width = shape
 
-        def uniform() -> th.Tensor:
-            return th.rand(n, 1, 1, 1)
+        def uniform() -> np.ndarray:
+            return rng.random((n, 1, 1, 1), dtype=np.float32)
 
-        mixing = th.eye(channels) + self.color * th.randn(n, channels, channels)
-        amount = self.pattern * uniform() * (uniform() < 0.7)
+        mixing = np.eye(channels, dtype=np.float32)
+        mixing = mixing + np.float32(self.color) * rng.standard_normal((n, channels, channels), dtype=np.float32)
+        amount = np.float32(self.pattern) * uniform() * (uniform() < 0.7)
         return dict(
-            mixing=mixing / mixing.sum(dim=2, keepdim=True).clamp(min=0.3),
-            pattern=self._patterns(n, channels, height, width),
-            amount=th.maximum(amount, self._patches(n, height, width)),
-            scale=1 - self.contrast * uniform(),
+            mixing=mixing / mixing.sum(axis=2, keepdims=True).clip(min=0.3),
+            pattern=self._patterns(rng, n, channels, height, width),
+            amount=np.maximum(amount, self._patches(rng, n, height, width)),
+            scale=1 - np.float32(self.contrast) * uniform(),
             offset=uniform(),
-            noise=self.noise * uniform(),
+            noise=np.float32(self.noise) * uniform(),
         )
 
-    def _patterns(self, n: int, channels: int, height: int, width: int) -> th.Tensor:
-        """Draw random coloured cells: ``(N, C, H, W)``."""
-        parts = []
+    def _patterns(self, rng: np.random.Generator, n: int, channels: int, height: int, width: int) -> np.ndarray:
+        """Draw random coloured cells: ``(n, C, H, W)``."""
+        patterns = np.empty((n, channels, height, width), np.float32)
         for start in range(0, n, PATTERN_GROUP):
-            size = PATTERN_SIZES[int(th.randint(len(PATTERN_SIZES), ()))]
-            mode = ("nearest", "bilinear")[int(th.randint(2, ()))]
-            cells = th.rand(min(PATTERN_GROUP, n - start), channels, size, size)
-            parts.append(interpolate(cells, size=(height, width), mode=mode))
-        return th.cat(parts) if parts else th.empty(0, channels, height, width)
+            group = patterns[start : start + PATTERN_GROUP]
+            size, mode = rng.choice(PATTERN_SIZES), rng.choice(["nearest", "bilinear"])
+            cells = th.from_numpy(rng.random((len(group), channels, size, size), dtype=np.float32))
+            group[:] = interpolate(cells, size=(height, width), mode=str(mode)).numpy()
+        return patterns
 
-    def _patches(self, n: int, height: int, width: int) -> th.Tensor:
-        """Draw rectangles with sides uniform up to ``patch`` of the image's: ``(N, 1, H, W)``, 1 inside."""
+    def _patches(self, rng: np.random.Generator, n: int, height: int, width: int) -> np.ndarray:
+        """Draw rectangles with sides uniform up to ``patch`` of the image's: ``(n, 1, H, W)``, 1 inside."""
 
-        def interval(length: int) -> th.Tensor:
-            size = self.patch * th.rand(n, 1)
-            start = (1 - size) * th.rand(n, 1)
-            at = (th.arange(length) + 0.5) / length
+        def interval(length: int) -> np.ndarray:
+            size = self.patch * rng.random((n, 1))
+            start = (1 - size) * rng.random((n, 1))
+            at = (np.arange(length) + 0.5) / length
             return (at >= start) & (at < start + size)
 
-        return (interval(height)[:, None, :, None] & interval(width)[:, None, None, :]).float()
+        inside = interval(height)[:, None, :, None] & interval(width)[:, None, None, :]
+        return inside.astype(np.float32)
 
-    def apply(self, images: np.ndarray, drawn: Drawn) -> np.ndarray:
-        """
-        Change each image as drawn, with new noise.
-
-        :param images: ``(N, C, H, W)`` uint8
-        :return: the same shape and type
-        """
-        y = th.as_tensor(images) / 255.0
-        y = (drawn["mixing"] @ y.flatten(2)).unflatten(2, y.shape[2:])
-        y = th.lerp(y, drawn["pattern"], drawn["amount"])
-        y = drawn["scale"] * y + (1 - drawn["scale"]) * drawn["offset"]
-        y = y + drawn["noise"] * th.randn_like(y)
-        return (255 * y.clamp(0, 1)).round().to(th.uint8).numpy()
+    def apply(self, images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np.ndarray:
+        """Change each image ``(n, C, H, W)``, float32 in [0, 1], as drawn, with new noise."""
+        of = {name: th.from_numpy(values) for name, values in drawn.items() if name != "t"}  # several times as fast
+        y = (of["mixing"] @ th.from_numpy(images).flatten(2)).unflatten(2, images.shape[2:])
+        y = th.lerp(y, of["pattern"], of["amount"])
+        y = of["scale"] * y + (1 - of["scale"]) * of["offset"]
+        own = th.Generator().manual_seed(int(rng.integers(2**63)))
+        return y.add_(th.randn(y.shape, generator=own).mul_(of["noise"])).numpy()
 
 
-class VecImagePerturbation(VecEnvWrapper):
+def images(*, held: bool = False, **strengths: float) -> Perturbation:
     """
-    Change every image of a vectorised environment by an :class:`ImageMixture`.
+    Return an :class:`ImageMixture` as a perturbation.
 
-    The true state does not change. The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound
-    the information about everything in the image, so what an encoder keeps of these changes counts as information.
-
-    :param venv: Environments with images of bytes, channels first or last.
     :param held: Whether an episode keeps what was drawn at its beginning, but for the noise; else every image has its
         own.
     :param strengths: See :class:`ImageMixture`.
-    :raises ValueError: if the observations are not images of bytes, or a strength is out of its range.
     """
+    mixture = ImageMixture(**strengths)
 
-    def __init__(self, venv: VecEnv, *, held: bool = False, **strengths: float) -> None:
-        super().__init__(venv)
-        space = venv.observation_space
-        if not (isinstance(space, spaces.Box) and is_image_space(space)):
-            raise ValueError(f"VecImagePerturbation takes images of bytes (uint8, 0 to 255), not {space}")
-        self.mixture = ImageMixture(**strengths)
-        self.held = held
-        self._drawn: Drawn = {}  # of the running episodes
-        self._channels_last = space.shape[0] > space.shape[2]
+    def draw(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
+        return mixture.draw(rng, n, sensor.shape)
 
-    def reset(self) -> np.ndarray:
-        """Reset, and perturb the first images."""
-        images = self.venv.reset()
-        assert isinstance(images, np.ndarray)
-        return self.perturb(images)
+    def apply(y: np.ndarray, value: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+        return mixture.apply(y, episode if held else mixture.draw(rng, len(y), y.shape[1:]), rng)
 
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step, and perturb the images."""
-        images, rewards, dones, infos = self.venv.step_wait()
-        assert isinstance(images, np.ndarray)
-        return self.perturb(images, dones if self.held else None), rewards, dones, infos
+    return Perturbation(
+        "images", "image", "strength", (1.0,) * N_SEVERITIES, apply, draw if held else None, on_depth=False
+    )
 
-    def perturb(self, images: np.ndarray, begins: np.ndarray | None = None) -> np.ndarray:
-        """
-        Perturb N images.
 
-        :param images: ``(N, C, H, W)`` or ``(N, H, W, C)``, uint8
-        :param begins: Which of them have new random numbers, ``(N,)``; the others keep those of the last call. None:
-            all have new ones.
-        """
-        if self._channels_last:
-            images = images.transpose(0, 3, 1, 2)
-        which = np.arange(len(images)) if begins is None else np.flatnonzero(begins)
-        drawn = self.mixture.draw(len(which), *images.shape[1:])
-        if begins is None:
-            self._drawn = drawn
-        else:
-            for name, values in drawn.items():
-                self._drawn[name][which] = values
-        result = self.mixture.apply(images, self._drawn)
-        return result.transpose(0, 2, 3, 1) if self._channels_last else result
+def noise_range(low: float = 0.01, high: float | Sequence[float] = 1.0) -> Perturbation:
+    """
+    Return noise whose standard deviation is drawn for each episode, log-uniform between two values in scales.
+
+    :param low: The smallest standard deviation.
+    :param high: The largest one; of several, each episode draws one first.
+    :raises ValueError: unless 0 < low <= high.
+    """
+    highs = np.atleast_1d(high)
+    if not (0 < low <= highs.min() and highs.max() < math.inf):
+        raise ValueError(f"low={low} and high={high} must be positive, low <= high")
+
+    def draw(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
+        return {"std": np.exp(rng.uniform(math.log(low), np.log(rng.choice(highs, n))))}
+
+    def apply(y: np.ndarray, value: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
+        return y + episode["std"][:, None] * rng.standard_normal(y.shape)
+
+    return Perturbation("noise_range", "vector", "standard deviation, scales", (highs.max(),) * 5, apply, draw)
+
+
+WITH_KEYWORDS: dict[str, Callable[..., Perturbation]] = {"images": images, "noise_range": noise_range}
+"""Perturbations that a declaration gives keywords instead of severities, by name."""

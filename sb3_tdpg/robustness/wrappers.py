@@ -5,19 +5,18 @@ Dimension key: N environments side by side.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_tdpg.problem import attribute_of, horizon_of
-from sb3_tdpg.robustness.core import Perturber, each_part
-from sb3_tdpg.robustness.registry import Perturbation, find_applicable
-from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.core import each_part
+from sb3_tdpg.robustness.families import Family
 
 Scale = float | np.ndarray | Mapping[str, Any] | None
 
@@ -47,7 +46,8 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
             raise ValueError(f"{type(env).__name__} holds several environments: use PerturbedVecEnv")
         RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
         gym.ObservationWrapper.__init__(self, env)
-        self._perturber = make_perturber(perturbation, severity, env, 1, seed, scale)
+        family = Family(perturbation, env, severity, scale)
+        self._is_plant, self._perturber = family.is_plant, family.members(1, _checked(seed))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and perturb its first observation."""
@@ -59,13 +59,13 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, with a perturbed action or observation."""
-        if self._perturber.perturbation.kind == "action":
+        if self._is_plant:
             (action,) = self._perturber(np.asarray(action)[None])
         return super().step(action)
 
     def observation(self, observation: Any) -> Any:
         """Perturb the next observation of the episode."""
-        if self._perturber.perturbation.kind == "action":
+        if self._is_plant:
             return observation
         batch = each_part(lambda part: np.asarray(part)[None], observation)
         return each_part(lambda part: part[0], self._perturber(batch))
@@ -73,20 +73,27 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
 
 class PerturbedVecEnv(VecEnvWrapper):
     """
-    Perturb the observations of N environments in one call, or their actions.
+    Perturb the observations of N environments in one call, or their actions, in an evaluation or a training.
 
     Every episode has its own draw, also after an automatic reset; ``info["terminal_observation"]`` is perturbed as the
     last observation of the episode that has ended. A perturbation of observations does not change state, reward, the
-    rest of info and the environments' random numbers. ``env.seed(...)`` also seeds the perturbation. Put this wrapper
-    inside a ``VecNormalize`` or a ``VecFrameStack``. The parameters are those of :class:`PerturbedObservation`; the
-    perturbation need not be registered.
+    rest of info and the environments' random numbers. ``env.seed(...)`` also seeds the perturbation; without it and
+    without ``seed`` every reset takes a seed from torch's generator, so that the seed of a training and a checkpoint
+    cover it. Put this wrapper inside a ``VecNormalize`` or a ``VecFrameStack``.
+
+    :param venv: The environments.
+    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, a dict of several, of which each episode
+        has one, a function, ...: see :class:`~sb3_tdpg.robustness.families.Family`.
+    :param severity: Of a name: 1 (mild) to 5 (strong); ``None``: each episode has any.
+    :param seed: Seed of the perturbation.
+    :param scale: See :class:`PerturbedObservation`.
     """
 
     def __init__(
         self,
         venv: VecEnv,
-        perturbation: str | Perturbation,
-        severity: int = 3,
+        perturbation: Any,
+        severity: int | None = 3,
         *,
         seed: int | None = None,
         scale: Scale = None,
@@ -97,21 +104,26 @@ class PerturbedVecEnv(VecEnvWrapper):
         if isinstance(venv, VecNormalize) and venv.norm_obs:
             raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)
-        self._perturber = make_perturber(perturbation, severity, venv, venv.num_envs, seed, scale)
+        family = Family(perturbation, venv, severity, scale)
+        self._seed = _checked(seed)
+        self._is_plant, self._perturber = family.is_plant, family.members(venv.num_envs, seed)
+        self.unperturbed: Any = None
+        """The observations of the last reset or step, as they came."""
 
     def reset(self) -> Any:
         """Start N episodes, and perturb their first observations."""
         (env_seed, *_) = self.unwrapped._seeds  # the reset takes it
-        observations = self.venv.reset()
+        self.unperturbed = observations = self.venv.reset()
+        if env_seed is None and self._seed is None:
+            env_seed = int(th.randint(2**31, ()))
         if env_seed is not None:
             self._perturber.reseed(env_seed)
         self._perturber.begin(np.arange(self.num_envs))
         self.reset_infos = self.unwrapped.reset_infos
-        return observations if self._is_plant else self._perturber(observations)
+        return observations if self._is_plant else self._perturber(observations, None, self._states(self.reset_infos))
 
-    @property
-    def _is_plant(self) -> bool:
-        return self._perturber.perturbation.kind == "action"
+    def _states(self, infos: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
+        return np.stack([info["state"] for info in infos]) if self._perturber.uses_states else None
 
     def step_async(self, actions: np.ndarray) -> None:
         """Begin a step, with perturbed actions if they are what is perturbed."""
@@ -120,25 +132,26 @@ class PerturbedVecEnv(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         """Step, and perturb the observations."""
         observations, rewards, dones, infos = self.venv.step_wait()
-        ended = np.flatnonzero(dones)
+        self.unperturbed, ended = observations, np.flatnonzero(dones)
         if self._is_plant:
             self._perturber.begin(ended)
             self.reset_infos = self.unwrapped.reset_infos
             return observations, rewards, dones, infos
         if not len(ended):
-            return self._perturber(observations), rewards, dones, infos
+            return self._perturber(observations, None, self._states(infos)), rewards, dones, infos
         # First the observations of the running episodes up to their end, then the first ones of the next episodes.
         last = each_part(np.copy, observations)
         reported = [i for i in ended if "terminal_observation" in infos[i]]
         for i in reported:
             each_part(functools.partial(_put, i), last, infos[i]["terminal_observation"])
-        perturbed, infos = self._perturber(last), list(infos)
+        perturbed, infos = self._perturber(last, None, self._states(infos)), list(infos)
         for i in reported:
             infos[i] = {**infos[i], "terminal_observation": each_part(lambda part, i=i: part[i].copy(), perturbed)}
         self._perturber.begin(ended)
-        first = self._perturber(each_part(lambda part: part[ended], observations), ended)
-        each_part(functools.partial(_put, ended), perturbed, first)
         self.reset_infos = self.unwrapped.reset_infos
+        states = self._states([self.reset_infos[i] for i in ended])
+        first = self._perturber(each_part(lambda part: part[ended], observations), ended, states)
+        each_part(functools.partial(_put, ended), perturbed, first)
         return perturbed, rewards, dones, infos
 
 
@@ -146,23 +159,7 @@ def _put(where: Any, target: np.ndarray, values: np.ndarray) -> None:
     target[where] = values
 
 
-def make_perturber(
-    perturbation: str | Perturbation,
-    severity: int,
-    env: gym.Env | VecEnv,
-    n_envs: int,
-    seed: int | None,
-    scale: Scale,
-) -> Perturber:
-    """Make the perturber of an environment from a perturbation or its name; see :class:`PerturbedObservation`."""
-    space, horizon = env.observation_space, horizon_of(env)
-    perturbation = find_applicable(perturbation, space, horizon, env.action_space)
-    perturbation.value(severity)  # checked before the calibration, which takes time
+def _checked(seed: Any) -> int | None:
     if seed is not None and (isinstance(seed, bool) or seed < 0):
         raise ValueError(f"seed={seed} must be None or an integer of at least 0")
-    how: dict[str, Any] = dict(seed=seed, horizon=horizon, groups=attribute_of(env, "observation_groups"))
-    if perturbation.kind == "action":
-        space, how["scale"] = env.action_space, np.ones(env.action_space.shape or ())
-    elif not perturbation.timing:
-        how["scale"] = default_scale(space, env, scale)
-    return Perturber(perturbation, severity, space, n_envs, **how)
+    return seed

@@ -9,7 +9,7 @@ from sb3_tdpg.cli import main
 
 
 def test_certified_bounds_hold_for_random_members(tmp_path):
-    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias", nuisance_level="trv")
+    model = tiny_tdpg("Lava-v0", n_episodes=100, nuisance="vector_bias")
     train_epochs(model, 3)
     model.save(tmp_path / "model.zip")
     declared = "{vector_noise: [1, 5], vector_bias: 2}"
@@ -28,6 +28,7 @@ def test_certified_bounds_hold_for_random_members(tmp_path):
     (["--nuisance", "{"], "is not YAML"),
     (["--nuisance", "fog"], "perturbation='fog' is unknown"),
     (["--nuisance", "auto"], "is none for"),
+    (["--nuisance", "actuator_gain"], "changes the actions"),
 ])  # fmt: skip
 def test_wrong_arguments_of_certify_are_explained(arguments, fragment, tmp_path, capsys):
     model = tiny_tdpg("Lava-v0")

@@ -169,6 +169,6 @@ def test_a_method_differs_from_the_one_line_in_what_its_name_says(launch):
     for method in others:
         assert settings_of(method)["n_timesteps"] == one_line["n_timesteps"]
         assert settings_of(method)["env_kwargs"] == one_line["env_kwargs"]
-        assert ("VecImagePerturbation" in str(settings_of(method))) == (method.algo != "tdpg")
+        assert ("PerturbedVecEnv" in str(settings_of(method))) == (method.algo != "tdpg")
     ours = settings_of(others[-1])["policy_kwargs"]
     assert (ours["features_extractor_class"], ours["lstm_hidden_size"]) == (TRVCnn, 64)

@@ -66,7 +66,9 @@ def test_those_that_were_told_train_on_the_faults_of_the_sensor_and_no_others():
     told = next(m for m in PROBLEMS["lava"].methods() if m.label == "PPO, told the faults")
     (wrapper,) = told.overrides["vec_env_wrapper"]
     (settings,) = wrapper.values()
-    names = [name for name, *_ in settings["perturbations"]]
+    plain, *faults = settings["perturbation"]
+    names = [name for name, *_ in faults]
+    assert plain is None
     assert len(names) == len(pays.FAULTS)
     assert "actuator_gain" not in names
 

@@ -1,0 +1,284 @@
+"""
+Declared families of perturbations, of which every episode has one member.
+
+Dimension key: N episodes side by side, n of them at a time, X state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.problem import attribute_of, horizon_of
+from sb3_tdpg.robustness.core import Members, Observations, Perturber, each_part
+from sb3_tdpg.robustness.registry import N_SEVERITIES, Perturbation, find_applicable
+from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.training import WITH_KEYWORDS
+
+EXPECTED = (
+    "the name of a perturbation, a dict of names and severities such as {'noise': (1, 3), 'contrast': 2}, a list such "
+    "as [None, ('vector_noise', 3)], or a function of the observations and a random generator"
+)
+
+
+class Family:
+    """
+    What an environment's episodes may show; :meth:`members` draws a member for each of them.
+
+    A declaration is one of the following. A dict or a list: each episode has one of the entries, at random.
+
+    - a name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or a :class:`~sb3_tdpg.robustness.Perturbation`;
+    - a dict: names with a severity or a range ``(1, 3)`` of them; ``"images"`` with keywords of
+      :func:`~sb3_tdpg.robustness.training.images`; ``"noise_range"`` with those of
+      :func:`~sb3_tdpg.robustness.training.noise_range`; and ``"env_kwargs"`` with a list of keywords for other scenes
+      of the environment, whose sensor sees the same state (and ``"redraw"``: names of the components of the state that
+      these draw anew for each episode);
+    - a list of ``(name, value)``, with the values of a dict, ``(name, value, factor)``, with a factor of the scale, and
+      ``None``: no perturbation;
+    - a function ``(observations (n, *obs), rng) -> changed observations``, called at each step.
+
+    :param declared: See above.
+    :param env: The environment; it must be reset afterwards.
+    :param severity: Of a name alone; ``None``: any.
+    :param scale: See :class:`~sb3_tdpg.robustness.PerturbedObservation`.
+    :raises ValueError: if nothing of a name exists or applies.
+    """
+
+    def __init__(self, declared: Any, env: gym.Env | VecEnv, severity: int | None = None, scale: Any = None) -> None:
+        self._env, self._given_scale = env, scale
+        self._kinds: set[bool] = set()  # whether actions are perturbed
+        entries: Any = declared
+        if isinstance(declared, (str, Perturbation)):
+            every = (1, N_SEVERITIES) if severity is None else severity
+            entries = [(declared, {} if _has_keywords(declared) else every)]
+        elif callable(declared):
+            entries = [("", declared)]
+        elif isinstance(declared, Mapping):
+            entries = [entry for entry in declared.items() if entry[0] != "redraw"]
+            if declared and not entries:
+                raise ValueError("'redraw' needs 'env_kwargs', the scenes that draw something anew")
+        if not isinstance(entries, (list, tuple)) or not entries:
+            raise ValueError(f"{declared!r} is no perturbation: expected {EXPECTED}")
+        self._makers: list[Callable[..., Members] | None] = []
+        for entry in entries:
+            if entry is None:
+                self._makers.append(None)
+                continue
+            if not (isinstance(entry, (list, tuple)) and len(entry) in (2, 3)):
+                raise ValueError(f"{entry!r} is no entry of a list: expected None or (name, severity)")
+            name, value, *factor = entry
+            if callable(value):
+                self._makers.append(partial(FunctionMembers, value))
+            elif name == "env_kwargs":
+                redraw = declared.get("redraw", ()) if isinstance(declared, Mapping) else ()
+                self._makers.append(self._scenes(value, redraw))
+            else:
+                self._makers += self._named(name, value, *factor)
+                continue
+            self._kinds.add(False)
+        if len(self._kinds) > 1:
+            raise ValueError(f"{declared!r} perturbs actions and observations: wrap the environment once for each")
+
+    @property
+    def is_plant(self) -> bool:
+        """Whether the actions are perturbed instead of the observations."""
+        return self._kinds == {True}
+
+    def members(self, n: int, seed: int | None = None) -> Members:
+        """Draw a member for each of N episodes."""
+        one = len(self._makers) == 1
+        made = [make and make(n, seed=seed, part="" if one else str(i)) for i, make in enumerate(self._makers)]
+        return made[0] if one and made[0] is not None else OneOf(made, n, seed)
+
+    def one(self, seed: int, n: int) -> Members:
+        """Give N episodes the same member, whose name is the seed."""
+        return self.members(1, seed).repeat(n)
+
+    @cached_property
+    def _measured_scale(self) -> Any:
+        return default_scale(self._env.observation_space, self._env, self._given_scale)
+
+    def _named(self, name: Any, value: Any, factor: float = 1.0) -> list[Callable[..., Members]]:
+        """Return one perturbation for each severity."""
+        env, horizon = self._env, horizon_of(self._env)
+        if _has_keywords(name):
+            try:
+                name = WITH_KEYWORDS[name](**value)
+            except TypeError as e:
+                raise ValueError(f"{{{name!r}: {value!r}}} must hold keywords of {name}(): {e}") from e
+            value = 1
+        found = find_applicable(name, env.observation_space, horizon, env.action_space)
+        low, *others = value if isinstance(value, (tuple, list)) and value else (value,)
+        high = others[0] if others else low
+        for severity in (low, high):
+            found.value(severity)
+        if len(others) > 1 or low > high:
+            raise ValueError(f"{{{name!r}: {value!r}}} must be a severity, or the lowest and the highest one")
+        self._kinds.add(found.kind == "action")
+        how: dict[str, Any] = dict(horizon=horizon, groups=attribute_of(env, "observation_groups"))
+        space = env.observation_space
+        if found.kind == "action":
+            space, how["scale"] = env.action_space, np.ones(env.action_space.shape or ())
+        elif not found.timing and (scale := self._measured_scale) is not None:
+            how["scale"] = each_part(lambda part: factor * part, scale)
+        return [partial(Perturber, found, severity, space, **how) for severity in range(low, high + 1)]
+
+    def _scenes(self, env_kwargs: Any, redraw: Any) -> Callable[..., Members]:
+        inner: Any = attribute_of(self._env, "unwrapped")
+        inner = getattr(inner, "unwrapped", inner)
+        if not isinstance(inner, POMDPEnv):
+            raise ValueError(
+                f"'env_kwargs' needs an environment that can observe a given state, a POMDPEnv, not "
+                f"{type(inner).__name__}: give a function of the observations instead"
+            )
+        names = list(getattr(inner, "state_names", ()))
+        if not isinstance(redraw, (list, tuple)):
+            raise ValueError(f"redraw={redraw!r} must be a list of components of the state, some of {names}")
+        if unknown := [name for name in redraw if name not in names]:
+            raise ValueError(f"redraw={unknown} are no components of the state: use some of {names}")
+        own = {} if inner.spec is None else inner.spec.kwargs
+        given = [env_kwargs] if isinstance(env_kwargs, Mapping) else env_kwargs
+        if not (isinstance(given, Sequence) and given and all(isinstance(kwargs, Mapping) for kwargs in given)):
+            raise ValueError(
+                f"{{'env_kwargs': {env_kwargs!r}}} must hold keywords of the environment, or a list of such"
+            )
+        try:
+            scenes = [type(inner)(**{**own, **kwargs}) for kwargs in given]
+        except TypeError as e:  # an unknown keyword
+            raise ValueError(f"{{'env_kwargs': {env_kwargs!r}}}: {e}") from e
+        for scene in scenes:
+            if scene.observation_space != inner.observation_space:
+                raise ValueError(f"a scene of 'env_kwargs' has the observation space {scene.observation_space}")
+        return partial(SceneMembers, scenes, [names.index(name) for name in redraw])
+
+
+def _has_keywords(name: Any) -> bool:
+    return isinstance(name, str) and name in WITH_KEYWORDS
+
+
+class OneOf(Members):
+    """Each episode has one of several perturbations, at random; ``None`` among them: it is not perturbed."""
+
+    def __init__(self, members: Sequence[Members | None], n: int, seed: int | None = None) -> None:
+        super().__init__("one of", seed=seed)
+        self.members = members
+        self.uses_states = any(each.uses_states for each in members if each)
+        self.choice = np.zeros(n, dtype=np.int64)
+        self.begin(np.arange(n))
+
+    def reseed(self, env_seed: int) -> None:
+        """See :meth:`Members.reseed`."""
+        super().reseed(env_seed)
+        for each in filter(None, self.members):
+            each.reseed(env_seed)
+
+    def begin(self, which: np.ndarray) -> None:
+        """See :meth:`Members.begin`."""
+        self.choice[which] = self._rng.integers(len(self.members), size=len(which))
+        for each in filter(None, self.members):
+            each.begin(which)
+
+    def __call__(
+        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
+    ) -> Observations:
+        """See :meth:`Members.__call__`."""
+        which = np.arange(len(self.choice)) if which is None else which
+        result = each_part(np.copy, observations)
+        for i, each in enumerate(self.members):
+            mine = np.flatnonzero(self.choice[which] == i)
+            if each and len(mine):
+                part = each_part(lambda x, mine=mine: x[mine], observations)
+                seen = each(part, which[mine], None if states is None else states[mine])
+                each_part(lambda x, new, mine=mine: x.__setitem__(mine, new), result, seen)
+        return result
+
+    def repeat(self, n: int) -> Members:
+        """See :meth:`Members.repeat`."""
+        self.choice = self.choice.repeat(n)
+        for each in filter(None, self.members):
+            each.repeat(n)
+        return self
+
+
+class FunctionMembers(Members):
+    """What a function of the observations and a random generator returns."""
+
+    def __init__(
+        self, function: Callable[[Any, np.random.Generator], Any], n: int, *, seed: int | None = None, part: str = ""
+    ) -> None:
+        super().__init__(part, seed=seed)
+        self.function = function
+
+    def __call__(
+        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
+    ) -> Observations:
+        """See :meth:`Members.__call__`."""
+        changed = self.function(observations, self._rng)
+        if not isinstance(observations, dict):
+            changed = np.asarray(changed)
+            if changed.shape != observations.shape or changed.dtype != observations.dtype:
+                raise ValueError(
+                    f"the perturbation returned observations of shape {changed.shape} and type {changed.dtype}, "
+                    f"expected those it was given: {observations.shape}, {observations.dtype}"
+                )
+            if not np.isfinite(changed).all():
+                raise ValueError("the perturbation returned observations that are NaN or infinite")
+        return changed
+
+
+class SceneMembers(Members):
+    """
+    Other scenes of an environment of this package: its sensor, in the same state.
+
+    :param scenes: Copies of the environment with other keywords.
+    :param redraw: Components of the state that the scenes draw anew for each episode, as at their start.
+    """
+
+    uses_states = True
+
+    def __init__(
+        self, scenes: Sequence[POMDPEnv], redraw: Sequence[int], n: int, *, seed: int | None = None, part: str = ""
+    ) -> None:
+        super().__init__(part, seed=seed)
+        self.scenes, self.redraw = scenes, redraw
+        self.scene, self.redrawn = np.zeros(n, dtype=np.int64), np.zeros((n, len(redraw)))
+        self.begin(np.arange(n))
+
+    def begin(self, which: np.ndarray) -> None:
+        """See :meth:`Members.begin`."""
+        self.scene[which] = self._rng.integers(len(self.scenes), size=len(which))
+        for scene, chosen in self._by_scene(which):
+            if self.redraw:
+                self.redrawn[which[chosen]] = scene.initial_state(len(chosen))[:, self.redraw]
+
+    def _by_scene(self, which: np.ndarray) -> list[tuple[POMDPEnv, np.ndarray]]:
+        """Group the places in ``which`` by scene."""
+        scene = self.scene[which]
+        for each in self.scenes:
+            each.np_random = self._rng
+        return [(self.scenes[i], np.flatnonzero(scene == i)) for i in np.unique(scene)]
+
+    def __call__(
+        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
+    ) -> Observations:
+        """See :meth:`Members.__call__`."""
+        if states is None:
+            raise ValueError("other scenes need the true state of each episode: wrap the VecEnv instead")
+        which = np.arange(len(self.scene)) if which is None else which
+        seen = np.array(states, dtype=np.float64)
+        seen[:, self.redraw] = self.redrawn[which]
+        changed = observations.copy()
+        for scene, chosen in self._by_scene(which):
+            changed[chosen] = scene.sensor(seen[chosen])
+        return changed
+
+    def repeat(self, n: int) -> Members:
+        """See :meth:`Members.repeat`."""
+        self.scene, self.redrawn = self.scene.repeat(n), self.redrawn.repeat(n, axis=0)
+        return self

@@ -1,0 +1,152 @@
+"""
+A phase of training that removes what the actions know of a nuisance of the sensor.
+
+Dimension key: T horizon, N episodes, Z TRVs, U action.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.utils import update_learning_rate
+from torch.distributions import Distribution, kl_divergence
+
+from sb3_tdpg.callbacks import TDPGCallback
+from sb3_tdpg.robustness.core import each_part
+from sb3_tdpg.robustness.families import Family
+from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, automatic
+
+BATCH_STEPS = 400  # of a gradient step: 16 episodes of 25 steps
+
+
+def actions(policy: Any, batch: Any, observations: Any) -> list[Distribution]:
+    """
+    Unroll a policy over recorded episodes with the recorded noise of the TRVs, but with these observations.
+
+    :param policy: A :class:`~sb3_tdpg.TRVPolicy`.
+    :param batch: An :class:`~sb3_tdpg.buffers.EpisodeBatch`.
+    :param observations: ``(T, N, *obs)``, or a dict of such
+    :return: pi(. | x~_t), ``(T * N, ...)``; several for a ``MultiDiscrete`` space
+    """
+    batch = batch._replace(observations=observations)
+    trvs, *_ = policy.rebuild_trvs(policy.episode_features(batch), batch)
+    densities = policy.episode_action_density(trvs).distribution
+    return densities if isinstance(densities, list) else [densities]
+
+
+def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.Tensor:
+    """Compute D[pi_p || pi_q], averaged over the living steps, in nats a step."""
+    parts = zip(p, q, strict=True)
+    by_part = [kl_divergence(of_p, of_q).reshape(batch.alive.numel(), -1).sum(dim=1) for of_p, of_q in parts]
+    return (batch.alive * th.stack(by_part).sum(dim=0).view_as(batch.alive)).sum() / batch.alive.sum()
+
+
+class NuisancePhase(TDPGCallback):
+    r"""
+    After the passes of an epoch with plain rollouts, remove what the actions know of a nuisance.
+
+    The policy on perturbed observations learns to do what it did on plain ones before the phase (the *teacher*), and on
+    plain ones to stay as it was, with the same noise of the TRVs:
+
+    .. math:: E_t\, D(\pi(\cdot | \tilde x_t^\omega) \| \bar\pi(\cdot | \tilde x_t^0))
+        + D(\pi(\cdot | \tilde x_t^0) \| \bar\pi(\cdot | \tilde x_t^0)).
+
+    Pass it to ``learn`` before a :class:`~sb3_tdpg.TrainingCheckpointCallback`; in a training that is resumed, its
+    optimiser starts anew.
+
+    :param nuisance: ``"auto"``: random changes of images of bytes, held for an episode; else a declaration of a
+        :class:`~sb3_tdpg.robustness.families.Family`.
+    :param n_steps: Gradient steps of a phase.
+    :raises ValueError: if nothing of this name exists or applies, or the rollouts are perturbed.
+    """
+
+    optimizer: th.optim.Optimizer
+    family: Family
+
+    def __init__(self, nuisance: Any = "auto", n_steps: int = 24, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if not (isinstance(n_steps, (int, np.integer)) and n_steps >= 1):
+            raise ValueError(f"n_steps={n_steps!r} must be an integer of at least 1")
+        self.nuisance, self.n_steps = nuisance, n_steps
+
+    def _init_callback(self) -> None:
+        env = self.tdpg.env
+        assert env is not None
+        if isinstance(env, NuisanceVecEnv):
+            raise ValueError("NuisancePhase needs plain rollouts: give TDPG nuisance=None")
+        declared = automatic(self.nuisance, env.observation_space, held=True)
+        if declared is None:
+            raise ValueError(f"nuisance={self.nuisance!r} is none for {env.observation_space}: name the perturbations")
+        self.family = Family(declared, env)
+        self.tdpg._last_obs = None  # the environment is reset once more: a scale may have been measured in it
+        if self.family.is_plant:
+            raise ValueError(f"nuisance={self.nuisance!r} changes the actions: the phase needs one of the sensor")
+        self.optimizer = th.optim.Adam(self.tdpg.policy.parameters(), lr=1e-3, fused=True)
+
+    def _on_training_start(self) -> None:
+        self._epoch = self.tdpg.epoch
+
+    def _on_rollout_start(self) -> None:  # the rollouts of the last epoch are still there
+        if self.tdpg.epoch > self._epoch:
+            self._remove_from_rollouts()
+            self._epoch = self.tdpg.epoch
+
+    def _on_training_end(self) -> None:
+        self._on_rollout_start()
+
+    def _remove_from_rollouts(self) -> None:
+        model: Any = self.tdpg
+        in_segments = not model.policy.time_varying
+        batch = model.rollout_buffer.episode_batch(whole_horizon=not in_segments)
+        if in_segments:
+            batch = batch.segments(model.bptt_steps or len(batch.costs))
+        update_learning_rate(self.optimizer, model.lr_schedule(model._current_progress_remaining))
+        model.policy.set_training_mode(True)
+        self.logger.record("nuisance/action_kl", self.remove(batch))
+        model.policy.set_training_mode(False)
+
+    def perturbed(self, batch: Any) -> Any:
+        """Draw members for N episodes, and return what the changed sensor shows: ``(T, N, *obs)``."""
+        members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
+        states = batch.states.cpu().numpy()
+        plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
+        steps = [members(each_part(lambda x, t=t: x[t], plain), None, states[t]) for t in range(len(states))]
+        return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
+
+    def remove(self, batch: Any) -> float:
+        """
+        Take the gradient steps of an epoch.
+
+        :param batch: The rollouts: whole episodes, or segments of them.
+        :return: the divergence of the new policy's actions on fresh perturbations, in nats a step
+        """
+        policy, check_finite = self.tdpg.policy, self.tdpg._check_finite
+        minibatches = self._minibatches(batch)
+        with th.no_grad():  # the policy as it is now, for all steps
+            parts = map(batch.select, minibatches)  # one at a time: images need room
+            teachers = [actions(policy, part, part.observations) for part in parts]
+        for columns, teacher in zip(minibatches, teachers, strict=True):
+            part = batch.select(columns)
+            seen = (self.perturbed(part), part.observations)
+            loss = th.stack([divergence(actions(policy, part, each), teacher, part) for each in seen]).sum()
+            check_finite("nuisance loss", loss)
+            self.optimizer.zero_grad()
+            loss.backward()
+            check_finite("gradient", th.nn.utils.clip_grad_norm_(policy.parameters(), 1.0))
+            self.optimizer.step()
+        fresh = batch.select(self._minibatches(batch)[0])
+        with th.no_grad():
+            now, plain = (actions(policy, fresh, each) for each in (self.perturbed(fresh), fresh.observations))
+            return divergence(now, plain, fresh).item()
+
+    def _minibatches(self, batch: Any) -> list[th.Tensor]:
+        """Draw the columns of each gradient step: about ``BATCH_STEPS`` steps, in as few passes as possible."""
+        n_columns = batch.alive.shape[1]
+        size = min(n_columns, max(2, round(BATCH_STEPS * n_columns / batch.alive.sum().item())))
+        n_passes = math.ceil(self.n_steps * size / n_columns)
+        device = batch.alive.device
+        columns = th.cat([th.randperm(n_columns, device=device) for _ in range(n_passes)])
+        return [columns[i * size : (i + 1) * size] for i in range(self.n_steps)]
