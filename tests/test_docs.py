@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium as gym
 import matplotlib
 import pytest
+from stable_baselines3 import PPO
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.information import ESTIMATORS, CriticEstimator
@@ -42,6 +43,7 @@ MAX_EPOCHS = 2
 
 # The other pages take up to minutes and are marked slow.
 QUICK_PAGES = {
+    "README.md",
     "docs/guide/quickstart.md",
     "docs/guide/algorithm.md",
     "docs/guide/your_environment.md",
@@ -65,15 +67,19 @@ def name_of(page):
 @pytest.fixture
 def brief_training(monkeypatch):
     """Make every call of ``learn`` take a few epochs with a few critic steps, whatever the page asks for."""
-    learn, init = TDPG.learn, CriticEstimator.__init__
+    learn, learn_ppo, init = TDPG.learn, PPO.learn, CriticEstimator.__init__
 
     def brief_learn(self, total_timesteps=1_000_000, *args, **kwargs):
         return learn(self, min(total_timesteps, MAX_EPOCHS * self.epoch_size), *args, **kwargs)
+
+    def brief_ppo(self, total_timesteps, *args, **kwargs):
+        return learn_ppo(self, min(total_timesteps, MAX_EPOCHS * self.n_steps * self.n_envs), *args, **kwargs)
 
     def brief_init(self, *args, **kwargs):
         init(self, *args, **{**kwargs, "gradient_steps": 2, "warmup_gradient_steps": 5, "refit_gradient_steps": 5})
 
     monkeypatch.setattr(TDPG, "learn", brief_learn)
+    monkeypatch.setattr(PPO, "learn", brief_ppo)
     monkeypatch.setattr(CriticEstimator, "__init__", brief_init)
 
 
