@@ -121,9 +121,9 @@ def draw_lava(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float
     axes.add_patch(Rectangle((-1, -1), 1, n + 1, facecolor="#8C8C96"))
     axes.add_patch(Rectangle((LAVA, -1), 1, n + 1, facecolor="#EB5A14"))
     axes.axvline(GOAL[0], color=GREEN, linewidth=3)
-    axes.text(-0.5, n / 2 - 0.5, "wall", rotation=90, ha="center", va="center", color="white", fontsize=8)
-    axes.text(LAVA + 0.5, n / 2 - 0.5, "lava", rotation=90, ha="center", va="center", color="white", fontsize=8)
-    axes.text(GOAL[0] + 0.1, n - 0.62, "goal", color=GREEN, fontsize=8)
+    axes.text(-0.5, n / 2 - 0.5, "wall", rotation=90, ha="center", va="center", color="white", fontsize=10)
+    axes.text(LAVA + 0.5, n / 2 - 0.5, "lava", rotation=90, ha="center", va="center", color="white", fontsize=10)
+    axes.text(GOAL[0] + 0.1, n - 0.75, "goal", color=GREEN, fontsize=10)
     for lane, i in enumerate(shown):
         here, seen = take.states[step, i, 0], take.reports[step, i, 0]
         if share > 0:
@@ -148,11 +148,11 @@ def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float)
     said, colour = (
         ("Sensor fault: 7 of 10 readings are lost and read 0", GHOST) if faulty else ("The sensor works", GREEN)
     )
-    figure.text(0.5, 0.955, said, ha="center", va="center", fontsize=12, color="white", weight="bold",
+    figure.text(0.5, 0.955, said, ha="center", va="center", fontsize=14, color="white", weight="bold",
                 bbox=dict(boxstyle="round,pad=0.35", facecolor=colour, edgecolor="none"))  # fmt: skip
     for column, name in enumerate(POLICIES):
         figure.text(
-            0.275 + 0.475 * column, 0.875, name, ha="center", va="center", fontsize=10.5, color=INK, weight="bold"
+            0.275 + 0.475 * column, 0.875, name, ha="center", va="center", fontsize=12.5, color=INK, weight="bold"
         )
         for row, (task, (_, _, draw, _)) in enumerate(TASKS.items()):
             axes = figure.add_axes((0.055 + 0.475 * column, 0.48 - 0.395 * row, 0.44, 0.335))
@@ -162,13 +162,13 @@ def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float)
             step = min(int(time), len(take.actions))
             draw(axes, take, shown[task], step, 0.0 if step == len(take.actions) else time - step)
             cost = f"mean cost {take.costs.mean():.0f}"
-            axes.set_title(cost, loc="right", fontsize=9, color=INK, pad=3)
+            axes.set_title(cost, loc="right", fontsize=11, color=INK, pad=3)
             if column == 0:
                 figure.text(
-                    0.028, 0.645 - 0.395 * row, task, rotation=90, ha="center", va="center", fontsize=9, color=INK
+                    0.028, 0.645 - 0.395 * row, task, rotation=90, ha="center", va="center", fontsize=11, color=INK
                 )
     figure.text(0.5, 0.03, "filled: where it is        pink outline: what the sensor says", ha="center", va="center",
-                fontsize=9, color=INK)  # fmt: skip
+                fontsize=11, color=INK)  # fmt: skip
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
