@@ -16,6 +16,8 @@ import pytest
 from stable_baselines3 import PPO
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.information import ESTIMATORS, CriticEstimator
 from sb3_tdpg.robustness import PERTURBATIONS
 
@@ -27,6 +29,7 @@ PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if
 BLOCK = re.compile(r"^(?P<skip><!-- no-run -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+POLICIES = sorted((ROOT / "docs" / "policies").glob("*.zip"))
 PAPER_MAP = ROOT / "docs" / "paper_map.md"
 
 # Everything that has a number in the paper's PDF, but for plain sections.
@@ -132,6 +135,14 @@ def test_links_between_pages_point_to_files(page):
     links = re.findall(r"\]\(([^)#:\s]+\.md)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if not (page.parent / link).is_file()]
     assert not missing
+
+
+@pytest.mark.parametrize("policy", POLICIES, ids=lambda path: path.stem)
+def test_a_published_policy_loads_and_costs_what_its_page_says(policy):
+    (stated,) = re.findall(rf"`{policy.name}` \| ([\d.]+) \|", (policy.parent / "index.md").read_text(encoding="utf-8"))
+    row = Scenario("Training", policy.stem)
+    records = evaluate_scenarios(TDPG.load(policy, device="cpu"), [row], n_episodes=1000, seed=0)
+    assert records["cost"].mean() == pytest.approx(float(stated), abs=0.3)
 
 
 # -- notebooks -------------------------------------------------------------------------------------------------
