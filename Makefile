@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-baselines reproduce-public wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-baselines reproduce-public wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -71,6 +71,9 @@ format: $(STAMP) ## mend style and format in place
 
 docs: $(STAMP) ## build the documentation into docs/_build/html
 	$(PY) -m sphinx -W --keep-going -b html docs $(HTML)
+
+pictures: $(STAMP) ## draw the pictures of the documentation (PICTURES="lava.gif when.png": these only)
+	$(PY) docs/make_pictures.py $(PICTURES)
 
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py

@@ -1,5 +1,6 @@
-"""Configure Sphinx: MyST Markdown, the Read the Docs theme, and the docstrings of the code."""
+"""Configure Sphinx: MyST Markdown, the theme Furo, and the docstrings of the code."""
 
+import configparser
 import re
 import unicodedata
 from pathlib import Path
@@ -36,15 +37,23 @@ autodoc_class_signature = "mixed"
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
-html_theme = "sphinx_rtd_theme"
+html_theme = "furo"
+html_title = project
+# Links to edit a page, once setup.cfg names the repository.
+setup_cfg = configparser.ConfigParser()
+setup_cfg.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
+repository = re.search(r"^Source = (\S+)", setup_cfg["metadata"]["project_urls"], re.MULTILINE)
+if repository and "/OWNER/" not in repository[1]:
+    html_theme_options = {"source_repository": repository[1], "source_branch": "main", "source_directory": "docs/"}
 html_math_renderer = "mathml"
-html_theme_options = {"navigation_depth": 3}
 html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 
 
-# No line break before a unit, in an interval, or in an exponent ("43.9 ms", "[8.20, 9.04]", "1e-3").
-TOGETHER = re.compile(r"(?<=\d) (?=%|(?:[nµm]?s|min|nat)\b)|(?<=\d,) (?=[^\s\]]+\])")
+# No line break before a unit, in an interval, or in an exponent ("43.9 ms", "[8.20, 9.04]", "7.6 to 10", "1e-3").
+TOGETHER = re.compile(
+    r"(?<=\d) (?=%|(?:[nµm]?s|min|nat)\b)|(?<=\d,) (?=[^\s\]]+\])|(?<=\d) (?=to [\d.])|(?<=\d to) (?=[\d.])"
+)
 EXPONENT = re.compile(r"(?<=\de-)(?=\d)")
 
 

@@ -1,9 +1,16 @@
-"""Draw the pictures of the environments and the perturbations: ``python docs/make_pictures.py``."""
+"""
+Draw the pictures of the front page, the environments and the guide: ``make pictures``.
 
+``python docs/make_pictures.py lava.gif when.png`` draws these only.
+"""
+
+import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from fault_film import sensor_fault
 from PIL import Image
 
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
@@ -258,19 +265,30 @@ def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
         picture.convert("RGB").save(path, optimize=True)
 
 
+DOCS = Path(__file__).parent
+PICTURES: dict[str, Callable[[Path], None]] = {
+    "guide/sensor_fault.gif": sensor_fault,
+    "guide/when.png": when,
+    "guide/perturbations_ball.png": partial(perturbations, env_id="BallCatch-v0", renderer="fast"),
+    "guide/perturbations_grasp.png": partial(perturbations, env_id="PandaGrasp-v0"),
+    "environments/lava.gif": lava,
+    "environments/squeeze_insert.gif": squeeze_insert,
+    "environments/panda_squeeze.gif": panda_squeeze,
+    "environments/peg_corner.gif": peg_corner,
+    "environments/ball_textures.png": ball_textures,
+    "environments/ball_camera.png": ball_camera,
+    "environments/ball_catch.gif": ball_catch,
+    "environments/panda_depth.png": panda_depth,
+    "environments/panda_camera.png": panda_camera,
+    "environments/panda_grasp.gif": panda_grasp,
+}
+
+
 if __name__ == "__main__":
-    folder = Path(__file__).parent / "environments"
-    lava(folder / "lava.gif")
-    squeeze_insert(folder / "squeeze_insert.gif")
-    panda_squeeze(folder / "panda_squeeze.gif")
-    peg_corner(folder / "peg_corner.gif")
-    ball_textures(folder / "ball_textures.png")
-    ball_camera(folder / "ball_camera.png")
-    ball_catch(folder / "ball_catch.gif")
-    panda_depth(folder / "panda_depth.png")
-    panda_camera(folder / "panda_camera.png")
-    panda_grasp(folder / "panda_grasp.gif")
-    guide = Path(__file__).parent / "guide"
-    when(guide / "when.png")
-    perturbations(guide / "perturbations_ball.png", "BallCatch-v0", renderer="fast")
-    perturbations(guide / "perturbations_grasp.png", "PandaGrasp-v0")
+    wanted = sys.argv[1:] or [Path(name).name for name in PICTURES]
+    if unknown := set(wanted) - {Path(name).name for name in PICTURES}:
+        sys.exit(f"no such pictures: {sorted(unknown)}; there are {[Path(name).name for name in PICTURES]}")
+    for name, draw in PICTURES.items():
+        if Path(name).name in wanted:
+            draw(DOCS / name)
+            print(f"docs/{name}", flush=True)

@@ -13,8 +13,11 @@ from pathlib import Path
 import gymnasium as gym
 import matplotlib
 import pytest
+from stable_baselines3 import PPO
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.information import ESTIMATORS, CriticEstimator
 from sb3_tdpg.robustness import PERTURBATIONS
 
@@ -26,6 +29,7 @@ PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if
 BLOCK = re.compile(r"^(?P<skip><!-- no-run -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+POLICIES = sorted((ROOT / "docs" / "policies").glob("*.zip"))
 PAPER_MAP = ROOT / "docs" / "paper_map.md"
 
 # Everything that has a number in the paper's PDF, but for plain sections.
@@ -42,6 +46,7 @@ MAX_EPOCHS = 2
 
 # The other pages take up to minutes and are marked slow.
 QUICK_PAGES = {
+    "README.md",
     "docs/guide/quickstart.md",
     "docs/guide/algorithm.md",
     "docs/guide/your_environment.md",
@@ -65,15 +70,19 @@ def name_of(page):
 @pytest.fixture
 def brief_training(monkeypatch):
     """Make every call of ``learn`` take a few epochs with a few critic steps, whatever the page asks for."""
-    learn, init = TDPG.learn, CriticEstimator.__init__
+    learn, learn_ppo, init = TDPG.learn, PPO.learn, CriticEstimator.__init__
 
     def brief_learn(self, total_timesteps=1_000_000, *args, **kwargs):
         return learn(self, min(total_timesteps, MAX_EPOCHS * self.epoch_size), *args, **kwargs)
+
+    def brief_ppo(self, total_timesteps, *args, **kwargs):
+        return learn_ppo(self, min(total_timesteps, MAX_EPOCHS * self.n_steps * self.n_envs), *args, **kwargs)
 
     def brief_init(self, *args, **kwargs):
         init(self, *args, **{**kwargs, "gradient_steps": 2, "warmup_gradient_steps": 5, "refit_gradient_steps": 5})
 
     monkeypatch.setattr(TDPG, "learn", brief_learn)
+    monkeypatch.setattr(PPO, "learn", brief_ppo)
     monkeypatch.setattr(CriticEstimator, "__init__", brief_init)
 
 
@@ -126,6 +135,14 @@ def test_links_between_pages_point_to_files(page):
     links = re.findall(r"\]\(([^)#:\s]+\.md)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if not (page.parent / link).is_file()]
     assert not missing
+
+
+@pytest.mark.parametrize("policy", POLICIES, ids=lambda path: path.stem)
+def test_a_published_policy_loads_and_costs_what_its_page_says(policy):
+    (stated,) = re.findall(rf"`{policy.name}` \| ([\d.]+) \|", (policy.parent / "index.md").read_text(encoding="utf-8"))
+    row = Scenario("Training", policy.stem)
+    records = evaluate_scenarios(TDPG.load(policy, device="cpu"), [row], n_episodes=1000, seed=0)
+    assert records["cost"].mean() == pytest.approx(float(stated), abs=0.3)
 
 
 # -- notebooks -------------------------------------------------------------------------------------------------

@@ -129,19 +129,35 @@ def test_a_checkout_on_the_python_path_works_without_an_install(tmp_path: Path) 
     run(python, "-c", IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA, cwd=tmp_path, pythonpath=REPOSITORY)
 
 
+QUICKSTART_MAKES = (
+    "tdpg_lava.onnx",
+    "models/ppo_1.zip",
+    "results/report-CartPole-v1/report.html",
+    "ball.gif",
+    "logs/tdpg/Lava-v0_1/Lava-v0.zip",
+    "results/sweep-Lava-v0/selected.zip",
+)
+
+
 @pytest.mark.slow
-def test_the_blocks_of_the_readme_chain_word_for_word(installed: Path, tmp_path: Path) -> None:
-    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    section = text[text.index("## Use it") : text.index("## Results")]
-    blocks = re.findall(r"^```(python|bash)\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
-    assert len(blocks) >= 6
+@pytest.mark.parametrize(
+    ("page", "end", "makes"),
+    [
+        ("README.md", "## Install", ("tdpg_squeeze.zip", "results/report-CartPole-v1/report.html")),
+        ("docs/guide/quickstart.md", "## In a notebook", QUICKSTART_MAKES),
+    ],
+)
+def test_the_blocks_of_a_first_page_chain_word_for_word(
+    page: str, end: str, makes: tuple[str, ...], installed: Path, tmp_path: Path
+) -> None:
+    text = (REPOSITORY / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(python|bash)\n(.*?)^```$", text[: text.index(end)], re.MULTILINE | re.DOTALL)
+    assert {language for language, _ in blocks} == {"python", "bash"}
     for language, code in blocks:
         program = (installed, "-c") if language == "python" else ("bash", "-e", "-c")
         print(run(*program, code, cwd=tmp_path, path=installed.parent))
-    for made in ("models/ppo_1.zip", "tdpg_lava.onnx", "ball.gif", "logs/tdpg/Lava-v0_1/Lava-v0.zip"):
+    for made in makes:
         assert (tmp_path / made).stat().st_size > 0
-    assert list(tmp_path.glob("results/report-*/report.html"))
-    assert (tmp_path / "results/sweep-Lava-v0/selected.zip").exists()
 
 
 @pytest.mark.slow
