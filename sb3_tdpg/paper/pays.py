@@ -224,13 +224,14 @@ def reproduce_pays(
         problem, records = PROBLEMS[name], common.read_records(of_problem)
         table = with_summary(records)
         frames[name] = by_seed = _means(table)
+        of_tdpg = aggregate_seeds(table[table["model"] == "TDPG"])
         others = [label for label in by_seed["model"].unique() if label != "TDPG"]
         sections[problem.title] = dict(
             methods=common.markdown_table(_methods_table(by_seed, _cpu_times(of_problem))),
             comparisons=common.comparisons_table(table, [("TDPG", other) for other in others], KINDS),
             faults=common.markdown_table(_faults_table(by_seed)),
             successes=common.markdown_table(_successes_table(records)) if "failure" in records else "",
-            goals=common.goals_table(aggregate_seeds(table[table["model"] == "TDPG"]), {"TDPG": problem.goals}),
+            goals=problem.goals and common.goals_table(of_tdpg, {"TDPG": problem.goals}),
         )
     write_frame_atomically(pd.concat(f.assign(problem=n) for n, f in frames.items()), out / "seeds.csv")
     save_figure(figure(frames), out / "pays.png")
@@ -279,7 +280,7 @@ def _faults_table(by_seed: pd.DataFrame) -> pd.DataFrame:
 def _successes_table(records: pd.DataFrame) -> pd.DataFrame:
     """Show the share of the episodes that succeed in %, means over seeds, and the largest fall by a fault in points."""
     shares = 100 * (1 - records.groupby(["model", "train_seed", "scenario"], sort=False)["failure"].mean().unstack())
-    falls = -shares.drop(columns=TRAINING).sub(shares[TRAINING], axis=0).min(axis=1)
+    falls = shares[TRAINING] - shares.drop(columns=TRAINING).min(axis=1)
     table = shares.groupby("model", sort=False).mean().map("{:.1f}".format)
     of_model = falls.groupby("model", sort=False)
     ends = zip(of_model.mean(), of_model.min(), of_model.max(), strict=True)
