@@ -131,7 +131,7 @@ def test_from_nothing_to_tables_figure_and_records(tmp_path, monkeypatch):
     arguments = ["--n-seeds", "2", "--n-timesteps", "2000", "--publish", str(tmp_path / "docs")]
     assert main(["reproduce", "pays", "--out", str(tmp_path / "out"), *arguments]) == 0
     summary = (tmp_path / "out" / "summary.md").read_text()
-    for text in (*wanted, "## Squeeze and insert", "## Lava", "make reproduce-pays", "| TDPG | Training | <= 7.9 |"):
+    for text in (*wanted, "## Lava", "`sb3-tdpg reproduce pays` at", "| TDPG | Training | <= 7.9 |"):
         assert text in summary
     assert main(["reproduce", "pays-cue", "--no-controls", "--out", str(tmp_path / "cue"), *arguments[:4]]) == 0
     summary = (tmp_path / "cue" / "summary.md").read_text()
