@@ -196,7 +196,7 @@ def test_a_higher_confidence_is_a_wider_interval():
     (dict(states=th.zeros(4, 59, 2)), "shapes"),
     (dict(means=th.full((4, 60, 2), math.nan)), "means are not all finite"),
     (dict(stds=th.zeros(4, 60, 2)), "stds must be positive"),
-], ids=str)  # fmt: skip
+])  # fmt: skip
 def test_a_batch_that_is_not_fit_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         information_interval(random_batch()._replace(**change))
