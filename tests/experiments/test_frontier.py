@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+import shlex
 from dataclasses import replace
 
 import gymnasium as gym
@@ -36,6 +38,12 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
     assert (table["seeds"] == 2).all()
     assert np.isfinite(table.drop(columns="label")).all(axis=None)
     assert (table["cost_low"] <= table["cost"]).all() and (table["cost"] <= table["cost_high"]).all()
+
+    (report,) = re.findall(r"^sb3-tdpg (report .*)$", text, re.MULTILINE)
+    brief = ["--perturbations", "vector_noise", "--severities", "5", "--episodes", "5", "--jobs", "1"]
+    assert main([*shlex.split(report), *brief]) == 0
+    measured = (tmp_path / "results" / "frontier-Lava-v0-report" / "report.md").read_text()
+    assert "| 90 %" in measured and f"| {NO_PENALTY}" in measured
 
     runs = pd.read_csv(out / "runs.csv")
     settings = {
