@@ -1,18 +1,22 @@
 """
 Draw the pictures of the front page, the environments and the guide: ``make pictures``.
 
-``python docs/make_pictures.py lava.gif when.png`` draws these only.
+``python docs/make_pictures.py lava.gif when.png`` draws these only. All of them take half an hour, most of it for the
+trainings of the policies that the films show.
 """
 
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from fault_film import sensor_fault
 from PIL import Image
 
+from sb3_tdpg import TDPG
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import enlarge
@@ -25,6 +29,7 @@ from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 from sb3_tdpg.evaluation import save_figure
+from sb3_tdpg.evaluation.enjoy import enjoy
 from sb3_tdpg.evaluation.figures import new_figure
 from sb3_tdpg.robustness import perturbation_gallery
 
@@ -257,6 +262,14 @@ def panda_grasp(path: Path) -> None:
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
 
 
+def learned(path: Path, env_id: str, **shown: Any) -> None:
+    """Train TDPG by the one line and film it, as ``sb3-tdpg enjoy --record`` does."""
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder, "model.zip")
+        TDPG("TRVPolicy", env_id, seed=0).learn().save(model)
+        enjoy(model, env_id, record=path, **shown)
+
+
 def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
     """Draw one image under each perturbation at five severities."""
     perturbation_gallery(env_id, env_kwargs=env_kwargs).savefig(path, dpi=80)
@@ -278,9 +291,13 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "environments/ball_textures.png": ball_textures,
     "environments/ball_camera.png": ball_camera,
     "environments/ball_catch.gif": ball_catch,
+    "environments/ball_catch_tdpg.gif": partial(learned, env_id="BallCatch-v0", env_kwargs=dict(texture="blue_tiles")),
     "environments/panda_depth.png": panda_depth,
     "environments/panda_camera.png": panda_camera,
     "environments/panda_grasp.gif": panda_grasp,
+    "environments/panda_grasp_tdpg.gif": partial(
+        learned, env_id="PandaGrasp-v0", env_kwargs=dict(yaw_range=(0.0, 6.28)), n_episodes=3, seed=1
+    ),
 }
 
 
