@@ -79,8 +79,8 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
 
-    The file may be missing. A setting that it lacks (a file of an earlier version may) is a difference. ``what`` names
-    the content of its folder in the message.
+    The file may be missing. A setting that it lacks is a difference. ``what`` names the content of its folder in the
+    message.
     """
     if not path.exists():
         return
