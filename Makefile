@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-baselines reproduce-public wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-baselines reproduce-public records wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -113,6 +113,9 @@ reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside 
 
 reproduce-public: $(STAMP) ## our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO on public tasks
 	$(PY) tests/benchmarks/public/run.py
+
+records: $(STAMP) ## check the records of single episodes and pack them for a release
+	$(PY) docs/make_records.py
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@rm -rf build/lib

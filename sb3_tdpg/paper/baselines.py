@@ -150,8 +150,8 @@ def reproduce_baselines(
     comparisons = [(each, each.tasks(n, out / "runs", given.overrides)) for each, n in numbers if n > 0]
     if missing := [str(records / each.records) for each, _ in comparisons if not (records / each.records).exists()]:
         raise ValueError(
-            f"{' and '.join(missing)} are missing: run this in the folder of the repository, or make them first with "
-            "'make reproduce-lava reproduce-grasp'"
+            f"{' and '.join(missing)} are missing: run this in the folder of the repository with the records of the "
+            "release in docs/results, or make them first with 'make reproduce-lava reproduce-grasp'"
         )
     everything = [task for _, tasks in comparisons for task in tasks]
     complete_runs(everything, **given.of_runs)
