@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from fault_film import sensor_fault
+from panda_film import panda_squeeze
 from PIL import Image
 
 from sb3_tdpg import TDPG
@@ -22,7 +23,6 @@ from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
-from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.panda_view import depth_picture
 from sb3_tdpg.envs.peg_corner import HOLE, PegCornerEnv
 from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
@@ -93,25 +93,6 @@ def squeeze_insert(path: Path) -> None:
     starts = np.column_stack([np.sin(2 * yaws), np.cos(2 * yaws)])
     env = SqueezeInsertEnv(render_mode="rgb_array")
     ways(path, env, starts, look, lambda state, t: [fixed[t]])
-
-
-def panda_squeeze(path: Path) -> None:
-    """Animate an episode without looking: two squeezes across the slot and two along it, then the insertion."""
-    env = PandaSqueezeEnv(render_mode="rgb_array")
-    env.reset(seed=0)
-    env._state = env._with_yaw(np.array([np.radians(-70.0)]), np.empty((1, 0)))
-    frames, durations = [env.render()], [800]  # ms
-    for jaws in (45.0, 55.0, 0.0, 0.0):
-        env.step(np.radians([jaws]))
-        shown = list(env.film())[::3]
-        frames += shown
-        durations += [100] * len(shown)
-    frames.append(env.render())
-    durations.append(2000)
-    env.close()
-    palette = Image.fromarray(np.concatenate(frames[::8])).quantize(96, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
 
 
 def peg_corner(path: Path) -> None:
