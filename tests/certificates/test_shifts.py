@@ -239,6 +239,7 @@ def test_the_information_is_that_of_the_log_det_bound(model, episodes):
 def test_bad_input_is_told(model):
     with pytest.raises(ValueError, match="n_budget_episodes=50 must be at least 1 and at most n_episodes=20"):
         TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=20, n_budget_episodes=50)
+    assert np.isfinite(TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=4, n_budget_episodes=4).information)
     with pytest.raises(ValueError, match="n_episodes=2 must be at least 4, to estimate the information of 2 TRVs"):
         TrainingEpisodes(model, TRAINING, cost_bound=1.0, n_episodes=2, n_budget_episodes=1)
     for wrong in (dict(confidence=1.5), dict(cost_bound=math.nan)):

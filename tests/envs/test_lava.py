@@ -105,6 +105,10 @@ def test_an_action_out_of_bounds_counts_as_the_bound():
     assert costs == [4.0]  # |1 - 3| + |2|
 
 
+def test_an_action_is_bounded_by_a_hundred_by_default():
+    assert (LavaEnv().action_space.low.item(), LavaEnv().action_space.high.item()) == (-100.0, 100.0)
+
+
 def test_an_episode_starts_at_rest_anywhere_between_wall_and_lava():
     states, _ = LavaEnv().reset_batch(20_000)
     assert (states[:, 1] == 0).all()

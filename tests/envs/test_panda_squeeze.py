@@ -168,6 +168,17 @@ def test_the_checker_finds_nothing():
     env.close()
 
 
+def test_closing_gives_the_worlds_of_the_physics_and_of_the_pictures_back():
+    env = PandaSqueezeEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    env.render()
+    worlds = (env._simulation, env._view)
+    env.close()
+    for world in worlds:
+        with pytest.raises(RuntimeError, match="closed"):
+            world.client.getNumBodies()
+
+
 # -- the slot --------------------------------------------------------------------------------------------------------
 
 

@@ -158,6 +158,15 @@ def test_where_the_encoder_sees_the_state_the_information_lies_between_the_known
     assert upper - lower < 0.1
 
 
+def test_the_lower_bound_of_a_step_does_not_depend_on_the_other_steps():
+    batch = gaussian_batch(200, [[0.3, 0.3], [4.0, 4.0]], generator=th.Generator().manual_seed(0))
+    alone = [own_sample_bound(batch._replace(**{
+        name: getattr(batch, name)[[t]] for name in ("states", "trvs", "means", "stds")
+    })).item() for t in range(2)]  # fmt: skip
+    assert own_sample_bound(batch).tolist() == pytest.approx(alone, rel=1e-5)
+    assert alone[1] > alone[0] + 1
+
+
 def test_the_lower_bound_cannot_exceed_the_logarithm_of_the_number_of_samples():
     batch = gaussian_batch(100, [[1.0, 1.0]], noise_std=1e-6)
     assert own_sample_bound(batch).item() == pytest.approx(math.log(100), abs=1e-3)
