@@ -17,7 +17,7 @@ from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS, LAVA, PAND
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.figures import PALETTE
 from sb3_tdpg.paper.certificates import certificate_figure
-from sb3_tdpg.paper.figures import diagnosis_bars, failures_by_camera, failures_by_yaw, robustness_curves
+from sb3_tdpg.paper.plots import diagnosis_bars, failures_by_camera, failures_by_yaw, robustness_curves
 
 RESULTS = Path(__file__).parent / "results"
 BENCHMARK_MI = Path(__file__).parents[1] / "tests" / "benchmarks" / "benchmark_mi"

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(out: Path, **options: Any) -> None:
-    from sb3_tdpg.paper.lava import demo
+    from sb3_tdpg.paper.lava_tables import demo
 
     with kept_by_this_process(out):
         print(f"\n{demo(out, **options)}\n\nresults are in {out}")
@@ -133,7 +133,7 @@ def _certify(
     models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, nuisance: str | None, n_members: int,
     **options: Any,
 ) -> None:  # fmt: skip
-    from sb3_tdpg.certificates.nuisance import certify_nuisance
+    from sb3_tdpg.certificates.declared import certify_nuisance
     from sb3_tdpg.paper.certificates import certify_lava
 
     say_what_is_trusted(*models)

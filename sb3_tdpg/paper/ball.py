@@ -28,8 +28,8 @@ from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.baselines import baselines_table, training_times
 from sb3_tdpg.paper.common import Method
-from sb3_tdpg.paper.figures import diagnosis_bars, robustness_curves, sorted_walls
 from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
+from sb3_tdpg.paper.plots import diagnosis_bars, robustness_curves, sorted_walls
 from sb3_tdpg.presets import IMAGE_ENCODER
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG

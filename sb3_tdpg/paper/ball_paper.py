@@ -15,7 +15,7 @@ from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.ball import BACKGROUND_ROWS, GROUPS, NOISE_ROWS, group_rows, with_groups
 from sb3_tdpg.paper.common import Method
-from sb3_tdpg.paper.figures import robustness_curves
+from sb3_tdpg.paper.plots import robustness_curves
 
 FIRST_SEED = 400
 # Costs of policy gradient from which TDPG starts: the paper's limit for TDPG, the paper's own policy gradient, and

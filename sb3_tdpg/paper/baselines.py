@@ -17,7 +17,7 @@ from sb3_tdpg.experiments.runs import Task, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, Options, make_tasks, read_records, write_results
 from sb3_tdpg.paper.grasp import TDPG_SECOND_STAGE as GRASP_SECOND_STAGE
-from sb3_tdpg.paper.lava import MAX_ATTEMPTS
+from sb3_tdpg.paper.lava_tables import MAX_ATTEMPTS
 
 # The number of environment steps of TDPG, in both of its stages if it has two.
 LAVA_STEPS, GRASP_STEPS = 1.5e6, 3.2e4

@@ -13,7 +13,7 @@ from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figur
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.paper import common, knowledge
 from sb3_tdpg.paper.common import NO_PENALTY, Method
-from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
+from sb3_tdpg.paper.plots import failures_by_camera, failures_by_yaw
 from sb3_tdpg.tdpg import TDPG
 
 # Seeds below 100 were used to make the blocks.

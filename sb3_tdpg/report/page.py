@@ -9,7 +9,7 @@ import pandas as pd
 
 from sb3_tdpg.common.markdown import escaped, fill_template, markdown_table
 from sb3_tdpg.report.numbers import CLEAR, Numbers
-from sb3_tdpg.report.records import Plan
+from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED, Row
 from sb3_tdpg.robustness.registry import find
 

@@ -26,7 +26,7 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.experiments.runs import Run, complete_run, complete_runs, read_progress
-from sb3_tdpg.paper.lava import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
+from sb3_tdpg.paper.lava_tables import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
@@ -190,12 +190,12 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
     pytest.importorskip("matplotlib")
     # In this process: the workers would not see the small epochs of this module.
     monkeypatch.setattr(
-        "sb3_tdpg.paper.lava.complete_runs",
+        "sb3_tdpg.paper.lava_tables.complete_runs",
         lambda tasks, *, n_eval_episodes, jobs: [
             complete_run(*task, n_eval_episodes=n_eval_episodes) for task in tasks
         ],
     )
-    monkeypatch.setattr("sb3_tdpg.paper.lava.aggregate_seeds", partial(aggregate_seeds, n_bootstrap=10))
+    monkeypatch.setattr("sb3_tdpg.paper.lava_tables.aggregate_seeds", partial(aggregate_seeds, n_bootstrap=10))
     tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
     summary = reproduce_lava(
         tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200, publish=published

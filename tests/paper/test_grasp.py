@@ -18,8 +18,8 @@ from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import InformationBatch, Mine
 from sb3_tdpg.paper import common, grasp, knowledge
-from sb3_tdpg.paper.figures import failures_by_camera, failures_by_yaw
 from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
+from sb3_tdpg.paper.plots import failures_by_camera, failures_by_yaw
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import pytest
 from scipy.stats import binomtest
 
 from sb3_tdpg.common.provenance import how_made, provenance
-from sb3_tdpg.report.figures import comparison_figure, degradation_curves, own_rows_figure
+from sb3_tdpg.report.charts import comparison_figure, degradation_curves, own_rows_figure
 from sb3_tdpg.report.numbers import make_numbers
 from sb3_tdpg.report.page import Page, write_page
-from sb3_tdpg.report.records import Plan
+from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import ALL, UNPERTURBED
 
 pytest.importorskip("matplotlib")

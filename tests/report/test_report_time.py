@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from sb3_tdpg.cli import main
 from sb3_tdpg.evaluation import TrustBadge, TrustCheck
 from sb3_tdpg.report import main as report_main
-from sb3_tdpg.report import records, robustness_report
+from sb3_tdpg.report import plan, robustness_report
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rliable")
@@ -32,7 +32,7 @@ pytest.importorskip("markdown_it")
     ],
 )
 def test_long_episodes_are_fewer(kind, horizon, n_episodes):
-    assert records.default_episodes(kind, horizon, 10_000) == n_episodes
+    assert plan.default_episodes(kind, horizon, 10_000) == n_episodes
 
 
 def report_of(out, models=None, **settings):
@@ -55,7 +55,7 @@ def test_the_time_is_estimated_before_the_rows_run(tmp_path, capsys):
 
 def test_the_page_of_an_interrupted_report_has_what_is_finished(tmp_path, monkeypatch):
     """A perturbation without its strong severities would look better than it is, so it is left out."""
-    run_row, titles = records.run_row, []
+    run_row, titles = plan.run_row, []
 
     def interrupted(plan, row, models):
         titles.append(row.title)
@@ -63,7 +63,7 @@ def test_the_page_of_an_interrupted_report_has_what_is_finished(tmp_path, monkey
             raise KeyboardInterrupt
         return run_row(plan, row, models)
 
-    monkeypatch.setattr(records, "run_row", interrupted)
+    monkeypatch.setattr(plan, "run_row", interrupted)
     monkeypatch.setattr(report_main, "PAUSE", 0)
     settings = dict(perturbations=["vector_bias", "vector_noise"], progress_bar=False)
     with pytest.raises(KeyboardInterrupt):
@@ -74,7 +74,7 @@ def test_the_page_of_an_interrupted_report_has_what_is_finished(tmp_path, monkey
     assert "vector_noise" not in page
     assert '<meta http-equiv="refresh"' in html
 
-    monkeypatch.setattr(records, "run_row", run_row)
+    monkeypatch.setattr(plan, "run_row", run_row)
     page = report_of(tmp_path, **settings)
     assert "Unfinished" not in page
     assert "vector_noise" in page

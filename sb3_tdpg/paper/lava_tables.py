@@ -23,7 +23,7 @@ from sb3_tdpg.evaluation import (
 from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
 from sb3_tdpg.paper.certificates import PAPER_INVERSE_BETAS
 from sb3_tdpg.paper.common import RECORD_COLUMNS, Options, folders_of, met, read_records, write_results
-from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
+from sb3_tdpg.paper.plots import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
 READINGS = ("table", "text")

@@ -9,7 +9,7 @@ from small_problems import tiny_tdpg
 
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios, save_figure
-from sb3_tdpg.paper.figures import cost_histograms, lava_trajectories
+from sb3_tdpg.paper.plots import cost_histograms, lava_trajectories
 
 pytest.importorskip("matplotlib")
 

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 from small_problems import tiny_tdpg, train_epochs
 
-from sb3_tdpg.certificates.nuisance import FAMILY, nuisance_table
+from sb3_tdpg.certificates.declared import FAMILY, nuisance_table
 from sb3_tdpg.cli import main
 
 

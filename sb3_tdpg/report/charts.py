@@ -19,7 +19,7 @@ from sb3_tdpg.evaluation.figures import INK, PALETTE, WIDTH, import_matplotlib, 
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.numbers import Numbers
-from sb3_tdpg.report.records import Plan
+from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import find
