@@ -51,23 +51,26 @@ def _demo(out: Path, **options: Any) -> None:
 class Experiment(NamedTuple):
     """A command ``reproduce``."""
 
-    function: str  # below sb3_tdpg.paper
+    function: str  # below sb3_tdpg
     folder: str  # the default one, in results/
     arguments: dict[str, Any] = {}  # fixed arguments of the function
     flags: tuple[str, ...] = ()  # those that not all experiments have
 
 
 EXPERIMENTS = {
-    "lava": Experiment("lava:reproduce_lava", "lava_reproduction", flags=("n_paper_seeds",)),
-    "ball": Experiment("ball:reproduce_ball", "ball_catch", flags=("controls",)),
-    "ball-paper": Experiment("ball_paper:reproduce_ball_paper", "ball_catch_paper"),
-    "ball-varying": Experiment("ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)),
-    "grasp": Experiment("grasp:reproduce_grasp", "panda_grasp"),
-    "grasp-camera": Experiment("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
-    "pays": Experiment("pays:reproduce_pays", "pays", flags=("controls",)),
-    "pays-cue": Experiment("pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
-    "panda-squeeze": Experiment("pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",)), ("controls",)),
-    "baselines": Experiment("baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
+    "lava": Experiment("paper.lava_tables:reproduce_lava", "lava_reproduction", flags=("n_paper_seeds",)),
+    "ball": Experiment("paper.ball:reproduce_ball", "ball_catch", flags=("controls",)),
+    "ball-paper": Experiment("paper.ball_paper:reproduce_ball_paper", "ball_catch_paper"),
+    "ball-varying": Experiment(
+        "paper.ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)
+    ),
+    "grasp": Experiment("paper.grasp:reproduce_grasp", "panda_grasp"),
+    "grasp-camera": Experiment("paper.grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
+    "pays": Experiment("paper.pays:reproduce_pays", "pays", flags=("controls",)),
+    "pays-cue": Experiment("paper.pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
+    "panda-squeeze": Experiment("paper.pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",)), ("controls",)),
+    "baselines": Experiment("paper.baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
+    "public": Experiment("experiments.public.study:reproduce_public", "public_tasks"),
 }
 
 
@@ -82,7 +85,7 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
 
     out = out or Path("results", chosen.folder)
     with kept_by_this_process(out):
-        text = pkgutil.resolve_name(f"sb3_tdpg.paper.{chosen.function}")(out, **chosen.arguments, **given)
+        text = pkgutil.resolve_name(f"sb3_tdpg.{chosen.function}")(out, **chosen.arguments, **given)
     print(f"\n{text}\n\nresults are in {out}")
 
 

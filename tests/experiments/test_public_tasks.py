@@ -13,25 +13,24 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
 from sb3_tdpg import TDPG
-from tests.benchmarks.public import trainings
-from tests.benchmarks.public.page import TABLES, Records, published_labels
-from tests.benchmarks.public.run import make_trainings
-from tests.benchmarks.public.tasks import TASKS
-from tests.benchmarks.public.trainings import LABEL, LIMIT, PRESET, Training, complete_training, with_limit
+from sb3_tdpg.experiments.public import trainings
+from sb3_tdpg.experiments.public.page import TABLES, Records
+from sb3_tdpg.experiments.public.study import make_trainings
+from sb3_tdpg.experiments.public.tasks import TASKS
+from sb3_tdpg.experiments.public.trainings import LABEL, LIMIT, PRESET, Training, complete_training, with_limit
 
 CARTPOLE = TASKS[0]
 
 
 @pytest.fixture(autouse=True)
 def _few_episodes(monkeypatch):
-    monkeypatch.setattr(trainings, "N_EVAL_EPISODES", 3)
     monkeypatch.setattr(trainings, "N_EVAL_ENVS", 3)
 
 
 def trained(root, method=PRESET, seed=200):
     task = dataclasses.replace(CARTPOLE, n_timesteps=400)
     settings = None if method == "PPO" else dict(epoch_steps=200, batch_size=100, n_epochs=1)
-    training = Training(task, method, seed, settings)
+    training = Training(task, method, seed, settings, n_eval_episodes=3)
     return training, complete_training(training, root)
 
 
@@ -72,33 +71,22 @@ def test_a_finished_training_is_kept_and_has_all_records(method, tmp_path):
         complete_training(dataclasses.replace(training, settings=dict(epoch_steps=300)), tmp_path)
 
 
-def test_published_records_take_the_place_of_trainings(tmp_path):
-    first, _ = trained(tmp_path, "PPO")
-    Records([first], tmp_path).write(tmp_path / "published", "make")
-    assert not (tmp_path / "published" / "summary.md").exists()  # there is nothing to compare yet
-    labels = published_labels(tmp_path / "published", ["PPO"])
-    assert labels == {first.label}
-    assert published_labels(tmp_path / "published", ["RecurrentPPO"]) == set()
-    second, _ = trained(tmp_path)
-    records = Records([second], tmp_path)
-    records.add_published(tmp_path / "published", labels)
-    for table in (records.episodes, records.times, records.curves):
-        assert set(table["method"]) == {PRESET, "PPO"}
-    all_published = Records([], tmp_path)
-    all_published.add_published(tmp_path / "published", labels)
-    assert set(all_published.episodes["method"]) == {"PPO"}
-
-
-def test_the_page_is_written_once_all_methods_are_there(tmp_path):
+def test_the_page_has_a_table_for_each_question(tmp_path):
     records = Records([trained(tmp_path)[0], trained(tmp_path, "PPO")[0]], tmp_path)
     for name in TABLES:
         table = getattr(records, name)
         hidden = table.replace({"method": {"PPO": "RecurrentPPO"}}).assign(env_id="CartPoleNoVel-v1")
         limited = table[table["method"] == PRESET].assign(method=LIMIT)
         setattr(records, name, pd.concat([table, hidden, limited], ignore_index=True))
-    records.write(tmp_path / "out", "make reproduce-public")
-    summary = (tmp_path / "out" / "summary.md").read_text()
-    for part in ("## Final returns", "## Cost limit", "| kept |", "## CPU time", "`make reproduce-public` at commit"):
+    summary = records.write(tmp_path / "out", "sb3-tdpg reproduce public")
+    assert (tmp_path / "out" / "summary.md").read_text() == summary
+    for part in (
+        "## Final returns",
+        "## Cost limit",
+        "| kept |",
+        "## CPU time",
+        "`sb3-tdpg reproduce public` at",
+    ):
         assert part in summary
     assert (tmp_path / "out" / "curves.png").stat().st_size > 10_000
 

@@ -69,7 +69,8 @@ TASKS = (
 def make_hopper_without_velocities(**kwargs: Any) -> gym.Env:
     """Make Hopper-v5 with the first components of its observation, the positions, only."""
     env = gym.make("Hopper-v5", **kwargs)
-    low, high = (bound[:N_HOPPER_POSITIONS] for bound in (env.observation_space.low, env.observation_space.high))
+    full: Any = env.observation_space
+    low, high = (bound[:N_HOPPER_POSITIONS] for bound in (full.low, full.high))
     space = gym.spaces.Box(low, high, dtype=np.float64)
     return gym.wrappers.TransformObservation(env, lambda y: y[:N_HOPPER_POSITIONS], space)
 

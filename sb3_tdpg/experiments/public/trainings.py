@@ -23,11 +23,10 @@ from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, jsonable, write_frame_atomically, write_run_config
+from sb3_tdpg.experiments.public.tasks import PublicTask
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.information import LogDet
-from tests.benchmarks.public.tasks import PublicTask
 
-N_EVAL_EPISODES = 100  # of each mode, deterministic and stochastic
 N_EVAL_ENVS = 10
 EVAL_SEED = 10_000  # its environments are seeded alike for all methods
 N_CURVE_POINTS = 50
@@ -51,13 +50,14 @@ class Training:
     method: str
     seed: int
     settings: dict[str, Any] | None = None
+    n_eval_episodes: int = 100  # without and with the noise of the policy, each
 
     @property
     def config(self) -> dict[str, Any]:
         """Everything that determines the result."""
         settings = self.task.zoo_block() if self.settings is None else self.settings
         task = {name: value for name, value in asdict(self.task).items() if name != "tuned"}
-        return {**asdict(self), "task": task, "settings": settings, "n_eval_episodes": N_EVAL_EPISODES}
+        return {**asdict(self), "task": task, "settings": settings}
 
     @property
     def label(self) -> tuple[str, str, int]:
@@ -97,7 +97,7 @@ def complete_training(training: Training, root: Path) -> Path:
     write_run_config(folder / "config.json", training.config)
     log, start = EpisodeLog(), time.perf_counter()
     model, cpu_s = train_ours(training, log) if training.settings is not None else train_rival(training, log, folder)
-    record = dict(cpu_s=cpu_s, wall_s=time.perf_counter() - start, timesteps=model.num_timesteps)
+    record: dict[str, Any] = dict(cpu_s=cpu_s, wall_s=time.perf_counter() - start, timesteps=model.num_timesteps)
     record["nats"] = nats_per_step(model) if isinstance(model, TDPG) else None
     write_atomically(folder / "time.json", json.dumps(jsonable(record)))
     model.save(folder / "model.zip")
@@ -162,14 +162,19 @@ def nats_per_step(model: TDPG) -> float:
 def evaluate(training: Training, model: BaseAlgorithm) -> pd.DataFrame:
     """Return the returns of evaluation episodes, with and without noise in the policy: one row for each."""
     env = make_vec_env(training.task.env_id, n_envs=N_EVAL_ENVS)
-    norm = unwrap_vec_normalize(model.get_env())
+    trained_in = model.get_env()
+    assert trained_in is not None
+    norm = unwrap_vec_normalize(trained_in)
     if norm is not None:
         env = VecNormalize(env, training=False, norm_reward=False)
         env.obs_rms = norm.obs_rms
     frames = []
+    returns: Any
     for deterministic in (True, False):
         env.seed(EVAL_SEED)
-        returns, lengths = evaluate_policy(model, env, N_EVAL_EPISODES, deterministic, return_episode_rewards=True)
+        returns, lengths = evaluate_policy(
+            model, env, training.n_eval_episodes, deterministic, return_episode_rewards=True
+        )
         frames.append(pd.DataFrame({"episode": range(len(returns)), "return": returns, "length": lengths}))
         frames[-1]["deterministic"] = deterministic
     return pd.concat(frames, ignore_index=True).assign(**dict(zip(LABEL, training.label, strict=True)))

@@ -1,9 +1,9 @@
-"""Tables and the figure of ``make reproduce-public``, from the folders of finished trainings."""
+"""Tables and the figure of the study on public tasks, from the folders of finished trainings."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +16,10 @@ from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomica
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.figures import PALETTE, WIDTH, new_panels
 from sb3_tdpg.evaluation.statistics import interquartile_means, probabilities_of_improvement
-from tests.benchmarks.public.tasks import TASKS, PublicTask
-from tests.benchmarks.public.trainings import LABEL, LIMIT, PRESET, SHARE, TUNED, Training, learning_curve
+from sb3_tdpg.experiments.public.tasks import TASKS, PublicTask
+from sb3_tdpg.experiments.public.trainings import LABEL, LIMIT, PRESET, SHARE, TUNED, Training, learning_curve
 
 TABLES = ("episodes", "times", "curves")
-
-
-def published_labels(folder: Path, methods: Sequence[str]) -> set[tuple[str, str, int]]:
-    """List the trainings of some methods whose records are published."""
-    path = folder / "times.csv.xz"
-    table = pd.read_csv(path) if methods and path.exists() else pd.DataFrame(columns=LABEL)
-    return set(table[table["method"].isin(methods)][LABEL].itertuples(index=False, name=None))
 
 
 class Records:
@@ -51,13 +44,6 @@ class Records:
         self.times = pd.DataFrame(times)
         self.curves = _joined(curves)
 
-    def add_published(self, folder: Path, labels: Set[tuple[str, str, int]]) -> None:
-        """Add the records of some trainings that an earlier call has published."""
-        for name in TABLES if labels else ():
-            table = pd.read_csv(folder / f"{name}.csv.xz")
-            wanted = table.set_index(LABEL).index.isin(labels)
-            setattr(self, name, _joined([getattr(self, name), table[wanted]]))
-
     @property
     def tasks(self) -> list[PublicTask]:
         """The tasks that there are records of."""
@@ -70,13 +56,11 @@ class Records:
         frame = frame[frame["deterministic"] == deterministic]
         return frame.groupby("train_seed")["return"].mean().to_numpy()
 
-    def write(self, out: Path, command: str) -> None:
-        """Write the records and, once there are both ours and the rivals', ``summary.md`` and ``curves.png``."""
+    def write(self, out: Path, command: str) -> str:
+        """Write the records, ``config.json``, ``curves.png`` and ``summary.md``, and return the latter."""
         how = provenance()  # before the files below change the checkout
         for name in TABLES:
             write_frame_atomically(getattr(self, name).round(3), out / f"{name}.csv.xz")
-        if not set(self.episodes["method"]) >= {PRESET, LIMIT, "PPO", "RecurrentPPO"}:
-            return
         save_figure(self.figure(), out / "curves.png")
         write_run_config(out / "config.json", dict(provenance=how))
         parts = [
@@ -92,7 +76,9 @@ class Records:
             self.time_table(),
             how_made(command, how, sorted(self.times["commit"].unique())),
         ]
-        write_atomically(out / "summary.md", "\n\n".join(parts) + "\n")
+        summary = "\n\n".join(parts) + "\n"
+        write_atomically(out / "summary.md", summary)
+        return summary
 
     def returns_table(self, deterministic: bool) -> str:
         """Compare the final returns with those of the rival."""
@@ -143,7 +129,8 @@ class Records:
         kind, dates = ["env_id", "method"], self.times["date"].fillna("")
         is_last = dates == dates.groupby([self.times[column] for column in kind]).transform("max")
         medians = self.times[is_last].groupby(kind)["cpu_s"].median()
-        rows, ratios = [], {"PPO": [], "RecurrentPPO": []}
+        rows: list[list[str]] = []
+        ratios: dict[str, list[float]] = {"PPO": [], "RecurrentPPO": []}
         for task in self.tasks:
             rival, ours = (medians[task.env_id, method] for method in (task.rival, PRESET))
             ratios[task.rival].append(ours / rival)

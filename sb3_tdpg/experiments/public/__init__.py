@@ -1,0 +1,1 @@
+"""TDPG beside PPO and RecurrentPPO on tasks that others made."""
