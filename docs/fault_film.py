@@ -19,7 +19,7 @@ from sb3_tdpg.evaluation.figures import INK, PALETTE
 from sb3_tdpg.robustness import PerturbedVecEnv
 
 BLUE, GREEN, GHOST = PALETTE[1], PALETTE[2], "#B0307F"
-POLICIES = {"policy gradient: trusts its sensor": dict(beta=float("inf")), "TDPG: a policy that hardly looks": {}}
+POLICIES = {"policy gradient": dict(beta=float("inf")), "TDPG": {}}
 FAULT = dict(perturbation="vector_dropout", severity=5, scale=1.0, seed=0)  # 70 % of the readings
 N_EPISODES = 1000
 JAMS = 0.1  # rad
@@ -110,7 +110,7 @@ def draw_squeeze(axes: Axes, take: Take, shown: np.ndarray, step: int, share: fl
             seen = yaw_of(take.reports[step, i])
             box(axes, middle, (0.84, 0.3), seen, fill=False, edgecolor=GHOST, linestyle="--", linewidth=1.3, zorder=4)
         elif abs(yaw) > JAMS:
-            axes.text(*middle, "jams", ha="center", va="center", color="white", fontsize=9, weight="bold", zorder=5,
+            axes.text(*middle, "jams", ha="center", va="center", color="white", fontsize=12, weight="bold", zorder=5,
                       bbox=dict(boxstyle="round,pad=0.2", facecolor="#C00000", edgecolor="none"))  # fmt: skip
 
 
@@ -121,9 +121,9 @@ def draw_lava(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float
     axes.add_patch(Rectangle((-1, -1), 1, n + 1, facecolor="#8C8C96"))
     axes.add_patch(Rectangle((LAVA, -1), 1, n + 1, facecolor="#EB5A14"))
     axes.axvline(GOAL[0], color=GREEN, linewidth=3)
-    axes.text(-0.5, n / 2 - 0.5, "wall", rotation=90, ha="center", va="center", color="white", fontsize=10)
-    axes.text(LAVA + 0.5, n / 2 - 0.5, "lava", rotation=90, ha="center", va="center", color="white", fontsize=10)
-    axes.text(GOAL[0] + 0.1, n - 0.75, "goal", color=GREEN, fontsize=10)
+    axes.text(-0.5, n / 2 - 0.5, "wall", rotation=90, ha="center", va="center", color="white", fontsize=16)
+    axes.text(LAVA + 0.5, n / 2 - 0.5, "lava", rotation=90, ha="center", va="center", color="white", fontsize=16)
+    axes.text(GOAL[0] + 0.1, n - 0.75, "goal", color=GREEN, fontsize=14)
     for lane, i in enumerate(shown):
         here, seen = take.states[step, i, 0], take.reports[step, i, 0]
         if share > 0:
@@ -136,39 +136,37 @@ def draw_lava(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float
 
 
 TASKS = {
-    "squeeze and insert": ("SqueezeInsert-v0", 800_000, draw_squeeze, 12),
+    "squeeze, insert": ("SqueezeInsert-v0", 800_000, draw_squeeze, 12),
     "lava": ("Lava-v0", 1_000_000, draw_lava, 5),
 }
 
 
 def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float) -> Image.Image:
     """Draw both tasks by both policies at a time in steps; an episode that has ended stands still."""
-    figure = Figure(figsize=(8.0, 4.6), dpi=100, facecolor="white")
+    figure = Figure(figsize=(8.0, 5.6), dpi=100, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    said, colour = (
-        ("Sensor fault: 7 of 10 readings are lost and read 0", GHOST) if faulty else ("The sensor works", GREEN)
-    )
-    figure.text(0.5, 0.955, said, ha="center", va="center", fontsize=14, color="white", weight="bold",
-                bbox=dict(boxstyle="round,pad=0.35", facecolor=colour, edgecolor="none"))  # fmt: skip
+    said, colour = ("Sensor fault: 7 of 10 readings lost", GHOST) if faulty else ("The sensor works", GREEN)
+    figure.text(0.5, 0.955, said, ha="center", va="center", fontsize=21, color="white", weight="bold",
+                bbox=dict(boxstyle="round,pad=0.25", facecolor=colour, edgecolor="none"))  # fmt: skip
     for column, name in enumerate(POLICIES):
         figure.text(
-            0.275 + 0.475 * column, 0.875, name, ha="center", va="center", fontsize=12.5, color=INK, weight="bold"
+            0.275 + 0.475 * column, 0.875, name, ha="center", va="center", fontsize=21, color=INK, weight="bold"
         )
         for row, (task, (_, _, draw, _)) in enumerate(TASKS.items()):
-            axes = figure.add_axes((0.055 + 0.475 * column, 0.48 - 0.395 * row, 0.44, 0.335))
+            axes = figure.add_axes((0.06 + 0.475 * column, 0.485 - 0.395 * row, 0.455, 0.3))
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_color("0.8")
             take = takes[task, name, faulty]
             step = min(int(time), len(take.actions))
             draw(axes, take, shown[task], step, 0.0 if step == len(take.actions) else time - step)
             cost = f"mean cost {take.costs.mean():.0f}"
-            axes.set_title(cost, loc="right", fontsize=11, color=INK, pad=3)
+            axes.set_title(cost, loc="right", fontsize=17, color=INK, pad=3)
             if column == 0:
                 figure.text(
-                    0.028, 0.645 - 0.395 * row, task, rotation=90, ha="center", va="center", fontsize=11, color=INK
+                    0.028, 0.635 - 0.395 * row, task, rotation=90, ha="center", va="center", fontsize=16, color=INK
                 )
-    figure.text(0.5, 0.03, "filled: where it is        pink outline: what the sensor says", ha="center", va="center",
-                fontsize=11, color=INK)  # fmt: skip
+    figure.text(0.5, 0.03, "filled: the truth    pink: what the sensor says", ha="center", va="center",
+                fontsize=17, color=INK)  # fmt: skip
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 

@@ -17,7 +17,6 @@ from sb3_tdpg.robustness import PerturbedObservation
 
 RED = "#C00000"
 EVERY = 5  # of the 30 pictures a second
-SHORT = ("policy gradient", "TDPG")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +60,7 @@ def frame(shots: list[Shot], faulty: bool, step: int, i: int) -> Image.Image:
     said, colour = ("Sensor fault: 7 of 10 readings lost", GHOST) if faulty else ("The sensor works", GREEN)
     figure.text(0.5, 0.93, said, ha="center", va="center", fontsize=21, color="white", weight="bold",
                 bbox=dict(boxstyle="round,pad=0.25", facecolor=colour, edgecolor="none"))  # fmt: skip
-    for column, (shot, name) in enumerate(zip(shots, SHORT, strict=True)):
+    for column, (shot, name) in enumerate(zip(shots, POLICIES, strict=True)):
         pictures = shot.steps[step]
         axes = figure.add_axes((0.005 + 0.5 * column, 0.01, 0.49, 0.717))
         axes.set_axis_off()
