@@ -42,6 +42,40 @@ class TrainingDivergedError(ValueError):
     """A loss is NaN or infinite. The model keeps the last good parameters."""
 
 
+class RunningEpisodes:
+    """
+    The column of the buffer that the episode of each environment fills, and the end of an epoch.
+
+    :param n_envs: E.
+    :param n_episodes: Each environment runs its share of these; ``None``: it begins another episode as long as fewer
+        than ``n_steps`` steps are stored.
+    """
+
+    def __init__(self, n_envs: int, n_episodes: int | None, n_steps: int) -> None:
+        self.n_episodes, self.n_steps = n_episodes, n_steps
+        self.column = np.arange(n_envs)
+        """``(E,)``; -1: the environment has run its last episode."""
+        self._n_columns, self._n_stored = n_envs, 0
+
+    @property
+    def running(self) -> np.ndarray:
+        """The environments whose steps are stored, in order."""
+        return np.flatnonzero(self.column >= 0)
+
+    def advance(self, finished: np.ndarray) -> None:
+        """Count a step of the running environments, and give those whose episode is over the next column: ``(E,)``."""
+        self._n_stored += self.running.size
+        for i in np.flatnonzero(finished & (self.column >= 0)):
+            if self.n_episodes is not None:
+                following = self.column[i] + len(self.column)
+                self.column[i] = following if following < self.n_episodes else -1
+            elif self._n_stored < self.n_steps:
+                self.column[i] = self._n_columns
+                self._n_columns += 1
+            else:
+                self.column[i] = -1
+
+
 class EpisodicAlgorithm(OnPolicyAlgorithm):
     """
     An on-policy algorithm that rolls out N whole episodes of a :class:`~sb3_tdpg.TRVPolicy` per epoch.
@@ -175,25 +209,16 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         callback.on_rollout_start()
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
-        if self._last_obs is None:
-            with named_shapes(env):
-                self._last_obs = env.reset()  # type: ignore[assignment]
-            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-
         n_envs = env.num_envs
-        size = self.epoch_size
-        if self.epoch > 0:  # fewer steps than a tenth of an epoch would make an update of noise
-            size = min(size, max(self.remaining_timesteps, size // 10))
-        obs: Any = self._last_obs
+        obs = self._first_observations(env)
         states = self._problem.initial_states(env, obs)  # (E, X)
         trvs = th.zeros(n_envs, self.policy.trv_dim, device=self.device)
         t = np.zeros(n_envs, np.int64)
-        column = np.arange(n_envs)  # of the buffer, for the current episode of each environment
-        n_columns, n_stored = n_envs, 0
+        episodes = RunningEpisodes(n_envs, self.n_episodes, self._steps_of_this_epoch())
         # An epoch that ends early cannot be continued: leave the environments to be reset.
         self._last_obs = None
 
-        while (running := np.flatnonzero(column >= 0)).size > 0:
+        while (running := episodes.running).size > 0:
             check_observations(self.observation_space, obs, t)
             check_numbers("state", states, (self.state_dim,), t)
             with th.no_grad():
@@ -222,25 +247,20 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 "actions": actions.reshape(n_envs, -1),
                 "costs": -rewards,
             }
+            columns = episodes.column[running]
             rollout_buffer.add_step(
-                t[running], column[running], **{k: each(v, lambda x: x[running]) for k, v in stored.items()}
+                t[running], columns, **{k: each(v, lambda x: x[running]) for k, v in stored.items()}
             )
-            n_stored += running.size
-
             states = self._problem.next_states(env, new_obs, dones, infos)
             trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
             t = np.where(dones, 0, t + 1)
             finished = dones
             if dones.any() and (lost := np.array([info.get("episode_lost", False) for info in infos])).any():
                 # RayVecEnv has restarted these environments: they run the episode again.
-                rollout_buffer.clear_episodes(column[running][lost[running]])
+                rollout_buffer.clear_episodes(columns[lost[running]])
                 finished = dones & ~lost
-            for i in np.flatnonzero(finished & (column >= 0)):
-                if self.n_episodes is None:
-                    column[i], n_columns = (n_columns, n_columns + 1) if n_stored < size else (-1, n_columns)
-                else:
-                    column[i] = column[i] + n_envs if column[i] + n_envs < self.n_episodes else -1
-            if (t[column >= 0] >= self.horizon).any():
+            episodes.advance(finished)
+            if (t[episodes.running] >= self.horizon).any():
                 raise ValueError(
                     f"an episode did not end after horizon={self.horizon} steps: the environment must return "
                     "terminated or truncated there (or declare its true horizon)"
@@ -253,6 +273,20 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _first_observations(self, env: VecEnv) -> Any:
+        if self._last_obs is None:
+            with named_shapes(env):
+                self._last_obs = env.reset()  # type: ignore[assignment]
+            self._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        return self._last_obs
+
+    def _steps_of_this_epoch(self) -> int:
+        """Return its steps: with ``epoch_steps``, no more than are left, but for a tenth of an epoch."""
+        size = self.epoch_size
+        if self.epoch == 0:
+            return size
+        return min(size, max(self.remaining_timesteps, size // 10))  # fewer would make an update of noise
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Write the log; the mean cost comes from all episodes of the epoch."""
