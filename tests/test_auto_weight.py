@@ -189,6 +189,15 @@ def test_with_a_share_the_weight_grows_more_slowly_towards_the_end():
     assert growth == pytest.approx([0.09, 0.09, 0.045, 0.0])
 
 
+def test_the_limit_is_known_once_the_first_window_of_costs_is_full():
+    weight = AutoWeight("90%")
+    for epoch in range(WINDOW):
+        assert math.isnan(weight.limit), epoch
+        weight.update(10.0 - epoch, 5.0)
+    smoothed = 10.0 - (WINDOW - 1) / 2
+    assert weight.limit == pytest.approx(10.0 - 0.9 * (10.0 - smoothed))
+
+
 def test_one_lucky_epoch_does_not_set_the_limit():
     weight = AutoWeight("90%")
     for cost in [100.0] + [10.0] * 8 + [-90.0] + [10.0] * 8:

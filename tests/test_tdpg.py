@@ -306,3 +306,11 @@ def test_a_schedule_that_turns_bad_in_mid_training_stops_with_the_mend():
     model = tiny_tdpg(beta=lambda progress: 1.0 if progress in (0.0, 1.0) else math.nan)
     with pytest.raises(ValueError, match="beta=nan must be a positive number"):
         train_epochs(model, 4)
+
+
+@pytest.mark.parametrize(("before", "after"), [(dict(n_episodes=20), dict(epoch_steps=100)),
+                                               (dict(epoch_steps=100), dict(n_episodes=20))])  # fmt: skip
+def test_a_loaded_model_takes_the_other_unit_of_an_epoch(before, after, tmp_path):
+    tiny_tdpg(**{"n_episodes": None, **before}).save(tmp_path / "model")
+    model = TDPG.load(tmp_path / "model", **after, device="cpu")
+    assert {name: getattr(model, name) for name in (*before, *after)} == {**dict.fromkeys(before), **after}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch as th
 from torch import nn
@@ -282,11 +282,3 @@ class CriticEstimator(InformationEstimator):
         inputs = self._pair(states, trvs, trvs[:, derange(n, trvs.device)])
         values = self.critic(inputs) if t is None else self.critic.at(inputs[0], t)[None]
         return self._bound(self._split(values, n))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        extra = state_dict.pop(f"{prefix}_extra_state", None)
-        if extra is not None:  # version 0.1 saved the moments, if there were any, and the flag apart from the tensors
-            moments = extra["optimizer"]["moments"] or [th.zeros_like(getattr(self, name)) for name in MOMENTS]
-            state_dict.update({f"{prefix}{name}": moment for name, moment in zip(MOMENTS, moments, strict=True)})
-            state_dict[f"{prefix}is_warm"] = th.tensor(extra["is_warm"])
-        super()._load_from_state_dict(state_dict, prefix, *args)
