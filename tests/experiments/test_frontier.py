@@ -179,19 +179,19 @@ def test_the_table_pairs_the_seeds_and_a_blind_policy_has_no_information():
     ("limit", "blind", "word", "why"),
     [
         (
-            [(12.0, 2.0), (12.0, 3.0)],
+            [(12.0, 0.3), (12.0, 0.5)],
             BLIND,
             "Probably",
-            "keeps 98 % of the improvement (cost 12) with 44 % of the information",
+            "keeps 98 % of the improvement (cost 12) with 7 % of the information",
         ),
-        ([(12.0, 2.0), (12.0, 3.0)], [(15.5, 0), (16.0, 0)], "Perhaps", "costs 15.5, which is dear: the bound is 15,"),
+        ([(12.0, 0.3), (12.0, 0.5)], [(15.5, 0), (16.0, 0)], "Perhaps", "costs 15.5, which is dear: the bound is 15,"),
         (
-            [(12.0, 2.0), (12.0, 3.0)],
+            [(12.0, 0.3), (12.0, 0.5)],
             [(14.5, 0), (18.0, 0)],
             "Probably",
             "costs 14.5, which is cheap: the bound is 15,",
         ),  # the best seed
-        ([(12.0, 1.0), (12.0, 5.0)], BLIND, "Perhaps", "44 % of the information (25 % to 62 %)"),  # one keeps more
+        ([(12.0, 0.2), (12.0, 1.6)], BLIND, "Perhaps", "12 % of the information (5 % to 20 %)"),  # one keeps more
         ([(25.0, 0.0), (25.0, 0.0)], BLIND, "Perhaps", "keeps 85 % of the improvement"),
         (
             [(12.0, 4.0), (12.0, 8.0)],
