@@ -48,6 +48,8 @@ __all__ = ["TDPG", "TrainingDivergedError"]
 
 SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
 
+HARDLY_ANY = 0.1  # nats an episode: a seventh of a bit
+
 
 class TDPG(EpisodicAlgorithm):
     r"""
@@ -441,9 +443,21 @@ class TDPG(EpisodicAlgorithm):
             TDPGProgressBar.close()
             if self.auto_weight is not None and self.epoch > 0:
                 self.auto_weight.warn_if_never_met()
-        if self.verbose >= 1 and self.auto_weight is not None and (kept := self.auto_weight.kept()) is not None:
+        if self.verbose >= 1 and (kept := self._information_kept()) is not None:
             print(f"Information: {kept}")
         return self
+
+    def _information_kept(self) -> str | None:
+        """Say what the last epoch has of the information, if it was penalised, and whether that is hardly any."""
+        if self.auto_weight is not None:
+            return self.auto_weight.kept()
+        if self.information is None:
+            return None
+        nats = float(self.information.sum())
+        text = f"{nats:.3g} nats kept, at a cost of {self.rollout_buffer.episode_costs.mean():.3g}"
+        if nats < HARDLY_ANY:
+            text += "; this policy hardly looks at its sensor. If it must, use beta='auto', which keeps the cost low"
+        return text
 
     def export(self, path: str | os.PathLike[str], *, format: str | None = None) -> Path:
         """

@@ -308,6 +308,17 @@ def test_a_schedule_that_turns_bad_in_mid_training_stops_with_the_mend():
         train_epochs(model, 4)
 
 
+@pytest.mark.parametrize(("beta", "told"), [(1e-9, True), (1e9, False), (math.inf, None)])
+def test_a_policy_that_hardly_looks_at_its_sensor_is_told_at_the_end(beta, told, capsys):
+    model = tiny_tdpg(
+        lava_env(50), n_episodes=50, beta=beta, learning_rate=5e-2, verbose=1, encoder_gradient="pathwise"
+    )
+    train_epochs(model, 1 if beta > 1 else 40, log_interval=None)
+    said = capsys.readouterr().out
+    assert ("nats kept, at a cost of" in said) == (told is not None)
+    assert ("hardly looks at its sensor" in said) == bool(told)
+
+
 @pytest.mark.parametrize(("before", "after"), [(dict(n_episodes=20), dict(epoch_steps=100)),
                                                (dict(epoch_steps=100), dict(n_episodes=20))])  # fmt: skip
 def test_a_loaded_model_takes_the_other_unit_of_an_epoch(before, after, tmp_path):
