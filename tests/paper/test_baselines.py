@@ -233,7 +233,10 @@ def test_an_option_of_another_experiment_is_refused(arguments, capsys):
     assert arguments[1] in capsys.readouterr().err
 
 
-def test_the_records_in_the_documentation_have_what_the_table_takes_from_them():
+@pytest.mark.skipif(
+    not all((RESULTS / each.records).exists() for each in COMPARISONS), reason="the records of the release are not here"
+)
+def test_the_records_of_the_release_have_what_the_table_takes_from_them():
     for each in COMPARISONS:
         records = each.read_recorded(RESULTS, 1000)
         counts = records.groupby(["model", "train_seed", "scenario"]).size()
