@@ -10,7 +10,8 @@ from gymnasium import spaces
 
 from . import checks
 from .base import POMDPEnv
-from .panda_bullet import FINGER_OPEN, HOME, LIFTED, MOTIONS, Configuration, Motion
+from .panda_arm import FINGER_OPEN, HOME, Configuration
+from .panda_bullet import LIFTED, MOTIONS, Motion
 from .panda_camera import IMAGE_SIZE
 from .panda_scene import PandaScene
 from .panda_view import PandaView
@@ -208,9 +209,9 @@ class PandaGraspEnv(POMDPEnv):
             raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a video")
         if self._time == 0:
             raise ValueError("there is no grasp to show before step()")
-        _, _, to_z, to_w = self._film[0].mug_orientation
+        _, _, to_z, to_w = self._film[0].orientation
         camera = self._current_state()[0, 4:].tolist()
-        depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w), *camera])
+        depth = self._depth_of([*self._film[0].position, 2 * np.arctan2(to_z, to_w), *camera])
         for configuration in self._film:
             self._view.place(configuration)
             yield self._view.picture(depth)

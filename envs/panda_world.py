@@ -1,11 +1,11 @@
 """The grasping problem in PyBullet: the simulation and the camera of one process."""
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 
-from .panda_bullet import Configuration, GraspSimulation, Motion, Outcome
+from .panda_arm import Watch
+from .panda_bullet import GraspSimulation, Motion, Outcome
 from .panda_camera import DepthCamera
 from .panda_scene import PandaScene
 
@@ -26,9 +26,7 @@ class GraspWorld:
         """The depth camera."""
         return DepthCamera(self._simulation_arguments[0])
 
-    def grasps(
-        self, states: np.ndarray, poses: np.ndarray, watch: Callable[[Configuration], object] | None = None
-    ) -> list[Outcome]:
+    def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
         """Carry out one grasp for each mug, ``(N, 4)``, at its pose, ``(N, 4)``; ``watch`` as in ``grasp``."""
         return [self.simulation.grasp(mug, pose, watch) for mug, pose in zip(states, poses, strict=True)]
 

@@ -107,7 +107,7 @@ def hit_from_above(env, state, point):
     x, y = point[0], point[1] - env.scene.frame_offset
     at = (state[0] + cos * x - sin * y, state[1] + sin * x + cos * y)
     body, _, _, position, _ = simulation.client.rayTest((*at, 0.2), (*at, -0.1))[0]
-    return position[2], body == simulation._mug
+    return position[2], body == simulation._body
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.8])
@@ -134,7 +134,7 @@ def test_a_finger_fits_between_handle_and_mug(shared):
 
     def through_the_hole(y):
         body, *_ = simulation.client.rayTest((0.4, y, 0.0405), (0.6, y, 0.0405))[0]
-        return body != simulation._mug
+        return body != simulation._body
 
     assert through_the_hole(0.06)
     assert not through_the_hole(0.087)  # the handle's upright bar
@@ -158,7 +158,7 @@ def test_the_handle_can_block_a_grasp(shared):
 
 
 def test_all_shapes_of_the_mug_arrive_in_bullet(shared):
-    assert len(shared._world.simulation.client.getCollisionShapeData(shared._world.simulation._mug, -1)) == 16
+    assert len(shared._world.simulation.client.getCollisionShapeData(shared._world.simulation._body, -1)) == 16
     assert len(shared.scene.collision_shapes()) == 16
 
 

@@ -259,7 +259,7 @@ def test_the_film_shows_the_grasp_from_its_beginning_to_what_is_rendered_after_i
     np.testing.assert_array_equal(pictures[-1][:, :384], after[:, :384])
     assert not np.array_equal(pictures[0][:, :384], pictures[-1][:, :384])
     assert all(np.array_equal(picture[:, 388:], before[:, 388:]) for picture in pictures)  # what the robot went by
-    heights = [configuration.mug_position[2] for configuration in env._film]
+    heights = [configuration.position[2] for configuration in env._film]
     assert heights[0] == pytest.approx(0.0, abs=1e-3)
     assert max(heights) == pytest.approx(heights[-1], abs=0.01) and heights[-1] > 0.06
 
