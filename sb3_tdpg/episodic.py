@@ -112,7 +112,9 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             raise ValueError(f"device={device!r} is unknown: use 'cpu', 'cuda', 'cuda:1' or 'auto'") from e
         if is_cuda and not th.cuda.is_available():
             warnings.warn(f"device={str(device)!r}, but torch finds no GPU: the model is on the CPU", stacklevel=3)
-        super().__init__(*args, device=device, **kwargs)  # type: ignore[misc]
+        # Unused: the length of a rollout is set once the horizon is known, the others belong to other algorithms.
+        unused: dict[str, Any] = dict(n_steps=0, ent_coef=0.0, vf_coef=0.0, use_sde=False, sde_sample_freq=-1)
+        super().__init__(*args, device=device, **unused, _init_setup_model=False, **kwargs)  # type: ignore[misc]
 
     @property
     @abstractmethod

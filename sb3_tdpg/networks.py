@@ -102,6 +102,12 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
     return vector
 
 
+def bounded_variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
+    """Return ``exp(log_var) + floor``, bounded above: unfamiliar observations would drive it to inf."""
+    # A clamp would stop the gradient there.
+    return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
+
+
 class TimeMLP(nn.Module):
     """
     An MLP whose weights vary with the time step, or are shared by all steps.
