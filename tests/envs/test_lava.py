@@ -312,11 +312,6 @@ def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, mess
         LavaEnv(**keywords)
 
 
-def test_a_misspelt_keyword_is_not_swallowed():
-    with pytest.raises(TypeError, match="sensor_noise"):
-        LavaEnv(sensor_noise=0.1)
-
-
 def test_nothing_leaves_the_lava():
     env = LavaEnv()
     state = np.array([[LAVA_EDGE, -1.0], [LAVA_EDGE + 0.1, -1.0]], np.float32)
