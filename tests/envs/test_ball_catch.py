@@ -146,15 +146,6 @@ def test_a_keyword_of_the_scene_changes_the_image_and_never_the_state(keywords, 
     np.testing.assert_array_equal(info["state"], expected_info["state"])
 
 
-def test_the_renderer_changes_neither_states_nor_costs():
-    controls = np.random.default_rng(0).normal(size=25)
-    for keywords in ({}, dict(pixel_noise_std=0.1)):
-        states, _, costs = run_episode(BallCatchEnv(renderer="pybullet", **keywords), controls)
-        fast_states, _, fast_costs = run_episode(BallCatchEnv(**keywords), controls)
-        np.testing.assert_array_equal(fast_states, states)
-        np.testing.assert_array_equal(fast_costs, costs)
-
-
 # -- perturbations -------------------------------------------------------------------------------------------
 
 VECTORISE = {
