@@ -10,11 +10,11 @@ from gymnasium import spaces
 
 from . import checks
 from .base import POMDPEnv
-from .panda_bullet import FINGER_OPEN, HOME, LIFTED, MOTIONS, Configuration, Motion
-from .panda_camera import IMAGE_SIZE
+from .panda_arm import FINGER_OPEN, HOME, Configuration, Watch
+from .panda_bullet import LIFTED, MOTIONS, GraspSimulation, Motion, Outcome
+from .panda_camera import IMAGE_SIZE, DepthCamera
 from .panda_scene import PandaScene
 from .panda_view import PandaView
-from .panda_world import GraspWorld
 from .pool import WorkPool
 
 NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
@@ -27,6 +27,36 @@ HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
 MIN_DEPTH, MAX_DEPTH = 0.2, 0.7
 MAX_CAMERA_SHIFT = 0.1  # m
 WORKSPACE = np.array([0.5, 0.0])  # m, its middle
+
+
+class GraspWorld:
+    """Simulation and camera of one process; each is made when it is first used."""
+
+    def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None) -> None:
+        self._simulation_arguments = (scene, motion, solver_iterations)
+
+    @cached_property
+    def simulation(self) -> GraspSimulation:
+        """The robot, the table and the mug."""
+        return GraspSimulation(*self._simulation_arguments)
+
+    @cached_property
+    def camera(self) -> DepthCamera:
+        """The depth camera."""
+        return DepthCamera(self._simulation_arguments[0])
+
+    def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
+        """Carry out one grasp for each mug, ``(N, 4)``, at its pose, ``(N, 4)``; ``watch`` as in ``grasp``."""
+        return [self.simulation.grasp(mug, pose, watch) for mug, pose in zip(states, poses, strict=True)]
+
+    def images(self, states: np.ndarray) -> np.ndarray:
+        """Draw the depth images; see :meth:`~sb3_tdpg.envs.panda_camera.DepthCamera.images`."""
+        return self.camera.images(states)
+
+    def close(self) -> None:
+        """Close the Bullet worlds."""
+        for name in {"simulation", "camera"} & set(self.__dict__):
+            getattr(self, name).close()
 
 
 class PandaGraspEnv(POMDPEnv):
@@ -208,9 +238,9 @@ class PandaGraspEnv(POMDPEnv):
             raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a video")
         if self._time == 0:
             raise ValueError("there is no grasp to show before step()")
-        _, _, to_z, to_w = self._film[0].mug_orientation
+        _, _, to_z, to_w = self._film[0].orientation
         camera = self._current_state()[0, 4:].tolist()
-        depth = self._depth_of([*self._film[0].mug_position, 2 * np.arctan2(to_z, to_w), *camera])
+        depth = self._depth_of([*self._film[0].position, 2 * np.arctan2(to_z, to_w), *camera])
         for configuration in self._film:
             self._view.place(configuration)
             yield self._view.picture(depth)

@@ -8,8 +8,9 @@ import numpy as np
 
 from . import checks
 from .base import BatchStep
+from .panda_arm import Configuration
 from .pool import WorkPool
-from .squeeze_bullet import Snapshot, SqueezeSimulation
+from .squeeze_bullet import SqueezeSimulation
 from .squeeze_insert import SqueezeInsertEnv
 from .squeeze_scene import SqueezeScene
 from .squeeze_view import SqueezeView
@@ -77,7 +78,7 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
         )
         self.n_processes = checks.count("n_processes", n_processes)
         self._is_closed = False
-        self._film: list[Snapshot] = []  # of the last step, if there is a render_mode
+        self._film: list[Configuration] = []  # of the last step, if there is a render_mode
 
     # The Bullet worlds are made at their first use, and so in the process that uses them.
 

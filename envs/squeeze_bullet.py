@@ -1,28 +1,25 @@
 """The simulation of a squeeze: PyBullet moves the arm down, closes the jaws on the part, opens them, and moves up."""
 
-import functools
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from .bullet import UNTURNED, BulletWorld
-from .panda_bullet import (
-    ARM_FORCE,
+from .panda_arm import (
     ARM_JOINTS,
-    FAR_AWAY,
     FINGER_JOINTS,
     FINGER_OPEN,
     FINGERTIPS_BELOW_HAND,
-    HAND,
     HOME,
-    LOOK_EVERY,
     NEAR_TARGET,
-    TIME_STEP,
+    ArmSimulation,
+    Configuration,
+    Joints,
     Phase,
+    Pose,
+    Watch,
 )
-from .panda_scene import TABLE_FILE, TABLE_POSITION
 from .squeeze_scene import (
     JAW_BEFORE_PAD,
     JAW_BELOW_FINGER,
@@ -38,14 +35,12 @@ from .squeeze_scene import (
 
 SOLVER_ITERATIONS = 50
 TABLE_FRICTION = 0.3  # between table and part
-GRIP_FORCE = 20.0  # N, of each finger
 GEAR_FORCE = 100.0  # N, of the gear that couples the fingers
 JAW_ABOVE_TABLE = 0.002  # m, during the squeeze
 HOVER = 0.045  # m, above the pose of the squeeze: the jaws are above the part
 ABOVE_SLOT = 0.002  # m, between the part on the slot and the jaws before the insertion
 PRESS_FORCE = 20.0  # N, at which the insertion ends; harder, a part that does not fit is turned until it does
 INSERTED = 0.003  # m, above the table: an inserted part is lower
-STAND_STILL = 0.001  # m/s
 SLOWEST = 0.02  # rad/s, of a joint that has hardly any way to go
 
 APPROACH = Phase(80, 1.0, 0.2)
@@ -75,40 +70,24 @@ class Inserted(NamedTuple):
         return self.height < INSERTED
 
 
-class Snapshot(NamedTuple):
-    """Positions of everything that moves, at one instant."""
-
-    joints: tuple[float, ...]  # seven of the arm, two of the fingers
-    part_position: tuple[float, ...]
-    part_orientation: tuple[float, ...]  # quaternion (x, y, z, w)
-
-
-Watch = Callable[[Snapshot], object]
-
-
-class SqueezeSimulation(BulletWorld):
+class SqueezeSimulation(ArmSimulation):
     """
     Robot, table, part and slot in a Bullet world of their own, without visual shapes of the robot.
 
     Every squeeze sets all positions and velocities, so that its outcome is a function of its arguments alone.
     """
 
+    _still = 0.001
+
     def __init__(self, scene: SqueezeScene) -> None:
-        super().__init__()
+        super().__init__(SOLVER_ITERATIONS)
         self.scene, client = scene, self.client
-        client.setGravity(0.0, 0.0, -9.81)
-        # See GraspSimulation for the order of the contacts.
-        client.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP, numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1
-        )
-        unseen = client.URDF_IGNORE_VISUAL_SHAPES
-        table = client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True, flags=unseen)
-        self._robot = load_robot(client, flags=unseen)
+        self._robot = load_robot(client, flags=self._unseen)
         self._slot = add_slot(client, scene)
-        self._part = add_part(client)
+        self._body = add_part(client)
         # Bullet multiplies the coefficients of two bodies that touch; the part's is 1.
-        client.changeDynamics(self._part, -1, lateralFriction=1.0, spinningFriction=0.0, rollingFriction=0.0)
-        client.changeDynamics(table, -1, lateralFriction=TABLE_FRICTION)
+        client.changeDynamics(self._body, -1, lateralFriction=1.0, spinningFriction=0.0, rollingFriction=0.0)
+        client.changeDynamics(self._table, -1, lateralFriction=TABLE_FRICTION)
         client.changeDynamics(self._slot, -1, lateralFriction=scene.friction)
         for finger in FINGER_JOINTS:
             client.changeDynamics(self._robot, finger, lateralFriction=scene.friction, spinningFriction=0.0)
@@ -118,29 +97,25 @@ class SqueezeSimulation(BulletWorld):
             client.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0),
         )  # fmt: skip
         client.changeConstraint(gear, gearRatio=-1, erp=0.2, maxForce=GEAR_FORCE)
-        self._watch: Watch | None = None
         low = FINGERTIPS_BELOW_HAND + JAW_BELOW_FINGER + JAW_ABOVE_TABLE
         self._low, self._high = self._solve(WORK_PLACE, low, low + HOVER)
         press = FINGERTIPS_BELOW_HAND + JAW_BELOW_FINGER + PART[2]
         self._slot_low, self._slot_high = self._solve(SLOT_PLACE, press, press + SLOT_HEIGHT + ABOVE_SLOT)
 
-    def _solve(self, place: tuple[float, float], *heights: float) -> list[tuple[float, ...]]:
+    def _solve(self, place: tuple[float, float], *heights: float) -> list[Joints]:
         """Return the joints of the arm with the jaws along x for each height of the hand."""
+        # Of the two yaws of the hand with the jaws along x, this one is in the middle of the wrist's range.
+        down = self.client.getQuaternionFromEuler((math.pi, 0.0, 0.0))
         joints = HOME
         solutions = []
         for height in heights:
-            # Of the two yaws of the hand with the jaws along x, this one is in the middle of the wrist's range.
-            down = self.client.getQuaternionFromEuler((math.pi, 0.0, 0.0))
             for _ in range(5):
                 self._put_arm(joints)
-                joints = self.client.calculateInverseKinematics(
-                    self._robot, HAND, (*place, height), down,
-                    jointDamping=[1e-5] * 9, maxNumIterations=200, residualThreshold=1e-8,
-                )[:7]  # fmt: skip
-            solutions.append(tuple(joints))
+                joints = self._joints_for((*place, height), down, 1e-8)
+            solutions.append(joints)
         return solutions
 
-    def _turned(self, yaw: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _turned(self, yaw: float) -> tuple[Joints, Joints]:
         """
         Return the joints of the squeeze and above it for a yaw of the jaws.
 
@@ -168,7 +143,7 @@ class SqueezeSimulation(BulletWorld):
         self._run(CLOSE, low, 0.0, self._fingers_stand_still)
         self._run(OPEN, low, FINGER_OPEN, self._fingers_are_open)
         self._run(LIFT, high, FINGER_OPEN, lambda: self._is_at(high))
-        position, orientation = self._part_pose()
+        position, orientation = self._pose()
         axes = self._axes(orientation)
         away = (position[0] - x, position[1] - y)
         return Squeezed(math.atan2(axes[1, 0], axes[0, 0]), away, math.acos(min(1.0, float(axes[2, 2]))))
@@ -184,7 +159,7 @@ class SqueezeSimulation(BulletWorld):
         self._put_part((*SLOT_PLACE, SLOT_HEIGHT + PART[2] / 2), yaw)
         self._put_arm(self._slot_high, fingers=JAW_BEFORE_PAD)
         self._run(INSERT, self._slot_low, JAW_BEFORE_PAD, lambda: self._is_inserted() or self._presses_hard())
-        position, orientation = self._part_pose()
+        position, orientation = self._pose()
         axes = self._axes(orientation)
         return Inserted(position[2] - PART[2] / 2, math.atan2(axes[1, 0], axes[0, 0]))
 
@@ -199,74 +174,34 @@ class SqueezeSimulation(BulletWorld):
         """Press N parts into the slot: ``(N,)``; see :meth:`insert`."""
         return [self.insert(yaw, watch) for yaw in yaws.tolist()]
 
-    def at_rest(self, yaw: float) -> Snapshot:
+    def at_rest(self, yaw: float) -> Configuration:
         """Return the scene before the first squeeze."""
         upright = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-        return Snapshot((*self._high, FINGER_OPEN, FINGER_OPEN), (*WORK_PLACE, PART[2] / 2), upright)
+        return Configuration((*self._high, FINGER_OPEN, FINGER_OPEN), (*WORK_PLACE, PART[2] / 2), upright)
 
-    def _run(self, phase: Phase, joints: tuple[float, ...], fingers: float, is_over: Callable[[], bool]) -> None:
-        """Move arm and fingers towards a goal until a phase is over."""
-        control = functools.partial(self.client.setJointMotorControl2, self._robot)
-        position = self.client.POSITION_CONTROL
+    def _speeds(self, phase: Phase, joints: Joints) -> Sequence[float]:
         # All joints arrive together: otherwise the hand would swerve by some millimetres on its way down.
-        ways = [abs(state[0] - goal) for state, goal in zip(self._arm(), joints, strict=True)]
+        ways = [abs(state[0] - goal) for state, goal in zip(self._states(ARM_JOINTS), joints, strict=True)]
         longest = max(*ways, NEAR_TARGET)
-        for joint, goal, way in zip(ARM_JOINTS, joints, ways, strict=True):
-            speed = max(phase.arm_speed * way / longest, SLOWEST)
-            control(joint, position, goal, force=ARM_FORCE, maxVelocity=speed)
-        for joint in FINGER_JOINTS:
-            control(joint, position, fingers, force=GRIP_FORCE, maxVelocity=phase.finger_speed)
-        step = self.client.stepSimulation
-        for i in range(phase.max_steps):
-            if i % LOOK_EVERY == 0:
-                self._show()
-                if i > 0 and is_over():
-                    return
-            step()
-        self._show()
-
-    def _show(self) -> None:
-        if self._watch is not None:
-            states = self.client.getJointStates(self._robot, (*ARM_JOINTS, *FINGER_JOINTS))
-            self._watch(Snapshot(tuple(state[0] for state in states), *self._part_pose()))
+        return [max(phase.arm_speed * way / longest, SLOWEST) for way in ways]
 
     def _put_part(self, position: tuple[float, ...], yaw: float) -> None:
-        """Put the part somewhere, upright and at rest; the arm must be put somewhere after this."""
-        client = self.client
-        # A step in which nothing touches removes the contacts of the last squeeze, which would change this one.
-        client.resetBasePositionAndOrientation(self._part, FAR_AWAY, UNTURNED)
-        client.stepSimulation()
-        upright = client.getQuaternionFromEuler((0.0, 0.0, yaw))
-        client.resetBasePositionAndOrientation(self._part, position, upright)
-        client.resetBaseVelocity(self._part, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-
-    def _put_arm(self, joints: tuple[float, ...], fingers: float = FINGER_OPEN) -> None:
-        """Set the joints of the arm and of the fingers."""
-        for joint, angle in zip((*ARM_JOINTS, *FINGER_JOINTS), (*joints, fingers, fingers), strict=True):
-            self.client.resetJointState(self._robot, joint, angle, 0.0)
-
-    def _is_at(self, joints: tuple[float, ...]) -> bool:
-        return all(abs(state[0] - goal) < NEAR_TARGET for state, goal in zip(self._arm(), joints, strict=True))
-
-    def _arm(self) -> list[tuple[float, ...]]:
-        return self.client.getJointStates(self._robot, ARM_JOINTS)
-
-    def _fingers_stand_still(self) -> bool:
-        return all(abs(state[1]) < STAND_STILL for state in self.client.getJointStates(self._robot, FINGER_JOINTS))
+        """Put the part somewhere; the arm must be put somewhere after this."""
+        self._clear_contacts()
+        self._put_body(position, yaw)
 
     def _fingers_are_open(self) -> bool:
-        states = self.client.getJointStates(self._robot, FINGER_JOINTS)
-        return all(state[0] > FINGER_OPEN - 0.001 for state in states)
+        return all(state[0] > FINGER_OPEN - 0.001 for state in self._states(FINGER_JOINTS))
 
     def _is_inserted(self) -> bool:
-        return self._part_pose()[0][2] - PART[2] / 2 < INSERTED
+        return self._pose()[0][2] - PART[2] / 2 < INSERTED
 
     def _presses_hard(self) -> bool:
         """Return whether the hand presses on the part with the force at which it gives up."""
-        return sum(point[9] for point in self.client.getContactPoints(self._robot, self._part)) > PRESS_FORCE
+        return sum(point[9] for point in self.client.getContactPoints(self._robot, self._body)) > PRESS_FORCE
 
-    def _part_pose(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return self.client.getBasePositionAndOrientation(self._part)
+    def _pose(self) -> Pose:
+        return self.client.getBasePositionAndOrientation(self._body)
 
     def _axes(self, orientation: tuple[float, ...]) -> np.ndarray:
         return np.array(self.client.getMatrixFromQuaternion(orientation)).reshape(3, 3)

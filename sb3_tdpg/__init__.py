@@ -23,9 +23,10 @@ from sb3_tdpg import envs, hyperparams
 
 if TYPE_CHECKING:
     from sb3_tdpg.callbacks import MINECallback, SelectionCallback, TrainingCheckpointCallback
+    from sb3_tdpg.episodic import TrainingDivergedError
     from sb3_tdpg.evaluation.information_callback import InformationCallback
     from sb3_tdpg.policies import TRVPolicy
-    from sb3_tdpg.tdpg import TDPG, TrainingDivergedError
+    from sb3_tdpg.tdpg import TDPG
     from sb3_tdpg.vec_env import BatchedVecEnv, make_episodes_env
 
 __version__ = "0.2.0"
@@ -52,7 +53,7 @@ _MODULES = {
     "SelectionCallback": "callbacks",
     "TRVPolicy": "policies",
     "TrainingCheckpointCallback": "callbacks",
-    "TrainingDivergedError": "tdpg",
+    "TrainingDivergedError": "episodic",
     "make_episodes_env": "vec_env",
 }
 

@@ -6,6 +6,8 @@ import math
 import warnings
 
 LEAST_SLACK = 0.01  # of the limit
+RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
+MAX_GROWTH = 1000.0  # of the starting weight; else it would grow forever where the task needs no information
 # Of a limit that is a share of the improvement.
 WINDOW = 5  # epochs that a cost is averaged over
 LEVEL_EPOCHS = 10  # in so many epochs a cost that has levelled off falls by less than the slack
@@ -30,7 +32,7 @@ class AutoWeight:
     The weight is 0 until the cost first meets the limit. It then starts where the penalty equals the limit, grows while
     the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"`` does for the entropy:
 
-        log w += rate * clip((C - cost) / scale, -2, 1)
+        log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
     The scale is abs(C). With ``by_slack`` it is how far the lowest cost so far is below the limit: a limit of 95 % of
     the attainable return then has as strong an effect as one of 50 %. The aim is then the middle of this slack instead
@@ -46,9 +48,6 @@ class AutoWeight:
     :param cost_limit: C, or a share such as ``"95%"``.
     :param by_slack: See above.
     :param first_cost: Cost of the first epoch, where the training has begun without the weight.
-    :param rate: Largest increase of log w per epoch, reached at a cost of one scale below the limit.
-    :param max_growth: Largest multiple of the starting weight. Without it the weight would grow forever where the task
-        needs no information.
     """
 
     def __init__(
@@ -56,15 +55,11 @@ class AutoWeight:
         cost_limit: float | str,
         by_slack: bool = False,
         first_cost: float | None = None,
-        rate: float = 0.3,
-        max_growth: float = 1000.0,
     ) -> None:
         self.cost_limit = cost_limit
         self.share = share_of(cost_limit)
         self.by_slack = by_slack or self.share is not None
         self.first_cost = first_cost
-        self.rate = rate
-        self.max_growth = max_growth
         self.limit = math.nan if isinstance(cost_limit, str) else cost_limit
         """C; NaN where it is a share and less than five epochs have been run."""
         self.value = 0.0
@@ -99,8 +94,8 @@ class AutoWeight:
         if self.share is not None:
             high *= min(1.0, progress_remaining / LATEST_START)
         if self.value > 0.0:
-            self.value *= math.exp(self.rate * min(max((aim - cost) / scale, low), high))
-            self.value = min(self.value, self.max_growth * self._start)
+            self.value *= math.exp(RATE * min(max((aim - cost) / scale, low), high))
+            self.value = min(self.value, MAX_GROWTH * self._start)
         elif is_ready:
             self.value = self._start = scale / max(information, 1.0)
             self.information_before = information

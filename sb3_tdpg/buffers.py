@@ -7,7 +7,7 @@ Dimension key: T horizon, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +51,12 @@ class EpisodeBatch(NamedTuple):
     def select(self, columns: th.Tensor | slice) -> EpisodeBatch:
         """Select episodes or segments by their columns."""
         return EpisodeBatch(*(each(x, lambda v: v[:, columns]) for x in self))
+
+    def partition(self, n_parts: int) -> Sequence[th.Tensor | slice]:
+        """Divide the columns at random into nearly equal parts; a single part is all of them, in their order."""
+        if n_parts == 1:
+            return [slice(None)]
+        return th.randperm(self.costs.shape[1], device=self.costs.device).tensor_split(n_parts)
 
     def segments(self, n_steps: int) -> EpisodeBatch:
         """

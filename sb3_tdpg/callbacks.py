@@ -8,7 +8,7 @@ import os
 import time
 import warnings
 from pathlib import Path
-from typing import ClassVar, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -18,6 +18,9 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.episodic import EpisodicAlgorithm
+
+if TYPE_CHECKING:
+    from sb3_tdpg.tdpg import TDPG
 
 
 class TDPGCallback(BaseCallback):
@@ -30,9 +33,9 @@ class TDPGCallback(BaseCallback):
         super().init_callback(model)
 
     @property
-    def tdpg(self) -> EpisodicAlgorithm:
+    def tdpg(self) -> TDPG:
         """The model."""
-        return cast(EpisodicAlgorithm, self.model)
+        return cast("TDPG", self.model)
 
     def _on_step(self) -> bool:
         return True

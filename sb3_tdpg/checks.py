@@ -141,6 +141,24 @@ def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) ->
         )
 
 
+def check_segments(bptt_steps: int | None, horizon: int) -> None:
+    """Raise a ``ValueError`` if a policy with weights for each time step is to learn from parts of its episodes."""
+    if bptt_steps is not None and bptt_steps < horizon:
+        raise ValueError(
+            f"bptt_steps={bptt_steps} cuts the horizon of {horizon} steps into parts, and all steps must share their "
+            "weights: give policy_kwargs=dict(time_varying=False), or leave bptt_steps out"
+        )
+
+
+def check_n_envs(env: Any, n_envs: int) -> None:
+    """Raise a ``ValueError`` if an environment that was given has another number of them."""
+    if (given := getattr(env, "num_envs", 1)) != n_envs:
+        raise ValueError(
+            f"n_envs={n_envs} applies to an environment given by its id, but the environment given has {given}: leave "
+            "n_envs out"
+        )
+
+
 def warn_if_short(total_timesteps: int, epoch_size: int) -> None:
     """Warn about a training that is shorter than one policy epoch, and say which number to change."""
     if total_timesteps < epoch_size:
@@ -250,6 +268,36 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
         known = {key for cls in make.func.__mro__[:-1] for key in signature(cls).parameters}  # type: ignore[attr-defined]
         hints = (nearest_name(key, known) for key in kwargs if key not in known)
         raise ValueError(f"{what}: {e}{next(filter(None, hints), '')}") from e
+
+
+def check_single(observation: Any, space: spaces.Space) -> None:
+    """Raise a ``ValueError`` for what ``predict`` cannot take: a dict for another space, or what ``reset`` returns."""
+    if isinstance(observation, dict) and not isinstance(space, spaces.Dict):
+        raise ValueError(f"the observation is a dict, but the policy was made for {space}")
+    if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+        raise ValueError(
+            "the observation is a tuple. You are probably mixing Gym API with SB3 VecEnv API: an environment's "
+            "reset() returns (obs, info), that of a VecEnv obs alone; pass obs"
+        )
+
+
+def check_memory(memory: np.ndarray, expected: tuple[int, ...]) -> None:
+    """Raise a ``ValueError`` unless the memory given to ``predict`` has the expected shape."""
+    if memory.shape != expected:
+        raise ValueError(
+            f"state[0] has shape {memory.shape}, expected {expected}: "
+            "pass the state that the last predict() returned, for the same number of environments"
+        )
+
+
+def check_time(t: np.ndarray, horizon: int) -> None:
+    """Raise a ``ValueError`` if an episode runs beyond the steps that a policy has weights for."""
+    if (t >= horizon).any():
+        raise ValueError(
+            f"predict() was called for step {int(t.max()) + 1} of an episode, but the policy has weights for "
+            f"{horizon} steps: pass episode_start=True at the first step of an episode (or state=None), or "
+            "train a policy that goes on for any number of steps with policy_kwargs=dict(time_varying=False)"
+        )
 
 
 def check_floors(**floors: float | None) -> None:

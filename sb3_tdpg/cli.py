@@ -44,8 +44,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _demo(out: Path, **options: Any) -> None:
     from sb3_tdpg.paper.lava_tables import demo
 
-    with kept_by_this_process(out):
-        print(f"\n{demo(out, **options)}\n\nresults are in {out}")
+    _print_results(out, lambda: demo(out, **options))
+
+
+def _print_results(out: Path, make: Callable[[], str], *, is_shared: bool = False) -> None:
+    """Print the summary that a function writes to a folder, which other processes do not use meanwhile."""
+    with contextlib.nullcontext() if is_shared else kept_by_this_process(out):
+        text = make()
+    print(f"\n{text}\n\nresults are in {out}")
 
 
 class Experiment(NamedTuple):
@@ -84,9 +90,7 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
             raise ValueError(f"{flag} is for {others}, not for {experiment}")
 
     out = out or Path("results", chosen.folder)
-    with kept_by_this_process(out):
-        text = pkgutil.resolve_name(f"sb3_tdpg.{chosen.function}")(out, **chosen.arguments, **given)
-    print(f"\n{text}\n\nresults are in {out}")
+    _print_results(out, lambda: pkgutil.resolve_name(f"sb3_tdpg.{chosen.function}")(out, **chosen.arguments, **given))
 
 
 def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
@@ -116,10 +120,10 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
     from sb3_tdpg.experiments.sweep import sweep
 
     out = options.pop("out") or Path("results", f"sweep-{options['block'] or env}")
+    options["settings"] = parse_keywords(settings)
     # With a storage, several workers share the folder.
-    with kept_by_this_process(out) if options["storage"] is None else contextlib.nullcontext():
-        text = sweep(env, n_seeds=seeds, settings=parse_keywords(settings), out=out, **options)
-    print(f"\n{text}\n\nresults are in {out}")
+    is_shared = options["storage"] is not None
+    _print_results(out, lambda: sweep(env, n_seeds=seeds, out=out, **options), is_shared=is_shared)
 
 
 def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequence[str], **options: Any) -> None:
@@ -127,9 +131,7 @@ def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequenc
 
     out = options.pop("out") or Path("results", f"frontier-{options['block'] or env.rpartition(':')[2]}")
     options.update(env_kwargs=parse_keywords(env_kwargs), settings=parse_keywords(settings))
-    with kept_by_this_process(out):
-        text = frontier(env, n_seeds=seeds, out=out, **options)
-    print(f"\n{text}\n\nresults are in {out}")
+    _print_results(out, lambda: frontier(env, n_seeds=seeds, out=out, **options))
 
 
 def _certify(
@@ -140,6 +142,7 @@ def _certify(
     from sb3_tdpg.paper.certificates import certify_lava
 
     say_what_is_trusted(*models)
+    keywords = parse_keywords(env_kwargs)
     if nuisance is not None:
         if options.pop("n_random_shifts"):
             raise ValueError("--random-shifts are those of Lava's sensor and start: leave them or --nuisance out")
@@ -147,19 +150,15 @@ def _certify(
             declared = yaml.safe_load(nuisance)
         except yaml.YAMLError as e:
             raise ValueError(f"--nuisance {nuisance!r} is not YAML, such as '{{vector_noise: [1, 3]}}'") from e
-        with kept_by_this_process(out):
-            keywords = parse_keywords(env_kwargs)
-            text = certify_nuisance(models, env, declared, out, env_kwargs=keywords, n_members=n_members, **options)
-        print(f"\n{text}\n\nresults are in {out}")
+        options.update(env_kwargs=keywords, n_members=n_members)
+        _print_results(out, lambda: certify_nuisance(models, env, declared, out, **options))
         return
     if env.rpartition(":")[2] != "Lava-v0":
         raise ValueError(
             f"certify has declared shifts for Lava-v0 only, not for {env}: declare your own in Python, see "
             "sb3_tdpg.certificates.shifts.TrainingEpisodes"
         )
-    with kept_by_this_process(out):
-        text = certify_lava(models, out, env_kwargs=parse_keywords(env_kwargs), **options)
-    print(f"\n{text}\n\nresults are in {out}")
+    _print_results(out, lambda: certify_lava(models, out, env_kwargs=keywords, **options))
 
 
 def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:

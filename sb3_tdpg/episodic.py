@@ -12,7 +12,6 @@ import io
 import os
 import traceback
 import warnings
-from abc import abstractmethod
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -80,8 +79,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     """
     An on-policy algorithm that rolls out N whole episodes of a :class:`~sb3_tdpg.TRVPolicy` per epoch.
 
-    A subclass sets ``n_episodes`` and the attributes below, and implements ``train``, :attr:`mi_coef` and
-    :attr:`needs_information`.
+    A subclass sets ``n_episodes`` and the attributes below, and implements ``train``.
     """
 
     policy: TRVPolicy  # type: ignore[assignment]
@@ -112,22 +110,9 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             raise ValueError(f"device={device!r} is unknown: use 'cpu', 'cuda', 'cuda:1' or 'auto'") from e
         if is_cuda and not th.cuda.is_available():
             warnings.warn(f"device={str(device)!r}, but torch finds no GPU: the model is on the CPU", stacklevel=3)
-        super().__init__(*args, device=device, **kwargs)  # type: ignore[misc]
-
-    @property
-    @abstractmethod
-    def pools_information(self) -> bool:
-        """Whether one estimate of the information is made for the steps of all times."""
-
-    @property
-    @abstractmethod
-    def mi_coef(self) -> float:
-        """Weight of the information in the loss, 1 / beta, in units of cost per nat."""
-
-    @property
-    @abstractmethod
-    def needs_information(self) -> bool:
-        """Whether the information of this epoch's rollouts is used."""
+        # Unused: the length of a rollout is set once the horizon is known, the others belong to other algorithms.
+        unused: dict[str, Any] = dict(n_steps=0, ent_coef=0.0, vf_coef=0.0, use_sde=False, sde_sample_freq=-1)
+        super().__init__(*args, device=device, **unused, _init_setup_model=False, **kwargs)  # type: ignore[misc]
 
     # -- the environment --------------------------------------------------------------------------------------
 

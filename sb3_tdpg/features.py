@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -122,3 +123,18 @@ class TRVCnn(BaseFeaturesExtractor):
         images = self.pooled(observations).contiguous(memory_format=th.channels_last)
         is_scaled = (self.offset, self.scale) != (0.0, 1.0)
         return self.cnn((images - self.offset) / self.scale if is_scaled else images)
+
+
+def pooled_steps(extractor: nn.Module, observations: th.Tensor | dict[str, th.Tensor]) -> Any:
+    """Pool images once for all passes over an epoch: ``(T, N, *obs)``, or a dict of such, which stays as it is."""
+    if not isinstance(extractor, TRVCnn) or extractor.pool == 1 or isinstance(observations, dict):
+        return observations
+    return extractor.pooled(observations.flatten(0, 1)).unflatten(0, observations.shape[:2])
+
+
+def flat_steps(extractor: nn.Module, x: th.Tensor) -> th.Tensor:
+    """Flatten the steps of episodes for a feature extractor: ``(T, N, *obs) -> (T * N, *obs)``."""
+    x = x.flatten(0, 1)
+    # Change the layout while the pixels are still bytes: it is cheaper.
+    is_pooled = isinstance(extractor, TRVCnn) and extractor.pool > 1
+    return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and not is_pooled else x

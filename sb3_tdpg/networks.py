@@ -7,8 +7,9 @@ Dimension key: T horizon, N episodes, I inputs, O outputs.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -62,22 +63,18 @@ class BatchedMLP(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """``(M, N, I) -> (M, N, O)``."""
-        last = len(self.layers) - 1
-        for i, layer in enumerate(self.layers):
-            x = layer(x)
-            if i < last:
-                x = self.activation(x)
-        return x
+        return self.through(x, BatchedLinear.forward)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
         """Evaluate the network of one index: ``(N, I) -> (N, O)``."""
-        last = len(self.layers) - 1
-        for i, layer in enumerate(self.layers):
-            assert isinstance(layer, BatchedLinear)
-            x = layer.at(x, index)
-            if i < last:
-                x = self.activation(x)
-        return x
+        return self.through(x, lambda layer, x: layer.at(x, index))
+
+    def through(self, x: th.Tensor, apply: Callable[[Any, th.Tensor], th.Tensor]) -> th.Tensor:
+        """Send inputs through all layers by ``apply(layer, x)``, with the nonlinearity in between."""
+        *hidden, last = self.layers
+        for layer in hidden:
+            x = self.activation(apply(layer, x))
+        return apply(last, x)
 
 
 def flatten_parameters(module: nn.Module) -> nn.Parameter:
@@ -100,6 +97,12 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
     for parameter, value, gradient in zip(parameters, values, gradients, strict=False):  # all but the padding
         parameter.data, parameter.grad = value.view_as(parameter), gradient.view_as(parameter)
     return vector
+
+
+def bounded_variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
+    """Return ``exp(log_var) + floor``, bounded above: unfamiliar observations would drive it to inf."""
+    # A clamp would stop the gradient there.
+    return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
 
 class TimeMLP(nn.Module):

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from functools import partial
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -16,17 +18,17 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution, make_proba_distribution
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 from torch.distributions import Normal
 from torch.nn import functional as F
 
-from sb3_tdpg.buffers import EpisodeBatch, Observations, PolicyStep, RebuiltTRVs, each
-from sb3_tdpg.checks import check_count, check_floors, check_net_arch
-from sb3_tdpg.features import TRVCnn, flat_action_space, least_side, observation_kind
-from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP
-from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_trvs
+from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
+from sb3_tdpg.checks import check_count, check_floors, check_memory, check_net_arch, check_single, check_time
+from sb3_tdpg.features import TRVCnn, flat_action_space, flat_steps, observation_kind
+from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP, bounded_variance
+from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_extractor, fill_in_trvs
 from sb3_tdpg.running_norms import Changes, ObservationNorm
 
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
@@ -123,20 +125,10 @@ class TRVPolicy(BasePolicy):
         check_floors(encoder_var_floor=encoder_var_floor, action_var_floor=action_var_floor)
         kind = observation_kind(observation_space, normalize_images=normalize_images)
         defaults = POLICY_DEFAULTS[preset or kind]
-        if features_extractor_class is None and isinstance(observation_space, spaces.Dict):
-            features_extractor_class = CombinedExtractor
-        elif features_extractor_class is None:
-            features_extractor_class = defaults.features_extractor_class
-            by_default = defaults.features_extractor_kwargs
-            sides = (observation_space.shape or ())[1:]
-            if "layers" in by_default and min(sides) < least_side(by_default["layers"]):
-                by_default = {}  # the paper's layers, for smaller images
-            features_extractor_kwargs = {**by_default, **(features_extractor_kwargs or {})}
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,
-            features_extractor_kwargs,
+            *fill_in_extractor(defaults, observation_space, features_extractor_class, features_extractor_kwargs),
             normalize_images=normalize_images,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -168,18 +160,13 @@ class TRVPolicy(BasePolicy):
             raise ValueError("policy_kwargs: gate=True and skip=True both decide what the TRVs keep: give one of them")
         self.changes = Changes(self.features_dim) if self.skip_changes else None
         self.action_dist = make_proba_distribution(flat_action_space(action_space))
-        self.encoder = TimeMLP(
-            horizon,
-            [self.trv_dim + self.features_dim, *self.net_arch["encoder"], (3 if self.gate else 2) * self.trv_dim],
-            activation_fn or defaults.encoder_activation_fn,
-            time_varying=self.time_varying,
-        )
-        self.action_head = TimeMLP(
-            horizon,
-            [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()],
-            activation_fn or defaults.action_head_activation_fn,
-            time_varying=self.time_varying,
-        )
+        n_outputs = (3 if self.gate else 2) * self.trv_dim
+        sizes = [self.trv_dim + self.features_dim, *self.net_arch["encoder"], n_outputs]
+        activation = activation_fn or defaults.encoder_activation_fn
+        self.encoder = TimeMLP(horizon, sizes, activation, time_varying=self.time_varying)
+        sizes = [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()]
+        activation = activation_fn or defaults.action_head_activation_fn
+        self.action_head = TimeMLP(horizon, sizes, activation, time_varying=self.time_varying)
         if defaults.is_long:  # begin near the middle of the actions, and with little else than the features in the TRVs
             self.encoder.scale_output(0.1)
             self.action_head.scale_output(0.1)
@@ -204,15 +191,8 @@ class TRVPolicy(BasePolicy):
         return int(np.sum(getattr(distribution, "action_dims", None) or distribution.action_dim))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        names = (
-            "horizon", "preset", "trv_dim", "net_arch", "activation_fn", "time_varying", "skip", "skip_changes",
-            "normalize_observations", "scale_actions", "shared_action_noise", "squash_trv_mean", "gate",
-            "encoder_log_var_init", "action_log_var_init", "encoder_var_floor", "action_var_floor",
-            "features_extractor_class", "features_extractor_kwargs", "optimizer_class", "optimizer_kwargs",
-        )  # fmt: skip
-        data.update({name: getattr(self, name) for name in names}, lr_schedule=self._dummy_schedule)
-        return data
+        names = [name for name in signature(TRVPolicy).parameters if name not in ("lr_schedule", "use_sde")]
+        return {**{name: getattr(self, name) for name in names}, "lr_schedule": self._dummy_schedule}
 
     # -- the two conditional distributions --------------------------------------------------------------------
 
@@ -240,7 +220,7 @@ class TRVPolicy(BasePolicy):
             mean = th.tanh(mean)
         for gate in gates:
             mean = th.lerp(prev_trv, mean, th.sigmoid(gate))
-        variance = self._variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor)
+        variance = bounded_variance(log_var + self.encoder_log_var_init, MAX_TRV_VAR, self.encoder_var_floor)
         return mean, variance.sqrt()
 
     def _action_distribution(self, parameters: th.Tensor) -> Distribution:
@@ -253,16 +233,12 @@ class TRVPolicy(BasePolicy):
         """Return mean and log standard deviation of Box actions, ``(n, U)`` each, from the head's outputs."""
         shared = self.shared_action_noise
         mean, log_var = (parameters, self.action_log_var) if shared else parameters.chunk(2, dim=-1)
-        variance = self._variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
+        variance = bounded_variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
         log_std = 0.5 * th.log(variance).expand_as(mean)
         if self.scale_actions:
             mean = self.action_middle + self.action_range * mean
             log_std = log_std + self.action_range.log()
         return mean, log_std
-
-    def _variance(self, log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
-        # A bounded exp(log_var): unfamiliar observations would drive it to inf. A clamp would stop the gradient there.
-        return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
     # -- one step, for rollouts and predict -------------------------------------------------------------------
 
@@ -330,28 +306,10 @@ class TRVPolicy(BasePolicy):
 
     # -- whole episodes, for training -------------------------------------------------------------------------
 
-    def pooled(self, observations: Observations) -> Observations:
-        """Pool images once for all passes over an epoch: ``(T, N, *obs)``, or a dict of such, which stays as it is."""
-        cnn = self.features_extractor
-        if not isinstance(cnn, TRVCnn) or cnn.pool == 1 or isinstance(observations, dict):
-            return observations
-        return cnn.pooled(observations.flatten(0, 1)).unflatten(0, observations.shape[:2])
-
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Extract the features of every observation: ``(T, N, F)``."""
-
-        def flat(x: th.Tensor) -> th.Tensor:
-            x = x.flatten(0, 1)
-            # Change the layout while the pixels are still bytes: it is cheaper.
-            is_pooled = isinstance(self.features_extractor, TRVCnn) and self.features_extractor.pool > 1
-            return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and not is_pooled else x
-
-        return self._features(each(batch.observations, flat)).unflatten(0, batch.alive.shape)
-
-    def episode_encoder_density(self, features: th.Tensor, batch: EpisodeBatch) -> Normal:
-        """Return q(x~_t | x~_{t-1}, y_t) given the *stored* TRVs x~_{t-1}, ``(T, N, Z)``."""
-        parameters = self.encoder(th.cat([batch.prev_trvs, features], dim=-1))
-        return Normal(*self._encoder_density(parameters, features, batch.prev_trvs), validate_args=False)
+        flat = each(batch.observations, partial(flat_steps, self.features_extractor))
+        return self._features(flat).unflatten(0, batch.alive.shape)
 
     def episode_action_density(self, trvs: th.Tensor) -> Distribution:
         """Return pi(u_t | x~_t), ``(T * N, U)``, given the TRVs, ``(T, N, Z)``; the next call overwrites it."""
@@ -365,7 +323,9 @@ class TRVPolicy(BasePolicy):
 
         :return: ``(T, N)``
         """
-        return self.episode_encoder_density(features, batch).log_prob(batch.trvs).sum(dim=-1)
+        parameters = self.encoder(th.cat([batch.prev_trvs, features], dim=-1))
+        density = Normal(*self._encoder_density(parameters, features, batch.prev_trvs), validate_args=False)
+        return density.log_prob(batch.trvs).sum(dim=-1)
 
     def action_log_prob(self, trvs: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
@@ -421,10 +381,10 @@ class TRVPolicy(BasePolicy):
         :return: ``(T, N)``, and the rebuilt TRVs
         """
         features = self.episode_features(batch)
-        rebuilt = self.rebuild_trvs(features, batch) if rebuild or encoder_gradient == "pathwise" else None
         if encoder_gradient == "pathwise":
-            assert rebuilt is not None
-            return self.action_log_prob(rebuilt.trvs, batch), rebuilt
+            trvs = self.rebuild_trvs(features, batch)
+            return self.action_log_prob(trvs.trvs, batch), trvs
+        rebuilt = self.rebuild_trvs(features, batch) if rebuild else None
         return self.trv_log_prob(features, batch) + self.action_log_prob(batch.trvs, batch), rebuilt
 
     # -- the interface of SB3 ---------------------------------------------------------------------------------
@@ -453,13 +413,7 @@ class TRVPolicy(BasePolicy):
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
         """
-        if isinstance(observation, dict) and not isinstance(self.observation_space, spaces.Dict):
-            raise ValueError(f"the observation is a dict, but the policy was made for {self.observation_space}")
-        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
-            raise ValueError(
-                "the observation is a tuple. You are probably mixing Gym API with SB3 VecEnv API: an environment's "
-                "reset() returns (obs, info), that of a VecEnv obs alone; pass obs"
-            )
+        check_single(observation, self.observation_space)
         if deterministic and not self._has_warned:
             self._has_warned = True
             warnings.warn(
@@ -477,21 +431,13 @@ class TRVPolicy(BasePolicy):
             prev_trv, t = np.zeros((n_envs, self.trv_dim), np.float32), np.zeros(n_envs, np.int64)
         else:
             prev_trv, t = state
-            if prev_trv.shape != (n_envs, self.trv_dim):
-                raise ValueError(
-                    f"state[0] has shape {prev_trv.shape}, expected {(n_envs, self.trv_dim)}: "
-                    "pass the state that the last predict() returned, for the same number of environments"
-                )
+            check_memory(prev_trv, (n_envs, self.trv_dim))
         if episode_start is not None:
             start = np.asarray(episode_start, dtype=bool).reshape(-1)
             prev_trv = np.where(start[:, None], np.float32(0), prev_trv)
             t = np.where(start, 0, t)
-        if self.time_varying and (t >= self.horizon).any():
-            raise ValueError(
-                f"predict() was called for step {int(t.max()) + 1} of an episode, but the policy has weights for "
-                f"{self.horizon} steps: pass episode_start=True at the first step of an episode (or state=None), or "
-                "train a policy that goes on for any number of steps with policy_kwargs=dict(time_varying=False)"
-            )
+        if self.time_varying:
+            check_time(t, self.horizon)
         with th.inference_mode():
             step = self.step(observation_tensor, th.as_tensor(prev_trv, device=self.device), t, deterministic)
         actions = step.actions.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from torch import nn
 
 from sb3_tdpg.checks import check_count
-from sb3_tdpg.features import TRVCnn, observation_kind
+from sb3_tdpg.features import TRVCnn, least_side, observation_kind
 
 # From this horizon on the problem is an ordinary one of reinforcement learning, and no longer one of the paper's kind.
 LONG_HORIZON = 50
@@ -201,6 +201,21 @@ def fill_in(
 def default(value: Any, otherwise: Any) -> Any:
     """Return the value of an argument, or its default if there is none."""
     return otherwise if value is None else value
+
+
+def fill_in_extractor(
+    defaults: PolicyDefaults,
+    space: spaces.Space,
+    given: type[BaseFeaturesExtractor] | None,
+    kwargs: dict[str, Any] | None,
+) -> tuple[type[BaseFeaturesExtractor], dict[str, Any] | None]:
+    """Return the class of the feature extractor and its keywords, with their defaults for an observation space."""
+    if given is not None or isinstance(space, spaces.Dict):
+        return given or CombinedExtractor, kwargs
+    by_default = defaults.features_extractor_kwargs
+    if "layers" in by_default and min((space.shape or ())[1:]) < least_side(by_default["layers"]):
+        by_default = {}  # the paper's layers, for smaller images
+    return defaults.features_extractor_class, {**by_default, **(kwargs or {})}
 
 
 def fill_in_trvs(

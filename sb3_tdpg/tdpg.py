@@ -23,7 +23,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_tdpg import losses
 from sb3_tdpg.advantages import ValueFunction, get_baseline
 from sb3_tdpg.auto_weight import AutoWeight
-from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer, RebuiltTRVs
+from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
 from sb3_tdpg.checks import (
     check_action_space,
@@ -31,20 +31,21 @@ from sb3_tdpg.checks import (
     check_batch_size,
     check_beta,
     check_count,
+    check_n_envs,
+    check_segments,
     rate_schedule,
     refuse_others,
     warn_if_short,
     with_keywords,
 )
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.episodic import EpisodicAlgorithm, TrainingDivergedError, check_policy
+from sb3_tdpg.episodic import EpisodicAlgorithm, check_policy
+from sb3_tdpg.features import pooled_steps
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.presets import DEFAULTS, Defaults, fill_in, preset_of
 from sb3_tdpg.problem import Problem, horizon_of
 from sb3_tdpg.vec_env import make_episodes_env
-
-__all__ = ["TDPG", "TrainingDivergedError"]
 
 SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
 
@@ -164,17 +165,13 @@ class TDPG(EpisodicAlgorithm):
                 check_count(name, count)
         if isinstance(env, str):
             env = make_episodes_env(env, n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps)
-        elif n_envs is not None and getattr(env, "num_envs", 1) != n_envs:
-            raise ValueError(
-                f"n_envs={n_envs} applies to an environment given by its id, but the environment given has "
-                f"{getattr(env, 'num_envs', 1)}: leave n_envs out"
-            )
+        elif n_envs is not None:
+            check_n_envs(env, n_envs)
         if env is not None:
             check_action_space(env.action_space)
-        # A model that is being loaded has its preset from the file.
-        is_new = env is not None and _init_setup_model
         horizon = None if env is None else horizon_of(env)
-        self.preset = preset_of(env.observation_space, horizon) if env is not None and is_new else None
+        # A model that is being loaded has its preset from the file.
+        self.preset = None if env is None or not _init_setup_model else preset_of(env.observation_space, horizon)
         settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1), horizon or 1)
         self._has_default_batch_size = batch_size is None
         # The defaults of the paper's problems count episodes always.
@@ -185,22 +182,15 @@ class TDPG(EpisodicAlgorithm):
             policy=policy,
             env=env,
             learning_rate=settings["learning_rate"],
-            n_steps=0,  # set once the horizon is known
             gamma=settings["gamma"],
             gae_lambda=settings["gae_lambda"],
-            # Unused: these belong to algorithms with a value network.
-            ent_coef=0.0,
-            vf_coef=0.0,
             max_grad_norm=settings["max_grad_norm"],
-            use_sde=False,
-            sde_sample_freq=-1,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=seed,
             device=device,
-            _init_setup_model=False,
         )
         self.beta: float | Schedule | str = settings["beta"]
         self.cost_limit = cost_limit
@@ -246,12 +236,8 @@ class TDPG(EpisodicAlgorithm):
         )  # fmt: skip
         policy = with_keywords("policy_kwargs", self.policy_kwargs, make_policy)
         self.policy = cast(TRVPolicy, policy).to(self.device)
-        if self.bptt_steps is not None and self.bptt_steps < self.horizon and self.policy.time_varying:
-            raise ValueError(
-                f"bptt_steps={self.bptt_steps} cuts the horizon of {self.horizon} steps into parts, and all steps "
-                "must share their weights: give policy_kwargs=dict(time_varying=False), or leave bptt_steps out"
-            )
         if self.policy.time_varying:
+            check_segments(self.bptt_steps, self.horizon)
             unit, size = "episodes", self.epoch_size // self.horizon
         else:
             unit, size = "steps", self.epoch_size
@@ -342,7 +328,7 @@ class TDPG(EpisodicAlgorithm):
         if in_segments:
             batch = batch.segments(self.bptt_steps or len(batch.costs))
         # What the passes need of it: images are pooled once.
-        passes = batch._replace(observations=self.policy.pooled(batch.observations))
+        passes = batch._replace(observations=pooled_steps(self.policy.features_extractor, batch.observations))
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
             with th.no_grad():
@@ -351,7 +337,7 @@ class TDPG(EpisodicAlgorithm):
         for _ in range(self.n_epochs):
             for columns in self._minibatches(passes):
                 part = passes.select(columns)
-                log_prob, rebuilt = self._evaluate(part, rebuild=mi_coef > 0.0)
+                log_prob, rebuilt = self.policy.evaluate_episodes(part, self.encoder_gradient, mi_coef > 0.0)
                 if old_log_prob is None:
                     policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
                 else:
@@ -400,17 +386,10 @@ class TDPG(EpisodicAlgorithm):
             self.logger.record("train/explained_variance", self.value_function.explained)
         return advantages
 
-    def _evaluate(self, batch: EpisodeBatch, rebuild: bool = False) -> tuple[th.Tensor, RebuiltTRVs | None]:
-        return self.policy.evaluate_episodes(batch, self.encoder_gradient, rebuild)
-
     def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
-        """Return the columns of each minibatch: a random partition into nearly equal parts, or all in one."""
-        n_columns = batch.costs.shape[1]
-        size = n_columns if self.policy.time_varying else batch.alive.sum().item()
-        n_parts = 1 if self.batch_size is None else math.ceil(size / self.batch_size)
-        if n_parts == 1:
-            return [slice(None)]
-        return th.randperm(n_columns, device=self.device).tensor_split(n_parts)
+        """Return the columns of each minibatch."""
+        size = batch.costs.shape[1] if self.policy.time_varying else batch.alive.sum().item()
+        return batch.partition(1 if self.batch_size is None else math.ceil(size / self.batch_size))
 
     # -- learn and load ---------------------------------------------------------------------------------------
 

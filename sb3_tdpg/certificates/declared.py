@@ -12,11 +12,10 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.models import load_models
+from sb3_tdpg.certificates.models import load_models, write_summary
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, wall_cost
-from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
-from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
@@ -95,16 +94,12 @@ def certify_nuisance(
                 rows.append(row | dict(measured_kl=measured))
     records = pd.DataFrame(rows)
     write_frame_atomically(records, out / "nuisance.csv")
-    how = provenance()
     settings.update(nuisance=str(declared), n_members=n_members, n_budget_episodes=n_budget_episodes)
     settings.update(n_test_episodes=n_test_episodes, env_id=env_id, env_kwargs=training.env_kwargs)
-    write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
     text = (
         f"The trivial bound is {cost_bound:g}: the cost is clipped there. Confidence of each bound: {confidence:.0%}."
     )
-    summary = "\n\n".join([nuisance_table(records, cost_bound), text, how_made(how["command"], how)]) + "\n"
-    write_atomically(out / "summary.md", summary)
-    return summary
+    return write_summary(out, [nuisance_table(records, cost_bound), text], models, settings)
 
 
 def nuisance_table(records: pd.DataFrame, trivial: float) -> str:

@@ -1,11 +1,14 @@
-"""Load the policies to certify."""
+"""What all certificates share: the policies, and the summary."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from sb3_tdpg.common.files import write_atomically
+from sb3_tdpg.common.provenance import how_made, provenance, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_models_fit
 from sb3_tdpg.tdpg import TDPG
@@ -27,3 +30,12 @@ def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
         models[next(label for label in labels if label not in models)] = model
     check_models_fit(models, [training])
     return models
+
+
+def write_summary(out: Path, sections: Sequence[str], models: Sequence[Path], settings: Mapping[str, Any]) -> str:
+    """Write ``config.json`` and ``summary.md``, and return the latter."""
+    how = provenance()
+    write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
+    summary = "\n\n".join([*sections, how_made(how["command"], how)]) + "\n"
+    write_atomically(out / "summary.md", summary)
+    return summary

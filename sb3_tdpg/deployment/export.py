@@ -133,13 +133,7 @@ def _at_time_steps(network: TimeMLP, x: th.Tensor, t: th.Tensor | None) -> th.Te
     """Evaluate a network at the time step of each robot: ``(N, I)`` and ``(N,) -> (N, O)``; None: shared weights."""
     if t is None:
         return network.at(x, 0)
-    last = len(network.mlp.layers) - 1
-    for i, layer in enumerate(network.mlp.layers):
-        weight, bias = cast(th.Tensor, layer.weight), cast(th.Tensor, layer.bias)
-        x = (x[:, None, :] @ weight[t] + bias[t])[:, 0]
-        if i < last:
-            x = network.mlp.activation(x)
-    return x
+    return network.mlp.through(x, lambda layer, x: (x[:, None, :] @ layer.weight[t] + layer.bias[t])[:, 0])
 
 
 def metadata_of(step: ExportedStep) -> dict[str, Any]:

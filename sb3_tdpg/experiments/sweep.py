@@ -93,11 +93,6 @@ class _Plan:
         return finished_row(self.task(inverse_beta, seed), self.n_eval_episodes, labels)
 
     @property
-    def columns(self) -> dict[str, str]:
-        """Name of the column of ``runs.csv`` with the mean cost, by scenario."""
-        return _columns(self.scenarios)
-
-    @property
     def config(self) -> dict[str, Any]:
         """Everything that makes one run comparable with another."""
         settings = {name: value for name, value in self.run(1.0, 0).settings.items() if name != "beta"}
@@ -107,6 +102,7 @@ class _Plan:
 
 
 def _columns(scenarios: Sequence[Scenario]) -> dict[str, str]:
+    """Return the name of the column of ``runs.csv`` with the mean cost, by scenario."""
     return {scenario.name: f"cost: {scenario.name}" for scenario in scenarios}
 
 
@@ -320,7 +316,7 @@ def _write(plan: _Plan, runs: pd.DataFrame, failures: Mapping[str, str]) -> str:
         if source.exists():
             with replaced_atomically(model) as partial:
                 shutil.copyfile(source, partial)
-    save_figure(tradeoff_figure(runs, plan.columns, best, plan.cost_limit), out / "sweep.png")
+    save_figure(tradeoff_figure(runs, _columns(plan.scenarios), best, plan.cost_limit), out / "sweep.png")
     write_run_config(out / "config.json", {**plan.config, "cost_limit": plan.cost_limit, "runs": [*runs["folder"]]})
     summary = _summary(plan, runs, best, failures)
     write_atomically(out / "summary.md", summary)
@@ -338,8 +334,9 @@ def _summary(plan: _Plan, runs: pd.DataFrame, best: pd.Series | None, failures: 
         "information in nats: mean (most)": _mean_and_worst(by_beta["information"], "{:.2g}"),
         f"runs below {limit}": is_below.groupby(runs["label"], sort=False).sum(),
     }
-    costs = {f"beta {beta}": _mean_and_worst(group[list(plan.columns.values())]) for beta, group in by_beta}
-    robustness = markdown_table(pd.DataFrame({"scenario": list(plan.columns), **costs}))
+    columns = _columns(plan.scenarios)
+    costs = {f"beta {beta}": _mean_and_worst(group[list(columns.values())]) for beta, group in by_beta}
+    robustness = markdown_table(pd.DataFrame({"scenario": list(columns), **costs}))
     shown = runs[["label", "seed", "cost", "std", "information", "information_lower", "met_block_limits"]]
     return fill_template(
         "sb3_tdpg.experiments",
@@ -349,7 +346,7 @@ def _summary(plan: _Plan, runs: pd.DataFrame, best: pd.Series | None, failures: 
         is_here=(plan.out / "selected.zip").exists(),
         counts=dict(n=len(runs), n_below=is_below.sum(), limit=limit, tie=TIE),
         overview=markdown_table(pd.DataFrame(overview)),
-        robustness=robustness if len(plan.columns) > 1 else "",
+        robustness=robustness if len(columns) > 1 else "",
         runs=markdown_table(shown.rename(columns={"label": "beta"}), digits=4),
         failures=failures,
         made=how_made("sb3-tdpg sweep", provenance()),

@@ -159,8 +159,7 @@ def reproduce_ball(
     for i, row in enumerate(others):
         if row.n_episodes is not None:
             others[i] = replace(row, n_episodes=min(row.n_episodes, given.n_eval_episodes))
-    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
-    everything = [(method, seed) for i, seed in enumerate(seeds) for method in chosen if i < method.max_seeds]
+    everything = common.seed_by_seed(chosen, FIRST_SEED, n_seeds)
     everything.sort(key=lambda run: run[0].max_seeds < math.inf)  # the controls last
 
     def rows_of(method: Method) -> list[Scenario]:
@@ -179,7 +178,7 @@ def reproduce_ball(
     write_frame_atomically(kept[~is_shift], out / "episodes.csv.xz")
     write_frame_atomically(kept[is_shift].drop(columns="distance"), out / "shifts.csv.xz")
     table = with_groups(records[is_row | is_shift])
-    by_seed = table.groupby(["model", "train_seed", "scenario"], sort=False)[["cost", "distance"]].mean().reset_index()
+    by_seed = common.means_by_seed(table, "cost", "distance")
     write_frame_atomically(by_seed, out / "seeds.csv")
 
     folders, labels = common.folders_of(tasks), [method.label for method in chosen]

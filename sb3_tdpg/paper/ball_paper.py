@@ -97,8 +97,7 @@ def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
     :return: the summary, as Markdown
     """
     given = common.Options(**{"n_eval_episodes": 200, **options})
-    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
-    everything = [(method, seed) for seed in seeds for method in methods()]
+    everything = common.seed_by_seed(methods(), FIRST_SEED, n_seeds)
     rows = list(BALL_CATCH)
     tasks = common.make_tasks("BallCatch-v0", out / "runs", everything, lambda _: rows, given.overrides)
     complete_runs(tasks, **given.of_runs)
@@ -113,8 +112,7 @@ def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
     write_frame_atomically(runs, out / "runs.csv")
     chosen = select(runs[runs["model"].str.startswith("TDPG")], records)
     table = with_groups(chosen)
-    by_seed = table.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
-    write_frame_atomically(by_seed, out / "seeds.csv")
+    write_frame_atomically(common.means_by_seed(table), out / "seeds.csv")
     save_figure(robustness_curves(chosen, NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
 
     cost_rows = [*rows, *group_rows(rows)]

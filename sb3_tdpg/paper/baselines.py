@@ -15,7 +15,16 @@ from sb3_tdpg.envs.scenarios import LAVA, PANDA_GRASP, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.experiments.runs import Task, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.paper.common import NO_PENALTY, RECORD_COLUMNS, Method, Options, make_tasks, read_records, write_results
+from sb3_tdpg.paper.common import (
+    NO_PENALTY,
+    RECORD_COLUMNS,
+    Method,
+    Options,
+    make_tasks,
+    read_records,
+    seed_by_seed,
+    write_results,
+)
 from sb3_tdpg.paper.grasp import TDPG_SECOND_STAGE as GRASP_SECOND_STAGE
 from sb3_tdpg.paper.lava_tables import MAX_ATTEMPTS
 
@@ -63,13 +72,8 @@ class Comparison:
     digits: int = 2
 
     def tasks(self, n_seeds: int, folder: Path, overrides: Mapping[str, Any] = MappingProxyType({})) -> list[Task]:
-        """List the runs seed by seed, so that an interrupted call has the same seeds of all baselines."""
-        methods = [
-            (baseline, self.first_seed + i)
-            for i in range(n_seeds)
-            for baseline in self.baselines
-            if i < baseline.max_seeds
-        ]
+        """List the runs."""
+        methods = seed_by_seed(self.baselines, self.first_seed, n_seeds)
         return make_tasks(self.env_id, folder / self.env_id, methods, lambda _: self.rows, overrides)
 
     @property

@@ -12,11 +12,10 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.models import load_models
+from sb3_tdpg.certificates.models import load_models, write_summary
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts, wall_cost
-from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
-from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import save_figure
@@ -101,12 +100,8 @@ def certify_lava(
         save_figure(certificate_figure(frames["random"], frames["paper"], bound), out / "certificate.png")
     for name, frame in frames.items():
         write_frame_atomically(frame, out / f"{name}.csv")
-    how = provenance()
     settings.update(n_random_shifts=n_random_shifts, n_test_episodes=n_test_episodes, env_kwargs=training.env_kwargs)
-    write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
-    summary = "\n\n".join([*_sections(frames, confidence, bound), how_made(how["command"], how)]) + "\n"
-    write_atomically(out / "summary.md", summary)
-    return summary
+    return write_summary(out, _sections(frames, confidence, bound), models, settings)
 
 
 def _row(episodes: TrainingEpisodes, shift: Shift, n_budget: int | None, n_test: int, test_seed: int) -> dict[str, Any]:

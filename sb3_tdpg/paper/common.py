@@ -71,6 +71,11 @@ class Method:
         return run if self.algo == "tdpg" else SB3Run(**vars(run), algo=self.algo)
 
 
+def seed_by_seed(methods: Sequence[Method], first_seed: int, n_seeds: int) -> list[tuple[Method, int]]:
+    """List methods with their seeds, so that an interrupted call has the same seeds of all methods."""
+    return [(method, first_seed + i) for i in range(n_seeds) for method in methods if i < method.max_seeds]
+
+
 def make_tasks(
     env_id: str,
     folder: Path,
@@ -99,6 +104,12 @@ def folders_of(tasks: Iterable[Task]) -> dict[tuple[str, int], Path]:
 def read_records(tasks: Iterable[Task]) -> pd.DataFrame:
     """Return the episodes of finished runs."""
     return pd.concat([pd.read_csv(folder / "episodes.csv") for _, folder, _ in tasks], ignore_index=True)
+
+
+def means_by_seed(records: pd.DataFrame, *columns: str) -> pd.DataFrame:
+    """Return the means over the episodes of each method, seed and row; default: of the cost."""
+    groups = records.groupby(["model", "train_seed", "scenario"], sort=False)
+    return groups[list(columns or ["cost"])].mean().reset_index()
 
 
 def met(condition: bool) -> str:

@@ -77,8 +77,7 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
     records = common.read_records(tasks).rename(columns=poses)
     columns = ["model", "train_seed", "scenario", "episode", "cost", *poses.values(), "seed", "deterministic"]
     write_frame_atomically(records[columns].round(dict.fromkeys(poses.values(), 6)), out / "episodes.csv.xz")
-    by_seed = records.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
-    write_frame_atomically(by_seed, out / "seeds.csv")
+    write_frame_atomically(common.means_by_seed(records), out / "seeds.csv")
 
     of_second_row = records[records["scenario"] == rows[1].name]
     if is_fixed:

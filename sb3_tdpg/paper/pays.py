@@ -208,12 +208,11 @@ def reproduce_pays(
     :return: the summary, as Markdown
     """
     given = common.Options(**options)
-    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
     tasks = {}
     for name in problems:
         problem = PROBLEMS[name]
         chosen = [method for method in problem.methods() if controls or method.algo == "tdpg"]
-        everything = [(method, seed) for i, seed in enumerate(seeds) for method in chosen if i < method.max_seeds]
+        everything = common.seed_by_seed(chosen, FIRST_SEED, n_seeds)
         tasks[name] = common.make_tasks(problem.env_id, out / "runs" / name, everything, problem.rows, given.overrides)
     of_all = [task for of_problem in tasks.values() for task in of_problem]
     of_all.sort(key=lambda task: isinstance(task[0], SB3Run))  # the long runs last
@@ -223,7 +222,7 @@ def reproduce_pays(
     for name, of_problem in tasks.items():
         problem, records = PROBLEMS[name], common.read_records(of_problem)
         table = with_summary(records)
-        frames[name] = by_seed = _means(table)
+        frames[name] = by_seed = common.means_by_seed(table)
         of_tdpg = aggregate_seeds(table[table["model"] == "TDPG"])
         others = [label for label in by_seed["model"].unique() if label != "TDPG"]
         sections[problem.title] = dict(
@@ -246,11 +245,6 @@ def with_summary(records: pd.DataFrame) -> pd.DataFrame:
     worst = faults.groupby([*policy, "scenario"])["cost"].mean().groupby(policy).idxmax()
     of_worst = faults.set_index([*policy, "scenario"]).loc[worst.tolist()].reset_index()
     return pd.concat([records, faults.assign(scenario=MEAN), of_worst.assign(scenario=WORST)], ignore_index=True)
-
-
-def _means(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean cost of each method, seed and row."""
-    return table.groupby(["model", "train_seed", "scenario"], sort=False)["cost"].mean().reset_index()
 
 
 def _cpu_times(tasks: Sequence[Task]) -> pd.Series:

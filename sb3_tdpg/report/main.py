@@ -24,9 +24,8 @@ from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.report.charts import comparison_figure, degradation_curves, own_rows_figure, vector_examples
 from sb3_tdpg.report.models import Source, fingerprint, load_all
 from sb3_tdpg.report.numbers import Numbers, make_numbers
-from sb3_tdpg.report.page import Knowledge, Page, write_page
+from sb3_tdpg.report.page import Knowledge, Page, to_html, write_page
 from sb3_tdpg.report.plan import Models, Plan, complete_rows, default_episodes, missing_rows, seconds_of_a_row
-from sb3_tdpg.report.rendering import to_html
 from sb3_tdpg.report.rows import Row, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
 from sb3_tdpg.robustness.registry import find

@@ -17,6 +17,7 @@ from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 
 CLEAR = 0.05
 """A difference is clear up to this p-value."""
+LEVEL = 0.95  # of the intervals
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def p_value(costs: np.ndarray, of_others: np.ndarray) -> float:
     return float(mannwhitneyu(costs, of_others).pvalue)
 
 
-def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
+def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
     """
     Aggregate the records of ``run_row``.
 
@@ -78,7 +79,6 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
     or 1 (failures): it is about this model, not about the method.
 
     :param records: The records of all rows.
-    :param level: Coverage of the intervals.
     :param n_bootstrap: Number of bootstrap samples.
     :param seed: Seed of the bootstrap.
     """
@@ -86,7 +86,7 @@ def make_numbers(records: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int
     groups = _groups(rows)
     keys = pd.DataFrame(list(groups), columns=["perturbation", "kind"])
     plain = rows.index[rows["kind"] == "unperturbed"]
-    how = dict(level=level, n_bootstrap=n_bootstrap, seed=seed)
+    how = dict(level=LEVEL, n_bootstrap=n_bootstrap, seed=seed)
 
     levels, summaries, by_seed, by_row = [], [], {}, {}
     for label, of_model in records.groupby("model", sort=False):
@@ -163,18 +163,18 @@ def _interval_columns(
     """Aggregate ``(S, G, E)`` over models: a column with the number, and two with the ends of its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
     one = len(cube) == 1
-    columns = _mean_of_one(cube[0], how["level"], is_share) if one else interquartile_means(cube.mean(axis=2), **how)
+    columns = _mean_of_one(cube[0], is_share) if one else interquartile_means(cube.mean(axis=2), **how)
     return dict(zip(names, columns, strict=True))
 
 
-def _mean_of_one(costs: np.ndarray, level: float, is_share: bool) -> tuple[np.ndarray, ...]:
+def _mean_of_one(costs: np.ndarray, is_share: bool) -> tuple[np.ndarray, ...]:
     """Return the mean over episodes of ``(G, E)``, and the ends of its interval."""
     from scipy.stats import norm
 
     mean, variance, n = costs.mean(axis=1), costs.var(axis=1), costs.shape[1]
     if n == 1:
         return mean, mean * np.nan, mean * np.nan
-    z = norm.ppf(0.5 + level / 2)
+    z = norm.ppf(0.5 + LEVEL / 2)
     if not is_share:
         half = z * np.sqrt(variance / (n - 1))
         return mean, mean - half, mean + half

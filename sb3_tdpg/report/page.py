@@ -1,7 +1,9 @@
 """The page of a report: compute its tables and verdicts, and fill the Markdown template."""
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,8 @@ from sb3_tdpg.robustness.registry import find
 
 MIN_SEEDS = 5
 """With fewer models of a method, its interval is not reliable."""
+
+TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml"}
 
 
 @dataclass
@@ -181,3 +185,23 @@ def _models_table(page: Page) -> str:
     sources = page.sources.items()
     rows = [(escaped(label), str(i), f"`{name}`") for label, names in sources for i, name in enumerate(names)]
     return markdown_table(rows, ["method", "`train_seed` in the records", "model"])
+
+
+def to_html(markdown: str, folder: Path, title: str, *, reload: bool = False) -> str:
+    """
+    Turn Markdown into an HTML page that contains its pictures; HTML in the Markdown is shown as text.
+
+    :param reload: Whether the browser shall load the page again after some seconds.
+    """
+    from markdown_it import MarkdownIt
+
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
+    tokens = parser.parse(markdown)
+    for token in tokens:
+        for child in token.children or ():
+            if child.type == "image":
+                path = folder / str(child.attrs["src"])
+                data = base64.b64encode(path.read_bytes()).decode()
+                child.attrs["src"] = f"data:{TYPES[path.suffix]};base64,{data}"
+    body = parser.renderer.render(tokens, parser.options, {})
+    return fill_template("sb3_tdpg.report", "report.html", title=title, body=body, reload=reload)

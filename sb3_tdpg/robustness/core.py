@@ -112,13 +112,11 @@ class Perturber(Members):
         self.begin(np.arange(n_envs))
 
     def reseed(self, env_seed: int) -> None:
-        """See :meth:`Members.reseed`."""
         super().reseed(env_seed)
         for part in self.parts.values():
             part.reseed(env_seed)
 
     def begin(self, which: np.ndarray) -> None:
-        """See :meth:`Members.begin`."""
         if self.parts:
             for part in self.parts.values():
                 part.begin(which)
@@ -137,7 +135,6 @@ class Perturber(Members):
             self._episode[name][which] = values
 
     def repeat(self, n: int) -> Members:
-        """See :meth:`Members.repeat`."""
         for part in self.parts.values():
             part.repeat(n)
         self._episode = {name: values.repeat(n, axis=0) for name, values in self._episode.items()}
@@ -147,7 +144,6 @@ class Perturber(Members):
     def __call__(
         self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
     ) -> Observations:
-        """See :meth:`Members.__call__`."""
         if self.parts:
             return {**observations, **{key: part(observations[key], which) for key, part in self.parts.items()}}
         index = slice(None) if which is None else which

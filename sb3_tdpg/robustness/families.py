@@ -173,13 +173,11 @@ class OneOf(Members):
         self.begin(np.arange(n))
 
     def reseed(self, env_seed: int) -> None:
-        """See :meth:`Members.reseed`."""
         super().reseed(env_seed)
         for each in filter(None, self.members):
             each.reseed(env_seed)
 
     def begin(self, which: np.ndarray) -> None:
-        """See :meth:`Members.begin`."""
         self.choice[which] = self._rng.integers(len(self.members), size=len(which))
         for each in filter(None, self.members):
             each.begin(which)
@@ -187,7 +185,6 @@ class OneOf(Members):
     def __call__(
         self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
     ) -> Observations:
-        """See :meth:`Members.__call__`."""
         which = np.arange(len(self.choice)) if which is None else which
         result = each_part(np.copy, observations)
         for i, each in enumerate(self.members):
@@ -199,7 +196,6 @@ class OneOf(Members):
         return result
 
     def repeat(self, n: int) -> Members:
-        """See :meth:`Members.repeat`."""
         self.choice = self.choice.repeat(n)
         for each in filter(None, self.members):
             each.repeat(n)
@@ -218,7 +214,6 @@ class FunctionMembers(Members):
     def __call__(
         self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
     ) -> Observations:
-        """See :meth:`Members.__call__`."""
         changed = self.function(observations, self._rng)
         if not isinstance(observations, dict):
             changed = np.asarray(changed)
@@ -251,7 +246,6 @@ class SceneMembers(Members):
         self.begin(np.arange(n))
 
     def begin(self, which: np.ndarray) -> None:
-        """See :meth:`Members.begin`."""
         self.scene[which] = self._rng.integers(len(self.scenes), size=len(which))
         for scene, chosen in self._by_scene(which):
             if self.redraw:
@@ -267,7 +261,6 @@ class SceneMembers(Members):
     def __call__(
         self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
     ) -> Observations:
-        """See :meth:`Members.__call__`."""
         if states is None:
             raise ValueError("other scenes need the true state of each episode: wrap the VecEnv instead")
         which = np.arange(len(self.scene)) if which is None else which
@@ -279,6 +272,5 @@ class SceneMembers(Members):
         return changed
 
     def repeat(self, n: int) -> Members:
-        """See :meth:`Members.repeat`."""
         self.scene, self.redrawn = self.scene.repeat(n), self.redrawn.repeat(n, axis=0)
         return self

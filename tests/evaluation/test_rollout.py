@@ -1,5 +1,7 @@
 """The rollout loop that every evaluation shares."""
 
+import random
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -80,7 +82,7 @@ def test_the_returns_are_those_of_evaluate_policy():
 def test_the_global_generators_are_restored_however_the_loop_is_left(leave):
     model, env = tiny_tdpg(), make_episodes_env("Lava-v0", 4)
     th.manual_seed(5)
-    expected = th.rand(1), np.random.get_state()[1].copy()  # noqa: NPY002
+    expected = th.rand(1), np.random.get_state()[1].copy(), random.getstate()  # noqa: NPY002
     th.manual_seed(5)
     space = model.action_space
     try:
@@ -93,6 +95,7 @@ def test_the_global_generators_are_restored_however_the_loop_is_left(leave):
         pass
     assert th.rand(1) == expected[0]
     assert (np.random.get_state()[1] == expected[1]).all()  # noqa: NPY002
+    assert random.getstate() == expected[2]
     assert model.action_space is space
 
 

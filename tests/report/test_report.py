@@ -20,7 +20,7 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
 from sb3_tdpg.report.models import label_of
-from sb3_tdpg.report.rendering import to_html
+from sb3_tdpg.report.page import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
 
 pytest.importorskip("matplotlib")

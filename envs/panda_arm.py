@@ -1,0 +1,138 @@
+"""The simulated Panda arm, for a grasp and for a squeeze: phases of motion that a body on the table takes part in."""
+
+import functools
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from .bullet import UNTURNED, BulletWorld
+from .panda_scene import TABLE_FILE, TABLE_POSITION
+
+Joints = tuple[float, ...]  # rad, of the arm
+Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position in m, and orientation as a quaternion (x, y, z, w)
+
+TIME_STEP = 1 / 240  # s
+HAND = 8  # link
+ARM_JOINTS = tuple(range(7))
+FINGER_JOINTS = (9, 10)  # and links
+HOME: Joints = (0.0, -0.215, 0.0, -2.57, 0.0, 2.356, -0.785)  # rad, from where inverse kinematics starts
+FINGER_OPEN = 0.04  # m, of each of the two
+ARM_FORCE, FINGER_FORCE = 70.0, 20.0
+FINGERTIPS_BELOW_HAND = 0.1123  # m
+LOOK_EVERY = 8  # steps, after which a phase can end early
+NEAR_TARGET = 0.01  # rad: the arm has arrived
+FAR_AWAY = (5.0, 5.0, 5.0)  # m
+
+
+class Phase(NamedTuple):
+    """A part of a motion."""
+
+    max_steps: int
+    arm_speed: float  # rad/s, of each joint
+    finger_speed: float  # m/s, of each finger
+
+
+class Configuration(NamedTuple):
+    """Positions of everything that moves, at one instant."""
+
+    joints: tuple[float, ...]  # seven of the arm, two of the fingers
+    position: tuple[float, ...]  # of the mug's frame or of the part's middle
+    orientation: tuple[float, ...]  # quaternion (x, y, z, w)
+
+
+Watch = Callable[[Configuration], object]
+
+
+class ArmSimulation(BulletWorld):
+    """
+    Table, robot and a body in a Bullet world of their own, without visual shapes of table and robot.
+
+    A subclass loads the robot and the body, and sets all positions before a motion, so that its outcome is a function
+    of its arguments alone.
+    """
+
+    _robot: int
+    _body: int
+    _watch: Watch | None = None
+    _ends_early = True  # phases end when they are over, not after all of their steps
+    _still = 0.01  # m/s: slower fingers stand still
+
+    def __init__(self, solver_iterations: int) -> None:
+        super().__init__()
+        client = self.client
+        client.setGravity(0.0, 0.0, -9.81)
+        client.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP,
+            numSolverIterations=solver_iterations,
+            # By default the order in which contacts are solved depends on earlier simulations, and changes the body's
+            # final pose in one trial of fifteen.
+            deterministicOverlappingPairs=1,
+        )
+        self._unseen = client.URDF_IGNORE_VISUAL_SHAPES
+        self._table = client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True, flags=self._unseen)
+
+    @abstractmethod
+    def _pose(self) -> Pose:
+        """Return the pose of the body that a picture shows."""
+
+    def _run(self, phase: Phase, joints: Joints, fingers: float, is_over: Callable[[], bool]) -> None:
+        """Move arm and fingers towards a goal until a phase is over."""
+        control = functools.partial(self.client.setJointMotorControl2, self._robot)
+        position = self.client.POSITION_CONTROL
+        for joint, goal, speed in zip(ARM_JOINTS, joints, self._speeds(phase, joints), strict=True):
+            control(joint, position, goal, force=ARM_FORCE, maxVelocity=speed)
+        for joint in FINGER_JOINTS:
+            control(joint, position, fingers, force=FINGER_FORCE, maxVelocity=phase.finger_speed)
+        step = self.client.stepSimulation
+        for i in range(phase.max_steps):
+            if i % LOOK_EVERY == 0:
+                self._show()
+                if self._ends_early and i > 0 and is_over():
+                    return
+            step()
+        self._show()
+
+    def _speeds(self, phase: Phase, joints: Joints) -> Sequence[float]:
+        """Return the speed of each joint on its way to a goal, in rad/s."""
+        return [phase.arm_speed] * len(joints)
+
+    def _show(self) -> None:
+        if self._watch is not None:
+            states = self._states((*ARM_JOINTS, *FINGER_JOINTS))
+            self._watch(Configuration(tuple(state[0] for state in states), *self._pose()))
+
+    def _states(self, joints: Sequence[int]) -> list[tuple[float, ...]]:
+        """Return position and velocity, and more, of each joint."""
+        return self.client.getJointStates(self._robot, joints)
+
+    def _clear_contacts(self) -> None:
+        """Take a step in which nothing touches: the contacts of the last motion would change the next one."""
+        self.client.resetBasePositionAndOrientation(self._body, FAR_AWAY, UNTURNED)
+        self.client.stepSimulation()
+
+    def _put_body(self, position: tuple[float, ...], yaw: float) -> None:
+        """Put the body somewhere, upright and at rest."""
+        client = self.client
+        upright = client.getQuaternionFromEuler((0.0, 0.0, yaw))
+        client.resetBasePositionAndOrientation(self._body, position, upright)
+        client.resetBaseVelocity(self._body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    def _put_arm(self, joints: Joints, fingers: float = FINGER_OPEN) -> None:
+        """Set the joints of the arm and of the fingers."""
+        for joint, angle in zip((*ARM_JOINTS, *FINGER_JOINTS), (*joints, fingers, fingers), strict=True):
+            self.client.resetJointState(self._robot, joint, angle, 0.0)
+
+    def _joints_for(self, position: tuple[float, ...], orientation: tuple[float, ...], accuracy: float) -> Joints:
+        """Solve for the arm's joints by inverse kinematics, starting from the present ones."""
+        joints = self.client.calculateInverseKinematics(
+            self._robot, HAND, position, orientation,
+            jointDamping=[1e-5] * 9, maxNumIterations=200, residualThreshold=accuracy,
+        )  # fmt: skip
+        return tuple(joints[:7])
+
+    def _is_at(self, joints: Joints) -> bool:
+        states = self._states(ARM_JOINTS)
+        return all(abs(state[0] - goal) < NEAR_TARGET for state, goal in zip(states, joints, strict=True))
+
+    def _fingers_stand_still(self) -> bool:
+        return all(abs(state[1]) < self._still for state in self._states(FINGER_JOINTS))
