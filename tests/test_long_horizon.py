@@ -69,6 +69,14 @@ def _idle_steps(model):
     return model.num_timesteps - int(model.rollout_buffer.alive.sum())
 
 
+def test_the_length_of_an_epoch_does_not_depend_on_that_of_the_episodes():
+    model = TDPG(
+        "TRVPolicy", DummyVecEnv([lambda: CountdownEnv(0, [4, 2, 1]) for _ in range(2)]), epoch_steps=100, seed=0
+    )
+    model.learn(100)
+    assert 100 <= model.rollout_buffer.alive.sum() < 100 + 2 * model.horizon
+
+
 @pytest.mark.parametrize("n_envs", [3, 8])
 def test_any_number_of_environments_fits_the_defaults(n_envs):
     assert TDPG("TRVPolicy", make_vec_env("CartPole-v1", n_envs)).n_episodes is None

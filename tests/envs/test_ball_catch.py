@@ -4,11 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_tdpg  # noqa: F401  (registers the environments)
 from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.scenarios import (
     BALL_CATCH,
     BALL_CATCH_VARYING_LAUNCH,
@@ -79,6 +80,12 @@ def test_a_robot_that_drives_straight_to_the_landing_point_pays_for_its_controls
     np.testing.assert_allclose(costs, 0.015, atol=1e-9)
 
 
+def test_an_action_out_of_bounds_counts_as_the_bound():
+    states, _, costs = run_episode(BallCatchEnv(robot_range=(0, 0), max_action=3.0, dt=0.1), [50.0])
+    assert states[1, 0] == pytest.approx(0.3)
+    assert costs[0] == pytest.approx(0.03)
+
+
 def test_an_episode_starts_with_the_robot_anywhere_in_its_range_and_the_ball_at_its_launch():
     states = BallCatchEnv().initial_state(20_000)
     np.testing.assert_allclose(np.quantile(states[:, 0], [0, 0.25, 0.5, 0.75, 1]), [-2, -1, 0, 1, 2], atol=0.05)
@@ -144,6 +151,15 @@ def test_a_keyword_of_the_scene_changes_the_image_and_never_the_state(keywords, 
     image, info = BallCatchEnv(renderer=renderer, **keywords).reset(seed=0)
     assert np.array_equal(image, expected_image) != changes
     np.testing.assert_array_equal(info["state"], expected_info["state"])
+
+
+def test_the_renderer_changes_neither_states_nor_costs():
+    controls = np.random.default_rng(0).normal(size=25)
+    for keywords in ({}, dict(pixel_noise_std=0.1)):
+        states, _, costs = run_episode(BallCatchEnv(renderer="pybullet", **keywords), controls)
+        fast_states, _, fast_costs = run_episode(BallCatchEnv(**keywords), controls)
+        np.testing.assert_array_equal(fast_states, states)
+        np.testing.assert_array_equal(fast_costs, costs)
 
 
 # -- perturbations -------------------------------------------------------------------------------------------
@@ -225,6 +241,46 @@ def test_noise_of_a_batch_differs_between_its_images_and_follows_the_seed():
 # -- the interface -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("renderer", ["pybullet", "fast"])
+def test_the_batch_gives_what_a_single_environment_gives_for_the_same_state_and_action(renderer):
+    rng = np.random.default_rng(0)
+    vec_env = BatchedVecEnv(BallCatchEnv(renderer=renderer, horizon=3), 6)
+    vec_env.seed(1)
+    observations = vec_env.reset()
+    singles = [BallCatchEnv(renderer=renderer, horizon=3) for _ in range(6)]
+    for single, info, observation in zip(singles, vec_env.reset_infos, observations, strict=True):
+        single.reset()
+        single._state = info["state"][None].copy()
+        np.testing.assert_array_equal(observation, single.sensor(single._state)[0])
+    for _ in range(3):
+        actions = rng.uniform(-3, 3, (6, 1)).astype(np.float32)
+        observations, rewards, dones, infos = vec_env.step(actions)
+        for i, single in enumerate(singles):
+            observation, reward, terminated, _, info = single.step(actions[i])
+            np.testing.assert_array_equal(infos[i]["state"], info["state"])
+            assert rewards[i] == np.float32(reward)
+            assert dones[i] == terminated
+            last = infos[i]["terminal_observation"] if dones[i] else observations[i]
+            np.testing.assert_array_equal(last, observation)
+
+
+@pytest.mark.slow
+def test_subprocesses_give_the_same_numbers_as_a_loop():
+    def episode(vec_env_cls):
+        env = vec_env_cls([lambda: gym.make("sb3_tdpg:BallCatch-v0", pixel_noise_std=0.1, horizon=3)] * 2)
+        env.seed(3)
+        images, rewards = [env.reset()], []
+        for _ in range(4):  # into the second episode
+            observation, reward, _, _ = env.step(np.full((2, 1), 0.5, np.float32))
+            images.append(observation)
+            rewards.append(reward)
+        env.close()
+        return np.array(images), np.array(rewards, np.float32)  # SubprocVecEnv has them in double precision
+
+    for in_loop, in_processes in zip(episode(DummyVecEnv), episode(SubprocVecEnv), strict=True):
+        np.testing.assert_array_equal(in_processes, in_loop)
+
+
 def test_two_environments_in_one_process_do_not_disturb_each_other():
     controls = np.random.default_rng(0).normal(size=6)
     _, alone, _ = run_episode(BallCatchEnv(renderer="pybullet"), controls)
@@ -302,6 +358,13 @@ def test_without_a_render_mode_nothing_is_rendered_and_before_a_reset_there_is_n
     assert env.render() is None
     with pytest.raises(ValueError, match="before the first reset"):
         BallCatchEnv(render_mode="rgb_array").render()
+
+
+def test_a_window_without_a_display_is_refused_with_the_mend(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(RuntimeError, match=r"DISPLAY is not set.*render_mode='rgb_array'"):
+        BulletClient(gui=True)
 
 
 # -- scenarios -----------------------------------------------------------------------------------------------

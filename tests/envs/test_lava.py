@@ -303,8 +303,6 @@ def test_a_step_before_the_first_reset_or_after_the_end_asks_for_a_reset():
     (dict(max_action=0.0), "max_action=0.0 must be finite and positive"),
     (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
     (dict(action_cost=np.nan), "action_cost=nan must be finite"),
-    (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
-    (dict(start_beta=(0.0, 1.0)), r"start_beta=\(0.0, 1.0\) must be two positive numbers"),
     (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
     (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
     (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
@@ -312,6 +310,11 @@ def test_a_step_before_the_first_reset_or_after_the_end_asks_for_a_reset():
 def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
     with pytest.raises(ValueError, match=message):
         LavaEnv(**keywords)
+
+
+def test_a_misspelt_keyword_is_not_swallowed():
+    with pytest.raises(TypeError, match="sensor_noise"):
+        LavaEnv(sensor_noise=0.1)
 
 
 def test_nothing_leaves_the_lava():

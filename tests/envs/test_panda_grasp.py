@@ -200,6 +200,13 @@ def hand_position(simulation, joints):
     return np.array(simulation.client.getLinkState(simulation._robot, 8, computeForwardKinematics=True)[4])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_action_that_is_not_finite_is_refused(shared, value):
+    shared.reset(seed=0)
+    with pytest.raises(ValueError, match="received an action that is not finite"):
+        shared.step(np.array([0.0, value, 0.0, 0.0]))
+
+
 # -- an outcome depends on state and action alone ----------------------------------------------------------------------
 
 
@@ -253,8 +260,8 @@ def test_two_environments_in_one_process_do_not_disturb_each_other(env):
     np.testing.assert_array_equal(outcomes(env, states, actions)[0], alone)
 
 
-@pytest.mark.slow
-def test_three_thousand_trials_leak_neither_memory_nor_bodies():
+def leaked(n):
+    """Run some trials, then n more; the memory in kB and the bodies that the latter added."""
     resource = pytest.importorskip("resource")
     env = PandaGraspEnv()
     env.reset(seed=0)
@@ -269,7 +276,17 @@ def test_three_thousand_trials_leak_neither_memory_nor_bodies():
 
     trials(100)
     before, bodies_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, bodies()
-    trials(3000)
+    trials(n)
     assert bodies() == bodies_before == (3, 1)
     env.close()
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 6_000  # kB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+
+
+@pytest.mark.slow
+def test_hundreds_of_trials_leak_neither_memory_nor_bodies():
+    assert leaked(300) < 3_000
+
+
+@pytest.mark.slow
+def test_three_thousand_trials_leak_neither_memory_nor_bodies():
+    assert leaked(3000) < 6_000

@@ -264,6 +264,14 @@ def test_the_film_shows_the_grasp_from_its_beginning_to_what_is_rendered_after_i
     assert max(heights) == pytest.approx(heights[-1], abs=0.01) and heights[-1] > 0.06
 
 
+def test_every_episode_of_a_batch_is_rendered_by_its_own_state():
+    batch = BatchedVecEnv(PandaGraspEnv(render_mode="rgb_array"), 2)
+    batch.seed(0)
+    batch.reset()
+    assert not np.array_equal(*batch.get_images())
+    batch.close()
+
+
 def test_what_cannot_be_shown_is_said(env):
     assert env.render() is None
     with pytest.raises(ValueError, match="render_mode=None must be 'rgb_array' for a video"):
@@ -348,3 +356,8 @@ def test_the_registered_threshold_is_three_failures_in_a_hundred():
 def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(keywords, message):
     with pytest.raises(ValueError, match=message):
         PandaGraspEnv(**keywords)
+
+
+def test_a_keyword_that_does_not_exist_is_refused():
+    with pytest.raises(TypeError, match="grip_force"):
+        PandaGraspEnv(grip_force=1.0)

@@ -103,6 +103,13 @@ def test_the_oracle_lifts_every_mug_and_the_film_keeps_the_image_of_its_camera()
     env.close()
 
 
+def test_processes_give_the_same_images(env):
+    state = env.initial_state(6)
+    shared = PandaGraspEnv(**PANDA_CAMERA, n_processes=2)
+    np.testing.assert_array_equal(shared.sensor(state), env.sensor(state))
+    shared.close()
+
+
 @pytest.mark.parametrize("camera_range", [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05, (0.0,)], ids=str)
 def test_a_bad_range_is_refused_with_the_mend(camera_range):
     with pytest.raises(

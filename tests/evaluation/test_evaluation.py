@@ -1,4 +1,5 @@
 import math
+import random
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,9 +9,11 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
@@ -88,6 +91,48 @@ def test_an_evaluation_does_not_replay_the_episodes_of_a_training_with_the_same_
     training_env.reset()
     starts = [info["state"][0] for info in training_env.reset_infos]
     assert not np.isin(rollout_states(tdpg, LAVA[0], 10, seed=5).states[0, :, 0], starts).any()
+
+
+def draw():
+    return random.random(), float(np.random.rand()), float(th.rand(()))  # noqa: NPY002
+
+
+def seed_all():
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    th.manual_seed(0)
+
+
+def test_the_global_random_states_are_left_as_they_were(tdpg):
+    seed_all()
+    expected = draw()
+    seed_all()
+    evaluate_scenarios(tdpg, TWO_ROWS, 3)
+    assert draw() == expected
+
+
+def test_the_global_random_states_are_left_as_they_were_even_after_an_error(tdpg, monkeypatch):
+    def explode(*args, **kwargs):
+        draw()
+        raise RuntimeError("boom")
+
+    space = tdpg.action_space
+    monkeypatch.setattr(tdpg, "predict", explode)
+    seed_all()
+    expected = draw()
+    seed_all()
+    with pytest.raises(RuntimeError, match="boom"):
+        evaluate_scenarios(tdpg, TWO_ROWS, 3)
+    assert draw() == expected
+    assert tdpg.action_space is space
+
+
+def test_the_costs_are_those_of_evaluate_policy(tdpg):
+    frame = evaluate_scenarios(tdpg, LAVA[:1], 400, deterministic=True)
+    env = make_episodes_env("Lava-v0", 400, env_kwargs=LAVA[0].env_kwargs, seed=9)
+    mean, std = evaluate_policy(tdpg, env, 400, deterministic=True, warn=False)
+    assert frame["cost"].mean() == pytest.approx(-mean, abs=4 * std / 400**0.5 * 2**0.5)
+    assert frame["deterministic"].all()
 
 
 def test_more_episodes_than_run_side_by_side_are_recorded_all(tdpg, monkeypatch):

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import re
 import shutil
 import signal
@@ -82,6 +83,14 @@ def test_demo_called_again_trains_nothing_and_prints_the_same(demo, capsys, monk
     monkeypatch.setattr(TDPG, "learn", lambda *args, **kwargs: pytest.fail("it trains again"))
     assert main(["demo", "--out", str(tmp_path), *TINY]) == 0
     assert capsys.readouterr().out.split("\n\n")[1] == first.split("\n\n")[1]
+
+
+def test_a_folder_with_another_run_is_refused_and_left_alone(tmp_path, capsys):
+    complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=r"with other settings, seed: 0 there, 1 here: choose another folder"):
+        complete_run(tiny_run(seed=1), tmp_path, LAVA[:1], n_eval_episodes=4)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_the_command_line_tells_bad_input_in_one_line_with_exit_code_2(demo, capsys):
@@ -233,6 +242,23 @@ def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
     assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", [[], ["--storage", "study.log"]], ids=["pool", "storage"])
+def test_the_workers_of_a_command_that_is_killed_end_with_it(storage, tmp_path):
+    if storage:
+        pytest.importorskip("optuna")
+    command = [sys.executable, "-m", "sb3_tdpg", "sweep", "--env", "Lava-v0", "--betas", "inf", "--seeds", "2"]
+    command += ["--jobs", "2", "--cost-limit", "40", "--out", str(tmp_path), *storage]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("runs/*/attempt0/*")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.kill()
+        process.communicate(timeout=20)  # until nobody is left who could write there; a training takes longer
+    assert not list(tmp_path.glob("runs/*/episodes.csv"))
+
+
 def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
     overrides = {"n_timesteps": 200, "n_episodes": 20}
     first = Run("PG", "Lava-v0", "Lava-v0-pg", 0, overrides)
@@ -275,6 +301,13 @@ def test_a_folder_with_another_run_is_told_before_any_run_begins(tmp_path):
     with pytest.raises(ValueError, match="seed: 0 there, 1 here"):
         complete_runs(tasks, n_eval_episodes=4, jobs=1)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_the_reproduction_runs_in_worker_processes(tmp_path):
+    arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]
+    assert main([*arguments, "--n-timesteps", "2500", "--n-eval-episodes", "4"]) == 0
+    assert len(list(tmp_path.glob("runs/*/*/episodes.csv"))) == 2 * len(METHODS) + len(paper_runs(1))
 
 
 def test_every_method_of_the_reproduction_has_goals_on_both_readings():
