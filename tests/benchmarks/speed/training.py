@@ -29,7 +29,7 @@ def bench_epoch(sizes: Sizes) -> Iterable[Row]:
     """Compare an epoch of TDPG with the loop over samples, time steps and critics."""
     n = sizes.n_episodes
     # The mean baseline of the paper; the loop makes no regression.
-    model = make_tdpg(n, baseline="mean")
+    model = make_tdpg(n, baseline="mean", mi_estimator="mine")
     loop = LoopTDPG.copy_of(model)
     learn = learner(model, sizes.epochs, n * model.horizon)
     rng = np.random.default_rng(SEED)
