@@ -123,7 +123,7 @@ def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str,
         own.update(nuisance=None, vec_env_wrapper=[f"{BlindVecEnv.__module__}.{BlindVecEnv.__name__}", *wrappers])
     elif label != NO_PENALTY:
         own.update(beta="auto", cost_limit=label.replace(" ", ""))
-    run = Run(_method(label), env_id, block, seed, {**shared, **own})
+    run = Run(label.replace("%", "per cent"), env_id, block, seed, {**shared, **own})
     scenario = Scenario("Training", env_id, sensor=BlindVecEnv if label == OPEN_LOOP else None)
     return run, out / "runs" / run.folder_name, [scenario]
 
@@ -207,20 +207,16 @@ def verdict(table: pd.DataFrame) -> str:
     )
 
 
-def _method(label: str) -> str:
-    return label.replace("%", "per cent")
-
-
-def report_command(out: Path, table: pd.DataFrame, env_id: str, env_kwargs: Mapping[str, Any]) -> str:
+def report_command(out: Path, runs: pd.DataFrame, env_id: str, env_kwargs: Mapping[str, Any]) -> str:
     """
-    Return the command that measures what the verdict predicts: the policies of all limits under every fault.
+    Return the command that measures what the verdict predicts: each limit compared with no penalty, under every fault.
 
     :param out: Folder of the frontier.
-    :param table: From :func:`frontier_table`.
+    :param runs: ``label`` and ``folder`` of each run; those without a penalty come first.
     """
-    labels = sorted(set(table["label"]) - {OPEN_LOOP}, key=lambda label: label == NO_PENALTY)
-    runs = [Run(_method(label), env_id, None, 0).folder_name.removesuffix("0") for label in labels]
-    words = [f"{label}={out / 'runs' / run}*/model.zip" for label, run in zip(labels, runs, strict=True)]
+    folders = runs[runs["label"] != OPEN_LOOP].groupby("label", sort=False)["folder"].first()
+    seeds = {label: f"{folder.rpartition('seed')[0]}seed*" for label, folder in folders.items()}
+    words = [f"{label}={out / 'runs' / pattern / 'model.zip'}" for label, pattern in seeds.items()]
     words += ["--env", env_id, "--out", f"{out}-report"]
     if env_kwargs:
         words += ["--env-kwargs", *(f"{name}={json.dumps(value)}" for name, value in env_kwargs.items())]
@@ -258,7 +254,7 @@ def _write(out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.D
         env_id=config["env_id"],
         verdict=verdict(table),
         knee=best,
-        report=report_command(out, table, config["env_id"], config["settings"].get("env_kwargs") or {}),
+        report=report_command(out, runs, config["env_id"], config["settings"].get("env_kwargs") or {}),
         overview=markdown_table(pd.DataFrame(overview)),
         runs=markdown_table(shown, digits=4),
         made=how_made("sb3-tdpg frontier", provenance()),
