@@ -112,7 +112,7 @@ reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside 
 	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines
 
 reproduce-public: $(STAMP) ## our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO on public tasks
-	OMP_NUM_THREADS=1 $(PY) -m sb3_tdpg reproduce public --out results/public_tasks --publish docs/results/public_tasks
+	$(PY) -m sb3_tdpg reproduce public --out results/public_tasks --publish docs/results/public_tasks
 
 records: $(STAMP) ## check the records of single episodes and pack them for a release
 	$(PY) docs/make_records.py

@@ -54,15 +54,14 @@ def reproduce_public(
     """
     Train all methods on all tasks, and compare the returns. Finished trainings are kept: the same call continues.
 
-    It needs the extra ``public`` of the package. A training has one thread; for all threads of NumPy and PyTorch, too,
-    set ``OMP_NUM_THREADS=1`` as ``make reproduce-public`` does.
+    It needs the extra ``public`` of the package. Each training has one thread.
 
     :param out: Folder of the trainings, and of ``summary.md``, ``curves.png``, ``config.json`` and the records.
     :param n_seeds: Training seeds of each method.
     :param n_eval_episodes: Episodes of an evaluation, with and without the noise of the policy each.
     :param n_timesteps: Steps of each training; default: as the task declares.
     :param jobs: Parallel trainings; default: the number of cores.
-    :param publish: Where to write the summary and the records instead of ``out``.
+    :param publish: Folder that gets a copy of everything but the trainings.
     :return: the summary, as Markdown
     """
     trainings = make_trainings(range(FIRST_SEED, FIRST_SEED + n_seeds), n_eval_episodes, n_timesteps)
@@ -72,4 +71,6 @@ def reproduce_public(
             progress.set_postfix_str(task.result()[0].folder_name)
             progress.update()
     records = Records([done for task in tasks for done in task.result()], out)
-    return records.write(publish or out, "sb3-tdpg reproduce public")
+    for folder in filter(None, (publish, out)):
+        summary = records.write(folder, "sb3-tdpg reproduce public")
+    return summary
