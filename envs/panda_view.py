@@ -25,15 +25,15 @@ class ArmView(BulletWorld):
     :param load_robot: Loads it into the world, and returns its body's id.
     """
 
-    # Of the camera: its target and distance in m, yaw and pitch in degrees, and the depth in m from which on it sees.
+    # Of the camera: its target in m; its distance from it in m, yaw and pitch in degrees; the least depth in m.
     middle: tuple[float, float, float]
-    place_of_camera: tuple[float, float, float]
+    viewpoint: tuple[float, float, float]
     near = 0.1
 
     def __init__(self, load_robot: Callable[[BulletClient], int], *, gui: bool = False) -> None:
         super().__init__(gui=gui)
         if gui:
-            self.client.show_window(*self.place_of_camera, self.middle)
+            self.client.show_window(*self.viewpoint, self.middle)
         self.client.loadURDF(FLOOR_FILE, (0.0, 0.0, FLOOR_HEIGHT), useFixedBase=True)
         self.client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
         self._robot = load_robot(self.client)
@@ -45,7 +45,7 @@ class ArmView(BulletWorld):
 
     def scene_picture(self, height: int, width: int) -> np.ndarray:
         """Draw the scene, ``(height, width, 3)`` uint8."""
-        view = self.client.computeViewMatrixFromYawPitchRoll(self.middle, *self.place_of_camera, 0.0, 2)
+        view = self.client.computeViewMatrixFromYawPitchRoll(self.middle, *self.viewpoint, 0.0, 2)
         projection = self.client.computeProjectionMatrixFOV(FOV, width / height, self.near, 10.0)
         return self.client.picture(height, width, view, projection, LIGHT, shadow=1)
 
@@ -54,7 +54,7 @@ class PandaView(ArmView):
     """Robot, table and mug."""
 
     middle = (0.38, 0.0, 0.2)
-    place_of_camera = (0.82, 145.0, -18.0)  # robot, mug and handle are visible
+    viewpoint = (0.82, 145.0, -18.0)  # robot, mug and handle are visible
 
     def __init__(self, scene: PandaScene, *, gui: bool = False) -> None:
         super().__init__(lambda client: int(client.loadURDF(ROBOT_FILE, useFixedBase=True)), gui=gui)
@@ -70,7 +70,7 @@ class PandaView(ArmView):
     def place(self, configuration: Configuration) -> None:
         """Move robot and mug to a configuration."""
         super().place(configuration)
-        client, mug = self.client, configuration[1:]
+        client, mug = self.client, (configuration.position, configuration.orientation)
         client.resetBasePositionAndOrientation(self._mug, *mug)
         right, ahead, _ = self._scene.cup_origin.tolist()
         (x, y, _), _ = client.multiplyTransforms(*mug, (right, ahead, 0.0), UNTURNED)

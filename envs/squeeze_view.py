@@ -11,7 +11,7 @@ class SqueezeView(ArmView):
     """Robot, table, part and slot."""
 
     middle = (0.5, 0.085, 0.06)
-    place_of_camera = (0.46, 150.0, -30.0)
+    viewpoint = (0.46, 150.0, -30.0)
     near = 0.05
 
     def __init__(self, scene: SqueezeScene) -> None:
@@ -22,5 +22,5 @@ class SqueezeView(ArmView):
     def picture(self, configuration: Configuration) -> np.ndarray:
         """Draw the scene, ``(256, 384, 3)`` uint8."""
         self.place(configuration)
-        self.client.resetBasePositionAndOrientation(self._part, *configuration[1:])
+        self.client.resetBasePositionAndOrientation(self._part, configuration.position, configuration.orientation)
         return self.scene_picture(HEIGHT, WIDTH)
