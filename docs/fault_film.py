@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,15 +16,19 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.envs.lava import GOAL, LAVA
 from sb3_tdpg.envs.squeeze_insert import wrap
+from sb3_tdpg.evaluation.animation import save_gif
 from sb3_tdpg.evaluation.figures import INK, PALETTE
 from sb3_tdpg.robustness import PerturbedVecEnv
 
-BLUE, GREEN, GHOST = PALETTE[1], PALETTE[2], "#B0307F"
+BLUE, GREEN, GHOST, RED = PALETTE[1], PALETTE[2], "#B0307F", "#C00000"
 POLICIES = {"policy gradient": dict(beta=float("inf")), "TDPG": {}}
-FAULT = dict(perturbation="vector_dropout", severity=5, scale=1.0, seed=0)  # 70 % of the readings
+FAULT = dict(perturbation="vector_dropout", severity=5, scale=1.0, seed=0)
+FAULT_SAID = ("Sensor fault: 7 of 10 readings lost", GHOST)
 N_EPISODES = 1000
 JAMS = 0.1  # rad
 BETWEEN = 6  # frames from one step to the next
+MIDDLE: dict[str, Any] = dict(ha="center", va="center")
+TITLE = dict(MIDDLE, fontsize=21, weight="bold")  # legible at the 358 pixels that a phone has for 800
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +97,24 @@ def box(
     axes.add_patch(patch)
 
 
+def label(axes: Axes | Figure, x: float, y: float, words: str, colour: str, pad: float = 0.25, **looks: Any) -> None:
+    """Write white words on a coloured label."""
+    plate = dict(boxstyle=f"round,pad={pad}", facecolor=colour, edgecolor="none")
+    axes.text(x, y, words, bbox=plate, color="white", **{**TITLE, **looks})
+
+
+def tell_fault(figure: Figure, height: float, faulty: bool) -> None:
+    """Write at this height of the figure whether the sensor works."""
+    label(figure, 0.5, height, *FAULT_SAID if faulty else ("The sensor works", GREEN))
+
+
+def drawn(figure: Figure) -> Image.Image:
+    """Draw the figure, RGB."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
 def draw_squeeze(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float) -> None:
     """Draw twelve parts from above: slot, part, what the sensor says of it, fingers; and which part does not fit."""
     axes.set(xlim=(-0.55, 5.55), ylim=(-1.6, 0.5), aspect="equal")
@@ -110,8 +133,7 @@ def draw_squeeze(axes: Axes, take: Take, shown: np.ndarray, step: int, share: fl
             seen = yaw_of(take.reports[step, i])
             box(axes, middle, (0.84, 0.3), seen, fill=False, edgecolor=GHOST, linestyle="--", linewidth=1.3, zorder=4)
         elif abs(yaw) > JAMS:
-            axes.text(*middle, "jams", ha="center", va="center", color="white", fontsize=12, weight="bold", zorder=5,
-                      bbox=dict(boxstyle="round,pad=0.2", facecolor="#C00000", edgecolor="none"))  # fmt: skip
+            label(axes, *middle, "jams", RED, pad=0.2, fontsize=12, zorder=5)
 
 
 def draw_lava(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float) -> None:
@@ -121,8 +143,8 @@ def draw_lava(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float
     axes.add_patch(Rectangle((-1, -1), 1, n + 1, facecolor="#8C8C96"))
     axes.add_patch(Rectangle((LAVA, -1), 1, n + 1, facecolor="#EB5A14"))
     axes.axvline(GOAL[0], color=GREEN, linewidth=3)
-    axes.text(-0.5, n / 2 - 0.5, "wall", rotation=90, ha="center", va="center", color="white", fontsize=16)
-    axes.text(LAVA + 0.5, n / 2 - 0.5, "lava", rotation=90, ha="center", va="center", color="white", fontsize=16)
+    axes.text(-0.5, n / 2 - 0.5, "wall", rotation=90, **MIDDLE, color="white", fontsize=16)
+    axes.text(LAVA + 0.5, n / 2 - 0.5, "lava", rotation=90, **MIDDLE, color="white", fontsize=16)
     axes.text(GOAL[0] + 0.1, n - 0.75, "goal", color=GREEN, fontsize=14)
     for lane, i in enumerate(shown):
         here, seen = take.states[step, i, 0], take.reports[step, i, 0]
@@ -144,14 +166,9 @@ TASKS = {
 def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float) -> Image.Image:
     """Draw both tasks by both policies at a time in steps; an episode that has ended stands still."""
     figure = Figure(figsize=(8.0, 5.6), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    said, colour = ("Sensor fault: 7 of 10 readings lost", GHOST) if faulty else ("The sensor works", GREEN)
-    figure.text(0.5, 0.955, said, ha="center", va="center", fontsize=21, color="white", weight="bold",
-                bbox=dict(boxstyle="round,pad=0.25", facecolor=colour, edgecolor="none"))  # fmt: skip
+    tell_fault(figure, 0.955, faulty)
     for column, name in enumerate(POLICIES):
-        figure.text(
-            0.275 + 0.475 * column, 0.875, name, ha="center", va="center", fontsize=21, color=INK, weight="bold"
-        )
+        figure.text(0.275 + 0.475 * column, 0.875, name, **TITLE, color=INK)
         for row, (task, (_, _, draw, _)) in enumerate(TASKS.items()):
             axes = figure.add_axes((0.06 + 0.475 * column, 0.485 - 0.395 * row, 0.455, 0.3))
             axes.set(xticks=[], yticks=[])
@@ -162,13 +179,9 @@ def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float)
             cost = f"mean cost {take.costs.mean():.0f}"
             axes.set_title(cost, loc="right", fontsize=17, color=INK, pad=3)
             if column == 0:
-                figure.text(
-                    0.028, 0.635 - 0.395 * row, task, rotation=90, ha="center", va="center", fontsize=16, color=INK
-                )
-    figure.text(0.5, 0.03, "filled: the truth    pink: what the sensor says", ha="center", va="center",
-                fontsize=17, color=INK)  # fmt: skip
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+                figure.text(0.028, 0.635 - 0.395 * row, task, rotation=90, **MIDDLE, fontsize=16, color=INK)
+    figure.text(0.5, 0.03, "filled: the truth    pink: what the sensor says", **MIDDLE, fontsize=17, color=INK)
+    return drawn(figure)
 
 
 def sensor_fault(path: Path) -> None:
@@ -193,5 +206,4 @@ def film(path: Path, takes: Takes) -> None:
             durations.append(500 if i % BETWEEN == 0 else 80)  # ms
         durations[-1] = 3000
     palette = Image.fromarray(np.concatenate([frames[0], frames[3], frames[-1]])).quantize(96)
-    frames = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in frames]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    save_gif(path, frames, durations, palette)

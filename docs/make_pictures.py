@@ -1,8 +1,8 @@
 """
 Draw the pictures of the front page, the environments and the guide: ``make pictures``.
 
-``python docs/make_pictures.py lava.gif when.png`` draws these only. All of them take half an hour, most of it for the
-trainings of the policies that the films show.
+``python docs/make_pictures.py lava.gif when.png`` draws these only. All of them take half an hour: the films train
+their policies first.
 """
 
 import sys
@@ -29,6 +29,7 @@ from sb3_tdpg.envs.scenarios import PANDA_GRASP_CAMERA
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 from sb3_tdpg.evaluation import save_figure
+from sb3_tdpg.evaluation.animation import save_gif
 from sb3_tdpg.evaluation.enjoy import enjoy
 from sb3_tdpg.evaluation.figures import new_figure
 from sb3_tdpg.robustness import perturbation_gallery
@@ -53,7 +54,7 @@ def lava(path: Path) -> None:
         rows_of_frames.append(pictures)
     frames = [Image.fromarray(np.concatenate(rows)) for rows in zip(*rows_of_frames, strict=True)]
     durations = [900] * (len(frames) - 1) + [2500]  # ms
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    save_gif(path, frames, durations)
 
 
 def ways(path: Path, env: POMDPEnv, starts: Sequence[Sequence[float]], look: Policy, blind: Policy) -> None:
@@ -77,7 +78,7 @@ def ways(path: Path, env: POMDPEnv, starts: Sequence[Sequence[float]], look: Pol
     gap = np.full((6, rows[0][0].shape[1], 3), 255, np.uint8)
     frames = [Image.fromarray(np.concatenate([above, gap, below])) for above, below in zip(*rows, strict=True)]
     durations = [1200] * (len(frames) - 1) + [2500]  # ms
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    save_gif(path, frames, durations)
 
 
 def squeeze_insert(path: Path) -> None:
@@ -188,13 +189,12 @@ def ball_catch(path: Path) -> None:
         scene = Image.fromarray(picture[:, :512]).resize((320, 160), Image.Resampling.LANCZOS)
         seen = Image.fromarray(observation).resize((160, 160), Image.Resampling.NEAREST)
         frames.append(Image.fromarray(side_by_side([np.array(scene), np.array(seen)])))
-    # One palette for all frames, because a palette per frame flickers. Extra patches keep the colours of small parts.
+    # Extra patches keep the colours of small parts.
     rare = np.array([(0, 120, 0), (0, 155, 0), (0, 190, 0), (10, 30, 80), (15, 60, 130), (35, 35, 40)], np.uint8)
     patches = rare[None].repeat(81, axis=1)[:, : frames[0].width].repeat(600, axis=0)
     palette = Image.fromarray(np.concatenate([*frames[::6], patches])).quantize(64)
-    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [100] * (len(frames) - 1) + [2000]  # ms
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    save_gif(path, frames, durations, palette)
 
 
 def grasp(motion: str) -> PandaGraspEnv:
@@ -236,15 +236,12 @@ def panda_grasp(path: Path) -> None:
     env.close()
     # Moving down and closing take more than half of the time; the lift is what matters.
     shown = [*range(40, 126, 6), *range(126, 139, 2), *range(139, len(pictures), 3)]
-    sample = Image.fromarray(np.concatenate([pictures[i] for i in shown[::8]]))
-    palette = sample.quantize(208, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    frames = [Image.fromarray(pictures[i]).quantize(palette=palette, dither=Image.Dither.NONE) for i in shown]
-    durations = [80] * (len(frames) - 1) + [2000]  # ms
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    durations = [80] * (len(shown) - 1) + [2000]  # ms
+    save_gif(path, [Image.fromarray(pictures[i]) for i in shown], durations)
 
 
 def learned(path: Path, env_id: str, **shown: Any) -> None:
-    """Train TDPG by the one line and film it, as ``sb3-tdpg enjoy --record`` does."""
+    """Train TDPG by its defaults, and film episodes with the TRVs below."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.zip")
         TDPG("TRVPolicy", env_id, seed=0).learn().save(model)

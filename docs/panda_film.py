@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from fault_film import FAULT, GHOST, GREEN, INK, POLICIES, box, yaw_of
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from fault_film import FAULT, GHOST, GREEN, INK, POLICIES, RED, TITLE, box, drawn, label, tell_fault, yaw_of
 from matplotlib.figure import Figure
 from PIL import Image
 from stable_baselines3.common.utils import set_random_seed
@@ -13,9 +12,9 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE
+from sb3_tdpg.evaluation.animation import save_gif
 from sb3_tdpg.robustness import PerturbedObservation
 
-RED = "#C00000"
 EVERY = 5  # of the 30 pictures a second
 
 
@@ -37,6 +36,7 @@ class Shot:
 
 
 def shoot(model: TDPG, seed: int, faulty: bool, film: bool = True) -> Shot:
+    """Play an episode in PyBullet; without film, only its outcome and readings."""
     env = PandaSqueezeEnv(render_mode="rgb_array" if film else None)
     seen = PerturbedObservation(env, **FAULT) if faulty else env
     set_random_seed(seed)  # of the policy's noise
@@ -56,30 +56,24 @@ def shoot(model: TDPG, seed: int, faulty: bool, film: bool = True) -> Shot:
 def frame(shots: list[Shot], faulty: bool, step: int, i: int) -> Image.Image:
     """Draw both policies side by side: picture i of a squeeze, or the end of the episode if there are no more."""
     figure = Figure(figsize=(8.0, 3.65), dpi=100, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    said, colour = ("Sensor fault: 7 of 10 readings lost", GHOST) if faulty else ("The sensor works", GREEN)
-    figure.text(0.5, 0.93, said, ha="center", va="center", fontsize=21, color="white", weight="bold",
-                bbox=dict(boxstyle="round,pad=0.25", facecolor=colour, edgecolor="none"))  # fmt: skip
+    tell_fault(figure, 0.93, faulty)
     for column, (shot, name) in enumerate(zip(shots, POLICIES, strict=True)):
         pictures = shot.steps[step]
         axes = figure.add_axes((0.005 + 0.5 * column, 0.01, 0.49, 0.717))
         axes.set_axis_off()
         axes.imshow(pictures[min(i, len(pictures) - 1)])
-        figure.text(0.25 + 0.5 * column, 0.79, name, ha="center", va="center", fontsize=21, color=INK, weight="bold")
+        figure.text(0.25 + 0.5 * column, 0.79, name, **TITLE, color=INK)
         is_end = step == len(shot.steps) - 1 and i >= len(pictures) - 1
         if is_end:
             verdict, colour = ("in the slot", GREEN) if shot.success else ("jams", RED)
-            axes.text(0.5, 0.13, verdict, transform=axes.transAxes, ha="center", va="center", fontsize=23,
-                      color="white", weight="bold",
-                      bbox=dict(boxstyle="round,pad=0.25", facecolor=colour, edgecolor="none"))  # fmt: skip
+            label(axes, 0.5, 0.13, verdict, colour, fontsize=23, transform=axes.transAxes)
         else:  # the part from above before this squeeze, and what the sensor says of it
             inset = axes.inset_axes((0.0, 0.62, 0.36, 0.38))
             inset.set(xlim=(-0.62, 0.62), ylim=(-0.5, 0.5), aspect="equal", xticks=[], yticks=[])
             box(inset, (0, 0), (0.86, 0.28), shot.yaws[step], facecolor="#E69F00")
             looks = dict(fill=False, edgecolor=GHOST, linestyle="--", linewidth=2.5)
             box(inset, (0, 0), (0.98, 0.4), shot.reports[step], **looks)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    return drawn(figure)
 
 
 def panda_squeeze(path: Path) -> None:
@@ -106,5 +100,4 @@ def panda_squeeze(path: Path) -> None:
     palette = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])).quantize(
         128, Image.Quantize.MAXCOVERAGE, kmeans=1
     )
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
+    save_gif(path, frames, durations, palette)

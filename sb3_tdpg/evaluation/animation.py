@@ -16,10 +16,11 @@ from PIL import Image
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.evaluation.figures import INK, PALETTE, tidy
 
-DPI = 100
 MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below
-PANEL_HEIGHT = 190  # pixels of the plot of the TRVs
-LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # pixels around the axes; the legend is at the right
+# Of a video of this width, in pixels; a wider one has larger letters, since a phone shows all widths alike.
+DPI = 100
+PANEL_HEIGHT = 180  # of the plot of the TRVs
+LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # around the axes; the legend is at the right
 SYMBOLS = {"TRV": r"$\tilde{x}_t$", "action": "$u_t$"}
 HOLD = 1.0  # s: how long the last frame of an episode stays
 MAX_LINES = 8  # more TRVs are rows of an image
@@ -101,13 +102,17 @@ class _Video:
         height, width = episodes[0].pictures[0].shape[:2]
         self._factor = -(-MIN_WIDTH // width)
         height, width = self._factor * height, self._factor * width
-        total = height + PANEL_HEIGHT
-        self.figure: Figure = Figure(figsize=(width / DPI, total / DPI), dpi=DPI)
+        scale = width / MIN_WIDTH
+        panel = round(scale * PANEL_HEIGHT)
+        dpi, total = scale * DPI, height + panel
+        # The tenth of a pixel: a quotient that is rounded down would cost a row of the picture.
+        self.figure: Figure = Figure(figsize=((width + 0.1) / dpi, (total + 0.1) / dpi), dpi=dpi)
         self.canvas = FigureCanvasAgg(self.figure)
         # Pixel by pixel: the picture in axes would be resampled.
-        self._picture = self.figure.figimage(self._enlarged(episodes[0].pictures[0]), xo=0, yo=PANEL_HEIGHT)
+        self._picture = self.figure.figimage(self._enlarged(episodes[0].pictures[0]), xo=0, yo=panel)
+        left, right, top, bottom = (scale * margin for margin in (LEFT, RIGHT, TOP, BOTTOM))
         self._axes = axes = self.figure.add_axes((
-            LEFT / width, BOTTOM / total, (width - LEFT - RIGHT) / width, (PANEL_HEIGHT - TOP - BOTTOM) / total
+            left / width, bottom / total, (width - left - right) / width, (panel - top - bottom) / total
         ))  # fmt: skip
         axes.set_xlabel("time step $t$", fontsize=9)
         axes.locator_params(axis="x", integer=True)
@@ -136,8 +141,8 @@ class _Video:
             for i, color in zip(range(signals.shape[1]), PALETTE, strict=False)
         ]
         axes.legend(
-            title=self._signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7,
-            title_fontsize=8, handlelength=1.2, labelspacing=0.2,
+            title=self._signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8,
+            title_fontsize=9, handlelength=1.2, labelspacing=0.2,
         )  # fmt: skip
 
     def _draw_rows(self, signals: np.ndarray, horizon: int) -> None:
@@ -153,7 +158,7 @@ class _Video:
         box = self._axes.get_position()
         bar = self.figure.add_axes((box.x1 + 0.012, box.y0, 0.012, box.height))
         self.figure.colorbar(self._rows, cax=bar)
-        bar.tick_params(labelsize=7, length=2)
+        bar.tick_params(labelsize=8, length=2)
         bar.set_title(SYMBOLS[self._signal], fontsize=9)
 
     def frames(self) -> Iterator[bool]:
@@ -189,11 +194,29 @@ def _write_gif(video: _Video, path: Path, fps: float) -> None:
     for is_last in video.frames():
         images.append(video.image())
         durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; less is shown more slowly
-    # One palette for all frames, or they flicker. MAXCOVERAGE keeps small objects' colours, k-means serves large ones.
-    sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
-    palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
+    save_gif(path, images, durations)
+
+
+def save_gif(
+    path: str | os.PathLike[str],
+    images: Sequence[Image.Image],
+    durations: Sequence[float],
+    palette: Image.Image | None = None,
+) -> None:
+    """
+    Write images of the same size as a GIF that repeats, with one palette: with one for each, they would flicker.
+
+    :param path: The file; its folder exists.
+    :param images: RGB.
+    :param durations: How long each stays, in ms.
+    :param palette: An image whose palette to use; default: 256 colours of eight of the images.
+    """
+    if palette is None:
+        # MAXCOVERAGE keeps the colours of small objects, k-means serves large ones.
+        sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
+        palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first.save(path, save_all=True, append_images=others, duration=list(durations), loop=0, optimize=True)
 
 
 def _write_mp4(video: _Video, path: Path, fps: float) -> None:
@@ -201,7 +224,7 @@ def _write_mp4(video: _Video, path: Path, fps: float) -> None:
     from matplotlib.animation import FFMpegWriter
 
     writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]  # ffmpeg takes fractions, too
-    with mpl.rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(video.figure, str(path), DPI):
+    with mpl.rc_context({"animation.ffmpeg_path": _ffmpeg()}), writer.saving(video.figure, str(path), video.figure.dpi):
         for is_last in video.frames():
             for _ in range(max(1, round(HOLD * fps)) if is_last else 1):
                 writer.grab_frame()

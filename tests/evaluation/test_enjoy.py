@@ -141,7 +141,7 @@ def test_a_gif_has_a_frame_for_each_state_and_holds_the_last_one(lava, tmp_path)
     assert main(["enjoy", str(lava), "--env", "Lava-v0", "--n-episodes", "2", "--record", str(path)]) == 0
     frames, durations = frames_of(path)
     assert durations == 2 * (5 * [500] + [1000])  # lava is drawn twice a second
-    assert {frame.shape for frame in frames} == {(96 + 190, 480, 3)}
+    assert {frame.shape for frame in frames} == {(96 + 216, 480, 3)}
     assert [file.name for file in path.parent.iterdir()] == ["film.gif"]
 
 
@@ -150,13 +150,13 @@ def test_a_frame_has_the_environments_picture_above_the_lines_up_to_the_present(
     frames, _ = frames_of(tmp_path / "film.gif")
     for frame, picture in zip(frames, episode.pictures, strict=True):
         assert np.abs(frame[: len(picture)].astype(int) - picture).mean() < 4  # a GIF has 256 colours
-    # The first TRV is drawn in vermillion, in columns 62 to 404; right of them is the legend.
-    lines = [(np.abs(frame[110:245, 62:404].astype(int) - (0xD5, 0x5E, 0x00)).sum(-1) < 60) for frame in frames]
+    # The first TRV is drawn in vermillion, in columns 74 to 389; right of them is the legend.
+    lines = [(np.abs(frame[127:262, 74:389].astype(int) - (0xD5, 0x5E, 0x00)).sum(-1) < 60) for frame in frames]
     reach = [np.flatnonzero(line.any(0)).max() for line in lines]
     assert reach == sorted(reach)
     assert reach[0] < 10
     steps = np.diff(reach[:5])
-    np.testing.assert_allclose(steps, (404 - 62) / 5, atol=3)  # the axis goes to the horizon of 5
+    np.testing.assert_allclose(steps, (389 - 74) / 5, atol=3)  # the axis goes to the horizon of 5
     assert reach[5] == reach[4], "there is no x~_T"
 
 
@@ -164,8 +164,8 @@ def test_the_axes_do_not_move_while_the_lines_grow(lava, tmp_path):
     enjoy(lava, "Lava-v0", n_episodes=2, record=tmp_path / "film.gif")
     frames, _ = frames_of(tmp_path / "film.gif")
     for frame in frames[1:]:
-        np.testing.assert_array_equal(frame[120:, :60], frames[0][120:, :60])  # ticks and label of the TRVs
-        np.testing.assert_array_equal(frame[255:], frames[0][255:])  # and of the time
+        np.testing.assert_array_equal(frame[137:, :70], frames[0][137:, :70])  # ticks and label of the TRVs
+        np.testing.assert_array_equal(frame[272:], frames[0][272:])  # and of the time
 
 
 def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(registered, tmp_path):
@@ -175,7 +175,19 @@ def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(registered, tm
     assert {len(episode.signals) for episode in episodes} == {1, 3}
     frames, _ = frames_of(tmp_path / "film.gif")
     assert len(frames) == sum(len(episode.signals) + 1 for episode in episodes)
-    assert frames[0].shape == (8 * 30 + 190, 8 * 50, 3)
+    assert frames[0].shape == (8 * 30 + 180, 8 * 50, 3)
+
+
+def test_the_letters_grow_with_the_picture(tmp_path):
+    panels = []
+    for width in (400, 800):
+        pictures = [np.full((40, width, 3), 255, np.uint8)] * 4
+        path = tmp_path / f"{width}.gif"
+        save_animation([Episode(pictures, np.zeros((3, 2)), np.ones(3))], path, horizon=3, fps=10)
+        panels.append(frames_of(path)[0][0][40:])
+    small, large = (panel.mean(-1) < 128 for panel in panels)
+    assert large.shape == (2 * small.shape[0], 2 * small.shape[1])
+    assert large.mean() == pytest.approx(small.mean(), rel=0.3)  # half as dark if letters and lines stayed as they are
 
 
 def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
@@ -185,7 +197,7 @@ def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
 
 
 def test_few_trvs_are_lines_and_many_are_rows_of_colours_up_to_the_present_step(tmp_path):
-    pictures = [np.full((40, 500, 3), 255, np.uint8)] * 4
+    pictures = [np.full((40, 400, 3), 255, np.uint8)] * 4
     for n_trvs, is_coloured in ((8, False), (9, True)):
         path = tmp_path / f"{n_trvs}.gif"
         save_animation([Episode(pictures, np.full((3, n_trvs), 5.0), np.ones(3))], path, horizon=3, fps=10)
