@@ -6,8 +6,9 @@ To add an estimator, add a file here and a row to :data:`ESTIMATORS`.
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 from sb3_tdpg.information.critic import CriticEstimator
+from sb3_tdpg.information.directed import DirectedLeaveOneOut, DirectedLogDet
 from sb3_tdpg.information.infonce import InfoNCE
-from sb3_tdpg.information.logdet import DirectedLogDet, LogDet
+from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.information.nwj import Nwj
@@ -22,6 +23,7 @@ ESTIMATORS: dict[str, type[InformationEstimator]] = {
     "logdet": LogDet,
     "directed": DirectedLogDet,
     "loo": LeaveOneOut,
+    "directed-loo": DirectedLeaveOneOut,
     "vib": VariationalBottleneck,
 }
 
@@ -44,6 +46,7 @@ def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[Inf
 __all__ = [
     "ESTIMATORS",
     "CriticEstimator",
+    "DirectedLeaveOneOut",
     "DirectedLogDet",
     "InfoNCE",
     "InformationBatch",

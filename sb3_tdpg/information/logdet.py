@@ -6,8 +6,6 @@ import torch as th
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
-RIDGE = 1e-4  # of a regression, in shares of the mean variance of its inputs
-
 
 class LogDet(InformationEstimator):
     r"""
@@ -26,36 +24,6 @@ class LogDet(InformationEstimator):
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         return _gaussian_bound(batch.means, batch.stds)
-
-
-class DirectedLogDet(InformationEstimator):
-    r"""
-    The bound of :class:`LogDet`, given the last TRVs: a memory is not charged again for what it keeps.
-
-    The penalty becomes the directed information from the sensor to the TRVs. Given x~_{t-1}, the TRVs depend on the
-    past only through y_t, hence by the chain rule it bounds all that an episode's TRVs know of its observations:
-
-    .. math::
-        I[y_{0:T}; \tilde x_{0:T}] \le \sum_t I[y_t; \tilde x_t | \tilde x_{t-1}]
-        \le \sum_t \tfrac12 \log\det \mathrm{Cov}(\tilde x_t - A_t \tilde x_{t-1})
-        - E[\textstyle\sum_i \log \sigma_i(e_t)]
-
-    with the matrix A_t of a linear regression: a Gaussian has the largest entropy, and the best linear prediction
-    leaves at least the variance of the best one. A bit that is kept for T steps costs one bit here, and T bits in the
-    sum over time of I[x_t; x~_t], on which this is no bound.
-    """
-
-    bound = "neither"
-
-    def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        if batch.prev_trvs is None:
-            raise ValueError("DirectedLogDet needs the prev_trvs of the batch, the TRVs of the step before")
-        means, past = (x - x.mean(dim=1, keepdim=True) for x in (batch.means, batch.prev_trvs))
-        gram = past.mT @ past
-        # The first step has no past: without a ridge the system would be singular.
-        ridge = RIDGE * gram.diagonal(dim1=1, dim2=2).mean(1).clamp(min=1e-6)
-        system = gram + th.diag_embed(ridge[:, None].expand(-1, gram.shape[1]))
-        return _gaussian_bound(means - past @ th.linalg.solve(system, past.mT @ means), batch.stds)
 
 
 def _gaussian_bound(means: th.Tensor, stds: th.Tensor) -> th.Tensor:

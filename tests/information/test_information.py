@@ -220,6 +220,7 @@ def test_the_gradient_of_the_estimate_is_that_of_finite_differences(name):
     ("logdet", {"means", "stds"}),
     ("directed", {"means", "stds"}),
     ("loo", {"trvs", "means", "stds"}),
+    ("directed-loo", {"trvs", "means", "stds"}),
     ("vib", {"means", "stds"}),
 ])  # fmt: skip
 def test_the_gradient_reaches_the_encoder_through_what_the_estimate_depends_on(name, reached):
@@ -257,7 +258,8 @@ def test_an_estimator_is_found_by_its_name_or_given_as_a_class():
 @pytest.mark.parametrize("estimator", ["mime", dict, 3, None, InformationBatch])
 def test_anything_else_is_refused_with_the_list(estimator):
     with pytest.raises(
-        ValueError, match=r"use one of \['directed', 'infonce', 'logdet', 'loo', 'mine', 'nwj', 'smile', 'vib'\]"
+        ValueError,
+        match=r"use one of \['directed', 'directed-loo', 'infonce', 'logdet', 'loo', 'mine', 'nwj', 'smile', 'vib'\]",
     ):
         get_estimator_class(estimator)
 

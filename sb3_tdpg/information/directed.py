@@ -1,0 +1,74 @@
+"""Bounds given the last TRVs: a memory is not charged again for what it keeps."""
+
+from __future__ import annotations
+
+import torch as th
+
+from sb3_tdpg.information.base import InformationBatch
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.loo import LeaveOneOut
+
+RIDGE = 1e-4  # of a regression, in shares of the mean variance of its inputs
+
+
+class DirectedLogDet(LogDet):
+    r"""
+    The bound of :class:`LogDet` on what a linear regression on the last TRVs leaves of the present ones.
+
+    The penalty becomes the directed information from the sensor to the TRVs. Given x~_{t-1}, the TRVs depend on the
+    past only through y_t, hence by the chain rule it bounds all that an episode's TRVs know of its observations:
+
+    .. math::
+        I[y_{0:T}; \tilde x_{0:T}] \le \sum_t I[y_t; \tilde x_t | \tilde x_{t-1}]
+        \le \sum_t \tfrac12 \log\det \mathrm{Cov}(\tilde x_t - A_t \tilde x_{t-1})
+        - E[\textstyle\sum_i \log \sigma_i(e_t)]
+
+    with the matrix A_t of a linear regression: a Gaussian has the largest entropy, and the best linear prediction
+    leaves at least the variance of the best one. A bit that is kept for T steps costs one bit here, and T bits in the
+    sum over time of I[x_t; x~_t], on which this is no bound.
+    """
+
+    bound = "neither"
+
+    def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
+        return super()._estimate(without_memory(batch), t)
+
+
+class DirectedLeaveOneOut(LeaveOneOut):
+    r"""
+    The bound of :class:`LeaveOneOut` on what a linear regression on the last TRVs leaves of the present ones.
+
+    It bounds the same directed information as :class:`DirectedLogDet`. With :math:`r_i = \tilde x_i - A_t
+    \tilde x_{i, t-1}`, and :math:`q_j` the density of r in episode j, a Gaussian around
+    :math:`\mu_j - A_t \tilde x_{j, t-1}`,
+
+    .. math::
+        I[y_t; \tilde x_t | \tilde x_{t-1}] \le h(r) - h(\tilde x_t | e_t) \le E\left[\frac1N \sum_i \log
+        \frac{q_i(r_i)}{\frac{1}{N-1} \sum_{j \ne i} q_j(r_i)}\right].
+
+    The first step is h(x~_t | x~_{t-1}) = h(r | x~_{t-1}) <= h(r), for any A_t. The second needs no shape of the
+    density: a bit costs at most ln 2, where the log-det bound charges the distance of its two values, so that the
+    policy makes them harder to tell apart.
+    """
+
+    bound = "neither"
+
+    def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
+        return super()._estimate(without_memory(batch), t)
+
+
+def without_memory(batch: InformationBatch) -> InformationBatch:
+    """
+    Subtract what a linear regression of the means on the last TRVs predicts, from TRVs and means.
+
+    :raises ValueError: if the batch does not have the last TRVs.
+    """
+    if batch.prev_trvs is None:
+        raise ValueError("a directed estimator needs the prev_trvs of the batch, the TRVs of the step before")
+    means, past = (x - x.mean(dim=1, keepdim=True) for x in (batch.means, batch.prev_trvs))
+    gram = past.mT @ past
+    # The first step has no past: without a ridge the system would be singular.
+    ridge = RIDGE * gram.diagonal(dim1=1, dim2=2).mean(1).clamp(min=1e-6)
+    system = gram + th.diag_embed(ridge[:, None].expand(-1, gram.shape[1]))
+    predicted = past @ th.linalg.solve(system, past.mT @ means)
+    return batch._replace(trvs=batch.trvs - predicted, means=batch.means - predicted)
