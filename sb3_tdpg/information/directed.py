@@ -28,7 +28,7 @@ class DirectedLogDet(LogDet):
     sum over time of I[x_t; x~_t], on which this is no bound.
     """
 
-    bound = "neither"
+    bound = "neither"  # type: ignore[assignment]  # of the inherited "upper": it bounds another quantity
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         return super()._estimate(without_memory(batch), t)
@@ -51,7 +51,7 @@ class DirectedLeaveOneOut(LeaveOneOut):
     policy makes them harder to tell apart.
     """
 
-    bound = "neither"
+    bound = "neither"  # type: ignore[assignment]  # of the inherited "upper": it bounds another quantity
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         return super()._estimate(without_memory(batch), t)
