@@ -64,7 +64,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     :raises ValueError: for the first one that is out of range.
     """
     check_beta_argument(settings["beta"], settings["cost_limit"])
-    for rate in _values(rate_schedule(settings["learning_rate"])):
+    for rate in _values(schedule_of("learning_rate", settings["learning_rate"])):
         check_learning_rate(rate)
     get_estimator_class(settings["mi_estimator"])
     get_baseline(settings["baseline"])
@@ -169,19 +169,24 @@ def warn_if_short(total_timesteps: int, epoch_size: int) -> None:
         )
 
 
-def rate_schedule(rate: Any) -> Schedule | Any:
-    """Return the schedule that a text such as ``"lin_1e-3"`` (to 0) or ``"lin_1e-3_1e-5"`` stands for, or the rate."""
-    if not isinstance(rate, str):
-        return rate
-    kind, *ends = rate.split("_")
+def schedule_of(name: str, value: Any) -> Schedule | Any:
+    """
+    Return the schedule that a text such as ``"lin_1e-3"`` (to 0) or ``"lin_1e-3_1e-5"`` stands for, or the value.
+
+    :param name: The argument, for the error message.
+    """
+    if not isinstance(value, str):
+        return value
+    kind, *ends = value.split("_")
     try:
         start, end = map(float, (*ends, "0")[:2])
     except ValueError:
         start = end = math.nan
     if kind != "lin" or len(ends) > 2 or not math.isfinite(start + end):
         raise ValueError(
-            f"learning_rate={rate!r} must be a number, a function, or a text such as 'lin_1e-3' (falls to 0) or "
-            "'lin_1e-3_1e-5' (in YAML write the number 1.0e-3: YAML reads 1e-3 as text)"
+            f"{name}={value!r} must be a number, a function, or a text such as 'lin_1e-3' (falls to 0) or "
+            f"'lin_1e-3_1e-5'{' or auto' if name == 'beta' else ''} (in YAML write the number 1.0e-3: YAML reads 1e-3 "
+            "as text)"
         )
     return LinearSchedule(start, end, 1.0)
 
@@ -194,9 +199,9 @@ def _values(number_or_schedule: Any) -> list[Any]:
 
 
 def check_beta_argument(beta: Any, cost_limit: Any) -> None:
-    """Raise a ``ValueError`` unless beta is a positive number, a schedule of such, or "auto" with a fitting limit."""
+    """Raise a ``ValueError`` unless beta is positive, a schedule of such numbers, or "auto" with a fitting limit."""
     if beta != "auto":
-        for value in _values(beta):
+        for value in _values(schedule_of("beta", beta)):
             check_beta(value)
         if cost_limit is not None:
             raise ValueError(

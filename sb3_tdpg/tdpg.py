@@ -33,8 +33,8 @@ from sb3_tdpg.checks import (
     check_count,
     check_n_envs,
     check_segments,
-    rate_schedule,
     refuse_others,
+    schedule_of,
     warn_if_short,
     with_keywords,
 )
@@ -74,9 +74,10 @@ class TDPG(EpisodicAlgorithm):
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``.
-    :param beta: Weight of the cost against the information: a positive number or a function of the remaining progress
-        (1 to 0). ``inf``: no penalty. ``"auto"``: minimise the information subject to E[cost] <= ``cost_limit``
-        (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default with a ``cost_limit``: ``"auto"``.
+    :param beta: Weight of the cost against the information: a positive number, a function of the remaining progress
+        (1 to 0), or a text, ``"lin_0.5_0.02"``, which falls linearly. ``inf``: no penalty. ``"auto"``: minimise the
+        information subject to E[cost] <= ``cost_limit`` (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default with a
+        ``cost_limit``: ``"auto"``.
     :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training to keep,
         ``"90%"``.
     :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
@@ -221,7 +222,7 @@ class TDPG(EpisodicAlgorithm):
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         check_policy(self.policy_class, self.policy_aliases)
         check_arguments(vars(self))
-        self.lr_schedule = FloatSchedule(rate_schedule(self.learning_rate))
+        self.lr_schedule = FloatSchedule(schedule_of("learning_rate", self.learning_rate))
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._set_problem(self._check_problem(self.env), self.env)
@@ -272,7 +273,7 @@ class TDPG(EpisodicAlgorithm):
         """Make the schedule of beta, or the weight that is adapted to the cost limit."""
         if self.beta != "auto":
             self.auto_weight = None
-            self.beta_schedule = FloatSchedule(cast("float | Schedule", self.beta))
+            self.beta_schedule = FloatSchedule(schedule_of("beta", self.beta))
             return
         if self.cost_limit is None:
             self.cost_limit = self._defaults.share

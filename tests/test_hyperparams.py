@@ -83,6 +83,16 @@ def test_a_learning_rate_may_fall_linearly_as_in_the_zoo():
     assert [model.lr_schedule(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
 
 
+def test_beta_may_fall_linearly_too(tmp_path):
+    model = make_training("Lava-v0", load_hyperparams("Lava-v0"), beta="lin_0.5_0.1").model
+    model._current_progress_remaining = 0.75
+    assert model.mi_coef == pytest.approx(1 / 0.4)
+    model.save(tmp_path / "model.zip")
+    loaded = TDPG.load(tmp_path / "model.zip")
+    loaded._current_progress_remaining = 0.0
+    assert loaded.mi_coef == pytest.approx(10.0)
+
+
 def test_another_schedule_is_refused_with_the_mend():
     with pytest.raises(ValueError, match=r"'cos_1e-3' must be a number, a function, or a text such as 'lin_1e-3'"):
         make_training("Lava-v0", load_hyperparams("Lava-v0"), learning_rate="cos_1e-3")

@@ -19,7 +19,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from tqdm import tqdm
 
 from sb3_tdpg.callbacks import TrainingCheckpointCallback
-from sb3_tdpg.checks import rate_schedule
+from sb3_tdpg.checks import schedule_of
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
 from sb3_tdpg.common.processes import process_pool, usable_cores
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
@@ -158,7 +158,7 @@ class SB3Run(Run):
         settings = self.settings
         n_timesteps = int(settings.pop("n_timesteps"))
         env = take_env(self.env_id, settings)
-        settings["learning_rate"] = rate_schedule(settings["learning_rate"])
+        settings["learning_rate"] = schedule_of("learning_rate", settings["learning_rate"])
         model = algorithm(settings.pop("policy"), env, **settings, seed=self.seed, device="cpu")
         model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), log_suffix="_00000000")]))
         model.learn(n_timesteps, progress_bar=progress_bar)

@@ -10,7 +10,7 @@ from sb3_contrib import RecurrentPPO
 from small_problems import complete_runs_here
 from stable_baselines3 import PPO
 
-from sb3_tdpg.checks import rate_schedule
+from sb3_tdpg.checks import schedule_of
 from sb3_tdpg.cli import main
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -105,7 +105,7 @@ def test_a_run_of_sb3_is_the_model_that_its_block_makes(algo, cls, tmp_path, tin
     settings = run.settings
     n_timesteps, policy = settings.pop("n_timesteps"), settings.pop("policy")
     env = take_env("Lava-v0", settings)
-    settings["learning_rate"] = rate_schedule(settings["learning_rate"])
+    settings["learning_rate"] = schedule_of("learning_rate", settings["learning_rate"])
     model = cls(policy, env, **settings, seed=3, device="cpu").learn(n_timesteps)
     saved = cls.load(tmp_path / "run" / "model.zip", device="cpu")
     for name, value in model.policy.state_dict().items():
