@@ -7,9 +7,10 @@ import pandas as pd
 import pytest
 from small_problems import complete_runs_here
 
-from sb3_tdpg import make_episodes_env
+from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE, Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common, pays
@@ -49,6 +50,35 @@ def test_the_cue_never_fails():
     for name in pays._NO_BLACKOUT:
         if name != "group failure":  # after which the environment would name its groups
             np.testing.assert_array_equal(observed(of_cue[name])[..., 2], clean)
+
+
+def test_the_cue_has_a_recipe_and_shows_the_defaults_beside_it():
+    methods = {method.label: method for method in PROBLEMS["cue"].methods()}
+    models = {
+        label: make_training(
+            "SqueezeInsert-v0", load_hyperparams(methods[label].block), **methods[label].overrides
+        ).model
+        for label in ("TDPG", pays.BY_DEFAULT, "TDPG, logdet", "PG, noise to 1")
+    }
+    by_default = TDPG("TRVPolicy", "SqueezeInsert-v0")
+    for name in ("beta", "mi_estimator"):
+        assert getattr(models[pays.BY_DEFAULT], name) == getattr(by_default, name)
+        assert getattr(models["TDPG"], name) != getattr(by_default, name)
+    assert models["TDPG, logdet"].beta == models["TDPG"].beta
+    assert {model.policy.trv_dim for model in models.values()} == {8}
+    assert pays.BY_DEFAULT not in {method.label for method in PROBLEMS["squeeze"].methods()}
+
+
+@pytest.mark.slow
+def test_the_recipe_keeps_the_cue_and_drops_the_yaw():
+    training = make_training("SqueezeInsert-v0", load_hyperparams("SqueezeInsert-v0-cue"), seed=1)
+    model = training.model.learn(training.n_timesteps)
+    of_cue = rows("cue")
+    records = evaluate_scenarios({"TDPG": model}, [of_cue[name] for name in (TRAINING, "noise 2", "scale 2")], 500)
+    costs = records.groupby("scenario")["cost"].mean()
+    assert costs.max() < 12  # 90 without the cue; the ablation costs 40 under its worst fault
+    information = model.estimator(model.rollout_buffer.episode_batch().information_batch())
+    assert 0.6 < information.sum() < 1.2  # a bit is 0.69 nats
 
 
 def test_a_blind_policy_stays_blind_under_every_fault_and_meets_those_of_the_plant():
