@@ -183,10 +183,10 @@ def schedule_of(name: str, value: Any) -> Schedule | Any:
     except ValueError:
         start = end = math.nan
     if kind != "lin" or len(ends) > 2 or not math.isfinite(start + end):
+        auto = ", or 'auto'" if name == "beta" else ""
         raise ValueError(
             f"{name}={value!r} must be a number, a function, or a text such as 'lin_1e-3' (falls to 0) or "
-            f"'lin_1e-3_1e-5'{' or auto' if name == 'beta' else ''} (in YAML write the number 1.0e-3: YAML reads 1e-3 "
-            "as text)"
+            f"'lin_1e-3_1e-5'{auto} (in YAML write the number 1.0e-3: YAML reads 1e-3 as text)"
         )
     return LinearSchedule(start, end, 1.0)
 
