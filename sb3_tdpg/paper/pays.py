@@ -114,7 +114,7 @@ class Problem:
         narrow = dict(policy_kwargs={**block.get("policy_kwargs", {}), "action_log_var_init": -2.0})
         no_penalty: dict[str, Any] = dict(beta=float("inf"))
         told = {_PERTURBED: dict(perturbation=[None, *self._told()], scale=list(self.scale))}
-        by_default = dict(beta=DEFAULTS["vector"].beta, mi_estimator=DEFAULTS["vector"].mi_estimator)
+        by_default: dict[str, Any] = dict(beta=DEFAULTS["vector"].beta, mi_estimator=DEFAULTS["vector"].mi_estimator)
         own_estimator = block.get("mi_estimator", by_default["mi_estimator"])
         estimators = [name for name in ("mine", "logdet", "directed", "vib") if name != own_estimator]
         found = [
