@@ -70,6 +70,11 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
 
 
 def statistics_beside(path: Path) -> Path | None:
-    """Return the ``vecnormalize.pkl`` that rl-zoo3 has saved for a model, if there is one."""
-    candidates = [path.parent / "vecnormalize.pkl", path.with_suffix("") / "vecnormalize.pkl"]
-    return next((each for each in candidates if each.is_file()), None)
+    """
+    Return the ``vecnormalize.pkl`` that rl-zoo3 has saved for a model, if there is one.
+
+    It lies beside the model or in a folder with its name; of ``<id>_1/best_model.zip``, in ``<id>_1/<id>/``.
+    """
+    folder = path.parent
+    folders = [folder, path.with_suffix(""), folder / folder.resolve().name.rpartition("_")[0]]
+    return next((found for each in folders if (found := each / "vecnormalize.pkl").is_file()), None)

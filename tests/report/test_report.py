@@ -222,13 +222,15 @@ def test_models_of_other_algorithms_are_recognised(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:You are trying to run PPO")
-def test_the_statistics_that_the_zoo_leaves_beside_a_model_are_used(tmp_path):
+@pytest.mark.parametrize("name", ["Lava-v0", "best_model"])
+def test_the_statistics_that_the_zoo_leaves_beside_a_model_are_used(name, tmp_path):
     env = VecNormalize(make_vec_env("Lava-v0", 2, seed=0), norm_reward=False)
     model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu").learn(100)
-    model.save(tmp_path / "Lava-v0.zip")
-    (tmp_path / "Lava-v0").mkdir()
-    env.save(tmp_path / "Lava-v0" / "vecnormalize.pkl")
-    loaded = load_model(tmp_path / "Lava-v0.zip", "Lava-v0", {}).get_vec_normalize_env()
+    folder = tmp_path / "Lava-v0_1"
+    model.save(folder / name)
+    (folder / "Lava-v0").mkdir()
+    env.save(folder / "Lava-v0" / "vecnormalize.pkl")
+    loaded = load_model(folder / f"{name}.zip", "Lava-v0", {}).get_vec_normalize_env()
     np.testing.assert_array_equal(loaded.obs_rms.mean, env.obs_rms.mean)
 
 
