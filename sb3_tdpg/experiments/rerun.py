@@ -10,27 +10,20 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sb3_tdpg.common.trust import plain_name, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.experiments.runs import Run, complete_run
-
-
-@dataclass(frozen=True)
-class _RecordedRun(Run):
-    """A run with all settings recorded, so that a later change of its block does not matter."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return dict(self.overrides)
+from sb3_tdpg.experiments.runs import Run, SB3Run, complete_run
 
 
 def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progress_bar: bool = True) -> Path:
     """
     Train and evaluate the run that a ``config.json`` describes; with the same versions it gives the same numbers.
+
+    Rows whose sensor is changed by a function are left out: the file has only its name.
 
     :param config: The file. If the run started from the policy of another run, that policy must lie beside the file:
         ``<name of that run>/model.zip``.
@@ -42,9 +35,12 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
     config = Path(config)
     try:
         content = json.loads(config.read_text())
-        scenarios, n_eval_episodes, start = scenarios_of(content), content["n_eval_episodes"], content["start"]
-        run = _RecordedRun(
-            **{name: content[name] for name in ("method", "env_id", "block", "seed", "max_attempts")},
+        rows = [row for row in content["scenarios"] if "sensor" not in row]
+        scenarios, n_eval_episodes, start = scenarios_of(rows), content["n_eval_episodes"], content["start"]
+        # Without the block: all settings are recorded, and the block may have changed.
+        run = (partial(SB3Run, algo=content["algo"]) if "algo" in content else Run)(
+            **{name: content[name] for name in ("method", "env_id", "seed", "max_attempts")},
+            block=None,
             overrides=with_numbers(content["settings"]),
             start=None if start is None else config.parent / plain_name(start, f"start of {config}"),
         )
@@ -60,9 +56,12 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
     return complete_run(run, Path(out), scenarios, n_eval_episodes=n_eval_episodes, progress_bar=progress_bar)
 
 
-def scenarios_of(config: Mapping[str, Any]) -> list[Scenario]:
-    """Return the scenarios that a recorded run was evaluated on."""
-    return [Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"])) for row in config["scenarios"]]
+def scenarios_of(rows: Sequence[Mapping[str, Any]]) -> list[Scenario]:
+    """Return the scenarios that a recorded run was evaluated on, without the functions that change a sensor."""
+    return [
+        Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"]), n_episodes=row.get("n_episodes"))
+        for row in rows
+    ]
 
 
 def with_numbers(value: Any) -> Any:

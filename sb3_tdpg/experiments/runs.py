@@ -42,7 +42,7 @@ class Run:
 
     :param method: The label in tables ("PG", "TDPG").
     :param env_id: The training environment.
-    :param block: Block of ``hyperparams/tdpg.yml``; ``None``: the settings are the overrides alone.
+    :param block: Block of ``hyperparams/<algo>.yml``; ``None``: the settings are the overrides alone.
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Maximum number of trainings from scratch, each with its own seed, until one meets the limits of
@@ -58,6 +58,7 @@ class Run:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
     start: Path | None = None
+    algo = "tdpg"  # no field: a TDPG's records do not name it
 
     def __post_init__(self) -> None:
         last = self.seed + SEEDS_BETWEEN_ATTEMPTS * (self.max_attempts - 1)
@@ -67,7 +68,7 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """The block with the overrides."""
-        return {**(load_hyperparams(self.block) if self.block else {}), **self.overrides}
+        return {**(load_hyperparams(self.block, self.algo) if self.block else {}), **self.overrides}
 
     @property
     def folder_name(self) -> str:
@@ -138,12 +139,6 @@ class SB3Run(Run):
     """A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew."""
 
     algo: str = "ppo"  # or "ppo_lstm"; the block is in hyperparams/<algo>.yml
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The block with the overrides."""
-        assert self.block is not None
-        return {**load_hyperparams(self.block, self.algo), **self.overrides}
 
     @property
     def config(self) -> dict[str, Any]:
@@ -227,14 +222,7 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
 
     :raises ValueError: if the folder holds a run with other settings.
     """
-    rows: list[dict[str, Any]] = [
-        dict(name=row.name, env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in scenarios
-    ]
-    for row, scenario in zip(rows, scenarios, strict=True):  # only where there is one
-        if scenario.sensor is not None:
-            row["sensor"] = str(scenario.sensor)
-        if scenario.n_episodes is not None:
-            row["n_episodes"] = scenario.n_episodes
+    rows = [{k: v for k, v in vars(row).items() if k != "paper" and v is not None} for row in scenarios]
     config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
     check_same_config(folder / "config.json", config, "run")
     return config

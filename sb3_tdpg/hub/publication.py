@@ -117,7 +117,7 @@ def read_run(folder: Path) -> Publication:
         model=folder / "model.zip",
         **{name: config[name] for name in ("env_id", "method", "seed")},
         records=records,
-        scenarios=scenarios_of(config),
+        scenarios=scenarios_of(config["scenarios"]),
         settings=settings,
         progress=read_progress(folder),
         notes=notes,

@@ -8,13 +8,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from published_cards import blocks
 from small_problems import assert_same_parameters, parameters
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.experiments.rerun import main as rerun_main
 from sb3_tdpg.experiments.rerun import rerun
+from sb3_tdpg.experiments.runs import SB3Run, complete_run
+from sb3_tdpg.robustness import PerturbedVecEnv
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -31,10 +35,25 @@ def test_the_command_in_the_card_repeats_the_run(card, runs, tmp_path):
 
 
 def test_a_rerun_uses_the_recorded_settings_and_not_the_block(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_tdpg.experiments.runs.load_hyperparams", lambda block: pytest.fail("it reads the block"))
+    monkeypatch.setattr("sb3_tdpg.experiments.runs.load_hyperparams", lambda *_: pytest.fail("it reads the block"))
     rerun(runs / "pg-seed0" / "config.json", tmp_path / "again", progress_bar=False)
     assert (tmp_path / "again" / "episodes.csv").read_bytes() == (runs / "pg-seed0" / "episodes.csv").read_bytes()
     assert TDPG.load(tmp_path / "again" / "model.zip", device="cpu").mi_coef == 0  # beta is inf, and not a text
+
+
+def test_a_run_of_ppo_is_repeated_without_the_rows_that_a_function_changes(tmp_path):
+    settings = dict(n_timesteps=100, n_steps=10, batch_size=10, n_envs=1)
+    run = SB3Run("PPO", "Lava-v0", "Lava-v0", 0, overrides=settings, algo="ppo")
+    rows = [Scenario("Training", "Lava-v0", n_episodes=3), Scenario("Noisy", "Lava-v0", sensor=noisy)]
+    complete_run(run, tmp_path / "run", rows, n_eval_episodes=4, progress_bar=False)
+    rerun(tmp_path / "run" / "config.json", tmp_path / "again", progress_bar=False)
+    first, second = (pd.read_csv(tmp_path / folder / "episodes.csv") for folder in ("run", "again"))
+    assert first["scenario"].value_counts().to_dict() == {"Noisy": 4, "Training": 3}
+    pd.testing.assert_frame_equal(second, first[first["scenario"] == "Training"])
+
+
+def noisy(env):
+    return PerturbedVecEnv(env, "vector_noise", 5)
 
 
 def test_a_rerun_without_the_policy_that_the_run_started_from_is_refused(card, runs, tmp_path, capsys):
