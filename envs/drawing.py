@@ -5,11 +5,6 @@ import math
 import numpy as np
 
 
-def canvas(height: int, width: int) -> np.ndarray:
-    """Return an empty picture: ``(height, width, 3)`` uint8."""
-    return np.full((height, width, 3), 245, np.uint8)
-
-
 def paint_box(
     image: np.ndarray,
     middle: tuple[float, float],

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from . import checks
 from .base import POMDPEnv
-from .drawing import canvas, paint_box
+from .drawing import paint_box
 
 SIZE = 6.0  # cm, side of the square table
 START = (2.0, 6.0)  # cm, range of both coordinates
@@ -92,7 +92,7 @@ class PegCornerEnv(POMDPEnv):
             return None
         x, y = self._current_state()[0]
         span = (-0.7, SIZE + 0.7, -0.7, SIZE + 0.7)
-        image = canvas(200, 200)
+        image = np.full((200, 200, 3), 245, np.uint8)
         middle = SIZE / 2
         paint_box(image, (middle, middle), (SIZE + 1.2, SIZE + 1.2), 0.0, (140, 140, 150), span)
         paint_box(image, (middle, middle), (SIZE + 0.7, SIZE + 0.7), 0.0, (245, 245, 245), span)

@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from . import checks
 from .base import POMDPEnv
-from .drawing import canvas, paint_box
+from .drawing import paint_box
 
 RIGHT_ANGLE = math.pi / 2
 
@@ -121,7 +121,7 @@ class SqueezeInsertEnv(POMDPEnv):
             return None
         state = self._current_state()
         yaw = float(self.yaw(state)[0])
-        image = canvas(200, 200)
+        image = np.full((200, 200, 3), 245, np.uint8)
         paint_box(image, (0.0, 0.0), (0.86, 0.3), 0.0, (205, 200, 190))
         paint_box(image, (0.0, 0.0), (0.80, 0.24), 0.0, (90, 90, 95))
         is_across = self.cue and state[0, 2] < 0

@@ -142,8 +142,7 @@ class SelectionCallback(TDPGCallback):
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
-            record = json.loads(_record_path(self.save_path).read_text())
-            self.best = Candidate(record["epoch"], record["cost"], record["information"])
+            self.best = Candidate(**json.loads(_record_path(self.save_path).read_text()))
             # Loading the whole model would seed all random number generators.
             _, parameters, _ = load_from_zip_file(self.save_path, device=self.model.device, load_data=False)
             self._best_policy = cast("dict[str, th.Tensor]", parameters["policy"])
@@ -239,10 +238,13 @@ class TDPGProgressBar(ProgressBarCallback):
     _open: ClassVar[list[TDPGProgressBar]] = []
 
     def _on_training_start(self) -> None:
+        from rich import get_console
+
         super()._on_training_start()
         self._open.append(self)
         self._started = time.monotonic()
-        self._next_line = 0.0 if _needs_lines() else math.inf
+        console = get_console()
+        self._next_line = math.inf if console.is_terminal or console.is_jupyter else 0.0
 
     @classmethod
     def close(cls) -> None:
@@ -262,12 +264,6 @@ class TDPGProgressBar(ProgressBarCallback):
             self._next_line = now + self.SECONDS
             total = model.num_timesteps + model.remaining_timesteps
             print(f"{now - self._started:.0f} s: {model.num_timesteps:,} of {total:,} steps, {shown}", flush=True)
-
-
-def _needs_lines() -> bool:
-    from rich import get_console
-
-    return not (get_console().is_terminal or get_console().is_jupyter)
 
 
 def _zip_path(path: str | os.PathLike[str]) -> Path:

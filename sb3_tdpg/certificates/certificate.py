@@ -19,12 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-
-try:
-    from scipy.optimize import minimize_scalar
-    from scipy.stats import beta as beta_distribution
-except ImportError as e:
-    raise ImportError("certificates need scipy: pip install sb3_tdpg[plots]") from e
+from scipy.optimize import minimize_scalar
+from scipy.stats import beta as beta_distribution
 
 # All of the highest costs, then ranks that grow by this factor: 400 of a million costs remain.
 _HIGHEST = 50

@@ -11,6 +11,7 @@ Dimension key: T horizon, N episodes, X state, Z TRVs.
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -277,32 +278,12 @@ class TrainingEpisodes:
 
     def _shifted(self, shift: Shift) -> Any:
         kwargs = {**self.scenario.env_kwargs, **shift.env_kwargs}
-        env = _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
-        return env if shift.nuisance is None else _UnderNuisance(env, shift.nuisance)
-
-
-class _UnderNuisance:
-    """An environment whose sensor shows what the members of a nuisance make of it, drawn at the first call."""
-
-    def __init__(self, env: POMDPEnv, nuisance: Callable[[int], Members]) -> None:
-        self.env, self.nuisance = env, nuisance
-        self.members: Members | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.env, name)
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        return self.env.np_random
-
-    @np_random.setter
-    def np_random(self, generator: np.random.Generator) -> None:
-        self.env.np_random = generator
-
-    def sensor(self, state: np.ndarray) -> Any:
-        if self.members is None:
-            self.members = self.nuisance(len(state))
-        return self.members(self.env.sensor(state), None, state)
+        env: Any = _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
+        if shift.nuisance is not None:
+            # Drawn once: every call sees the same number of episodes.
+            plain, members = env.sensor, functools.cache(shift.nuisance)
+            env.sensor = lambda state: members(len(state))(plain(state), None, state)
+        return env
 
 
 def record_episodes(model: Any, env: Any, n: int, seed: tuple[int, ...]) -> RecordedEpisodes:

@@ -85,7 +85,6 @@ def save_animation(
     """
     check_animation_path(path)
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     video = _Video(episodes, horizon, signal)
     with replaced_atomically(path) as partial:
         (_write_gif if path.suffix == ".gif" else _write_mp4)(video, partial, fps)

@@ -137,10 +137,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) ->
     :param path: The file, whose extension sets the format. Folders are created.
     :param dpi: Pixels per inch.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced_atomically(path) as partial:
-        figure.savefig(partial, format=path.suffix.lstrip("."), dpi=dpi)
+    with replaced_atomically(Path(path)) as partial:
+        figure.savefig(partial, dpi=dpi)
 
 
 def new_figure(width: float, height: float) -> Figure:

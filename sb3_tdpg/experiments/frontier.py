@@ -1,5 +1,6 @@
 """Will the bottleneck pay on a task? A short sweep over shares of the improvement kept, and a verdict."""
 
+import contextlib
 import json
 import math
 import shlex
@@ -78,7 +79,10 @@ def frontier(
         raise ValueError(f"{name} is set by the frontier: leave it out of the settings")
     name = env_id.rpartition(":")[2]
     out = out or Path("results", f"frontier-{block or name}")
-    block = block or (name if _has_block(name) else None)
+    if block is None:
+        with contextlib.suppress(KeyError):
+            load_hyperparams(name)
+            block = name
     # The penalty is the bound that the figure shows. Callbacks would select epochs by rules of their own.
     shared: dict[str, Any] = dict(policy="TRVPolicy", mi_estimator="logdet", mi_kwargs=None, callback=[])
     shared.update({**(settings or {}), **({"env_kwargs": dict(env_kwargs)} if env_kwargs else {})})
@@ -106,13 +110,6 @@ def frontier(
     runs = pd.DataFrame(rows)
     first = np.mean([read_progress(folder)["rollout/ep_cost_mean"].iloc[0] for _, folder, _ in tasks[:n_seeds]])
     return _write(out, dict(env_id=env_id, block=block, settings=shared), runs, frontier_table(runs, float(first)))
-
-
-def _has_block(name: str) -> bool:
-    try:
-        return bool(load_hyperparams(name))
-    except KeyError:
-        return False
 
 
 def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str, seed: int, out: Path) -> Task:

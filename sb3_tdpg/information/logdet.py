@@ -23,14 +23,10 @@ class LogDet(InformationEstimator):
     bound = "upper"
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        return _gaussian_bound(batch.means, batch.stds)
-
-
-def _gaussian_bound(means: th.Tensor, stds: th.Tensor) -> th.Tensor:
-    """Return the bound for Gaussians with means and standard deviations ``(T, N, Z)``: ``(T,)``."""
-    centred = means - means.mean(dim=1, keepdim=True)
-    covariance = centred.mT @ centred / (means.shape[1] - 1) + th.diag_embed(stds.square().mean(dim=1))
-    # Dividing by the geometric mean of the stds first keeps the determinant representable.
-    log_std = stds.log().mean(dim=1)  # (T, Z)
-    scale = th.exp(-log_std)
-    return 0.5 * th.logdet(covariance * scale[:, :, None] * scale[:, None, :])
+        means, stds = batch.means, batch.stds
+        centred = means - means.mean(dim=1, keepdim=True)
+        covariance = centred.mT @ centred / (means.shape[1] - 1) + th.diag_embed(stds.square().mean(dim=1))
+        # Dividing by the geometric mean of the stds first keeps the determinant representable.
+        log_std = stds.log().mean(dim=1)  # (T, Z)
+        scale = th.exp(-log_std)
+        return 0.5 * th.logdet(covariance * scale[:, :, None] * scale[:, None, :])

@@ -13,7 +13,7 @@ from sb3_tdpg.envs.scenarios import BALL_CATCH
 from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure
 from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.paper import common
-from sb3_tdpg.paper.ball import BACKGROUND_ROWS, GROUPS, NOISE_ROWS, group_rows, with_groups
+from sb3_tdpg.paper.ball import BACKGROUND_ROWS, NOISE_ROWS, group_rows, with_groups
 from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.plots import robustness_curves
 
@@ -128,7 +128,6 @@ def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
         given.publish,
         cost=comparison_markdown(aggregate_seeds(of_paper.assign(model=of_paper["model"].map(names))), cost_rows),
         comparisons=common.comparisons_table(table, pairs, KINDS),
-        groups=list(GROUPS),
         runs=common.markdown_table(_runs_table(runs)),
         chosen=common.markdown_table(shown.unstack().reset_index().rename(columns=dict(model="policy"))),
     )

@@ -64,8 +64,7 @@ class Comparison:
     title: str
     env_id: str
     baselines: Sequence[Method]
-    rows: Sequence[Scenario]  # that the policies are evaluated on
-    columns: Sequence[str]  # rows that the table shows
+    rows: Sequence[Scenario]  # that the policies are evaluated on, and the columns of the table
     first_seed: int  # as in the records
     records: Path  # of the methods that are not trained again, in the folder of results
     recorded: Mapping[str, str]  # label of these methods in the records -> in the table
@@ -105,7 +104,6 @@ LAVA_BASELINES = Comparison(
         Method("RecurrentPPO", "Lava-v0", algo="ppo_lstm", overrides=LAVA_PPO),
     ),
     rows=LAVA,
-    columns=[row.name for row in LAVA],
     first_seed=300,
     records=Path("lava", "episodes_text.csv.gz"),
     recorded={"TDPG (log-det)": "TDPG (log-det)"},
@@ -122,7 +120,6 @@ GRASP_BASELINES = Comparison(
         Method("PPO", "PandaGrasp-v0", algo="ppo", overrides=dict(n_timesteps=GRASP_STEPS)),
     ),
     rows=PANDA_GRASP,
-    columns=[row.name for row in PANDA_GRASP],
     first_seed=100,
     records=Path("panda_grasp", "episodes.csv.xz"),
     recorded={NO_PENALTY: "PG", "TDPG": "TDPG"},
@@ -169,7 +166,7 @@ def reproduce_baselines(
         new = trained[trained["model"].isin(set(each.labels) - set(each.recorded.values()))]
         table = pd.concat([each.read_recorded(records, given.n_eval_episodes), new], ignore_index=True)
         table = table.sort_values("model", key=lambda column, each=each: column.map(each.labels.index), kind="stable")
-        shown[each.title] = baselines_table(table, each.columns, seeds, each.digits)
+        shown[each.title] = baselines_table(table, [row.name for row in each.rows], seeds, each.digits)
     frame = read_records(everything)[["env_id", *RECORD_COLUMNS]].round({"cost": 4})
     write_frame_atomically(frame, out / "episodes.csv.xz")
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True).round(4), out / "seeds.csv")

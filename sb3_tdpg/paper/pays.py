@@ -16,7 +16,7 @@ from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE, Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, save_figure
 from sb3_tdpg.evaluation.figures import import_matplotlib, log_axis, new_panels
 from sb3_tdpg.experiments.blind import BlindVecEnv
-from sb3_tdpg.experiments.runs import SB3Run, Task, complete_runs
+from sb3_tdpg.experiments.runs import SB3Run, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.baselines import training_times
@@ -54,7 +54,6 @@ FAULTS: Mapping[str, Fault] = {
     "delay 3": ("vector_delay", 3, 1.0),
     "freeze": ("freeze", 1, 1.0),
 }
-GAIN: Mapping[str, Fault] = {"actuator gain 1.2": ("actuator_gain", 3, 1.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +112,8 @@ class Problem:
         block = load_hyperparams(self.block)
         narrow = dict(policy_kwargs={**block.get("policy_kwargs", {}), "action_log_var_init": -2.0})
         no_penalty: dict[str, Any] = dict(beta=float("inf"))
-        told = {_PERTURBED: dict(perturbation=[None, *self._told()], scale=list(self.scale))}
+        of_sensor = [[*fault] for fault in self.faults.values() if PERTURBATIONS[fault[0]].kind != "action"]
+        told = {_PERTURBED: dict(perturbation=[None, *of_sensor], scale=list(self.scale))}
         by_default: dict[str, Any] = dict(beta=DEFAULTS["vector"].beta, mi_estimator=DEFAULTS["vector"].mi_estimator)
         own_estimator = block.get("mi_estimator", by_default["mi_estimator"])
         estimators = [name for name in ("mine", "logdet", "directed", "vib") if name != own_estimator]
@@ -133,10 +133,6 @@ class Problem:
                 method = ours(label + more, wrapper, n_timesteps=block["n_timesteps"])
                 found.append(replace(method, algo=algo, max_seeds=N_SB3_SEEDS))
         return [method for method in found if self.labels is None or method.label in self.labels]
-
-    def _told(self) -> list[list[Any]]:
-        """List the faults of the sensor for training."""
-        return [[*fault] for fault in self.faults.values() if PERTURBATIONS[fault[0]].kind != "action"]
 
 
 class _BlindFaulty(BlindVecEnv):
@@ -170,7 +166,7 @@ PROBLEMS: Mapping[str, Problem] = {
         env_id="Lava-v0",
         block="Lava-v0-default",
         scale=(1.0, 1.0),
-        faults={**FAULTS, **GAIN},
+        faults={**FAULTS, "actuator gain 1.2": ("actuator_gain", 3, 1.0)},
     ),
     "cue": Problem(
         title="Squeeze and insert, with a cue",
@@ -233,12 +229,12 @@ def reproduce_pays(
     sections, frames = {}, {}
     for name, of_problem in tasks.items():
         problem, records = PROBLEMS[name], common.read_records(of_problem)
-        table = with_summary(records)
+        table, times = with_summary(records), training_times(of_problem).groupby("model")["cpu_s"].median()
         frames[name] = by_seed = common.means_by_seed(table)
         of_tdpg = aggregate_seeds(table[table["model"] == "TDPG"])
         others = [label for label in by_seed["model"].unique() if label != "TDPG"]
         sections[problem.title] = dict(
-            methods=common.markdown_table(_methods_table(by_seed, _cpu_times(of_problem))),
+            methods=common.markdown_table(_methods_table(by_seed, times)),
             comparisons=common.comparisons_table(table, [("TDPG", other) for other in others], KINDS),
             faults=common.markdown_table(_faults_table(by_seed)),
             successes=common.markdown_table(_successes_table(records)) if "failure" in records else "",
@@ -257,11 +253,6 @@ def with_summary(records: pd.DataFrame) -> pd.DataFrame:
     worst = faults.groupby([*policy, "scenario"])["cost"].mean().groupby(policy).idxmax()
     of_worst = faults.set_index([*policy, "scenario"]).loc[worst.tolist()].reset_index()
     return pd.concat([records, faults.assign(scenario=MEAN), of_worst.assign(scenario=WORST)], ignore_index=True)
-
-
-def _cpu_times(tasks: Sequence[Task]) -> pd.Series:
-    """Return the CPU time of a training in s by method: medians over the seeds."""
-    return training_times(tasks).groupby("model")["cpu_s"].median()
 
 
 def _methods_table(by_seed: pd.DataFrame, times: pd.Series) -> pd.DataFrame:
@@ -301,7 +292,7 @@ def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
     for axes, (name, frame) in zip(panels, frames.items(), strict=True):
         costs = frame.pivot(index=["model", "train_seed"], columns="scenario", values="cost")
         for i, label in enumerate(frame["model"].unique()):
-            marker = "o" if "TDPG" in label or label == "VIB" else "^" if "PPO" in label else "s"
+            marker = "o" if "TDPG" in label else "^" if "PPO" in label else "s"
             style: dict[str, Any] = dict(alpha=0.8, label=label, marker=marker, color=colours[i % len(colours)])
             style |= dict(s=44, zorder=3, edgecolor="black") if label == "TDPG" else dict(s=18)
             axes.scatter(costs.loc[label, TRAINING], costs.loc[label, MEAN], **style)

@@ -18,8 +18,6 @@ from sb3_tdpg.robustness.registry import find
 MIN_SEEDS = 5
 """With fewer models of a method, its interval is not reliable."""
 
-TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml"}
-
 
 @dataclass
 class Knowledge:
@@ -200,8 +198,7 @@ def to_html(markdown: str, folder: Path, title: str, *, reload: bool = False) ->
     for token in tokens:
         for child in token.children or ():
             if child.type == "image":
-                path = folder / str(child.attrs["src"])
-                data = base64.b64encode(path.read_bytes()).decode()
-                child.attrs["src"] = f"data:{TYPES[path.suffix]};base64,{data}"
+                data = base64.b64encode((folder / str(child.attrs["src"])).read_bytes()).decode()
+                child.attrs["src"] = f"data:image/png;base64,{data}"
     body = parser.renderer.render(tokens, parser.options, {})
     return fill_template("sb3_tdpg.report", "report.html", title=title, body=body, reload=reload)

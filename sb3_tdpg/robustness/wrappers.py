@@ -4,7 +4,6 @@ The wrappers that perturb observations or actions: one for a Gymnasium environme
 Dimension key: N environments side by side.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -132,10 +131,10 @@ class PerturbedVecEnv(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         """Step, and perturb the observations."""
         observations, rewards, dones, infos = self.venv.step_wait()
+        self.reset_infos = self.unwrapped.reset_infos
         self.unperturbed, ended = observations, np.flatnonzero(dones)
         if self._is_plant:
             self._perturber.begin(ended)
-            self.reset_infos = self.unwrapped.reset_infos
             return observations, rewards, dones, infos
         if not len(ended):
             return self._perturber(observations, None, self._states(infos)), rewards, dones, infos
@@ -143,20 +142,15 @@ class PerturbedVecEnv(VecEnvWrapper):
         last = each_part(np.copy, observations)
         reported = [i for i in ended if "terminal_observation" in infos[i]]
         for i in reported:
-            each_part(functools.partial(_put, i), last, infos[i]["terminal_observation"])
+            each_part(lambda x, new, i=i: x.__setitem__(i, new), last, infos[i]["terminal_observation"])
         perturbed, infos = self._perturber(last, None, self._states(infos)), list(infos)
         for i in reported:
             infos[i] = {**infos[i], "terminal_observation": each_part(lambda part, i=i: part[i].copy(), perturbed)}
         self._perturber.begin(ended)
-        self.reset_infos = self.unwrapped.reset_infos
         states = self._states([self.reset_infos[i] for i in ended])
         first = self._perturber(each_part(lambda part: part[ended], observations), ended, states)
-        each_part(functools.partial(_put, ended), perturbed, first)
+        each_part(lambda x, new: x.__setitem__(ended, new), perturbed, first)
         return perturbed, rewards, dones, infos
-
-
-def _put(where: Any, target: np.ndarray, values: np.ndarray) -> None:
-    target[where] = values
 
 
 def _checked(seed: Any) -> int | None:

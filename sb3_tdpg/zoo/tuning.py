@@ -24,6 +24,7 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
+from sb3_tdpg.experiments.rerun import with_numbers
 from sb3_tdpg.experiments.studies import open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
@@ -143,7 +144,6 @@ class TuningManager(TDPGExperimentManager):
 
     def _write_results(self, study: optuna.Study, description: dict[str, Any]) -> None:
         folder = Path(self.save_path)
-        folder.mkdir(parents=True, exist_ok=True)
         write_frame_atomically(study.trials_dataframe(), folder / "trials.csv")
         write_run_config(folder / RECORD, dict(study=self.study_name, **description))
         best = best_trial(study)
@@ -222,9 +222,7 @@ def block_of_trial(storage: str, study_name: str, number: int | None = None) -> 
     if trial is None:
         raise ValueError(f"study {study_name!r} has no trial {number}: it has {len(trials)}, from number 0")
     described = study.user_attrs["space"]
-    # JSON has no infinity.
-    block = {key: math.inf if value == "inf" else value for key, value in described["block"].items()}
-    return put_in(block, trial.params, abs(described["cost_limit"]))
+    return put_in(with_numbers(described["block"]), trial.params, abs(described["cost_limit"]))
 
 
 def _result(trial: optuna.trial.FrozenTrial) -> str:
