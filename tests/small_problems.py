@@ -207,6 +207,13 @@ def lava_env(n=20):
     return BatchedVecEnv(LavaEnv(), n)
 
 
+def rollouts(model):
+    """Roll out an epoch without an update; the batch that the update would get."""
+    model.train = lambda: None
+    train_epochs(model, 1)
+    return model.rollout_buffer.episode_batch()
+
+
 def complete_runs_here(tasks, *, n_eval_episodes, jobs=None):
     """As runs.complete_runs, in this process: workers would not see what a test has patched."""
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}

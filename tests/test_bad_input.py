@@ -217,11 +217,6 @@ def test_a_policy_of_ppo_is_refused_with_ours(name):
         TDPG(name, "Lava-v0")
 
 
-def test_a_misspelt_argument_is_not_swallowed():
-    with pytest.raises(TypeError, match="betta"):
-        TDPG("TRVPolicy", "Lava-v0", betta=1.0)
-
-
 # -- files -----------------------------------------------------------------------------------------------------
 
 
@@ -355,14 +350,6 @@ def test_an_environment_that_does_not_fit_cannot_be_set_and_leaves_the_old_one(e
         model.set_env(env())
     assert model.env is old
     model.learn(100)
-
-
-@pytest.mark.parametrize("observation", [
-    np.zeros(3, np.float32), np.zeros((4, 3), np.float32), np.zeros((1, 2, 2), np.float32), np.float32(0),
-], ids=["vector", "batch", "too_deep", "scalar"])  # fmt: skip
-def test_an_observation_of_a_wrong_shape_is_refused_by_predict(observation):
-    with pytest.raises(ValueError, match=r"(?i)observation shape.*\(2,\)"):
-        tiny_tdpg().predict(observation)
 
 
 def test_a_dict_is_refused_by_predict():

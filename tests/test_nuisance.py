@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import assert_same_parameters, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+from small_problems import (
+    assert_same_parameters,
+    parameters,
+    rollouts,
+    same_parameters,
+    tiny_tdpg,
+    toy_vec_env,
+    train_epochs,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -22,13 +30,6 @@ IMAGES_AND_VECTOR = spaces.Dict(camera=spaces.Box(0, 255, (3, 64, 64), np.uint8)
 
 def ball_env(n=20):
     return make_episodes_env("BallCatch-v0", n, env_kwargs=dict(renderer="fast"), seed=0)
-
-
-def rollouts(model):
-    """Roll out an epoch without an update; the batch that the update would get."""
-    model.train = lambda: None
-    train_epochs(model, 1)
-    return model.rollout_buffer.episode_batch()
 
 
 def wrappers(model):

@@ -200,13 +200,6 @@ def hand_position(simulation, joints):
     return np.array(simulation.client.getLinkState(simulation._robot, 8, computeForwardKinematics=True)[4])
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_an_action_that_is_not_finite_is_refused(shared, value):
-    shared.reset(seed=0)
-    with pytest.raises(ValueError, match="received an action that is not finite"):
-        shared.step(np.array([0.0, value, 0.0, 0.0]))
-
-
 # -- an outcome depends on state and action alone ----------------------------------------------------------------------
 
 

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE
@@ -159,13 +158,6 @@ def test_a_policy_for_the_batched_model_fits_this_environment(env):
     model = SqueezeInsertEnv()
     for name in ("observation_space", "action_space", "state_space", "state_names", "horizon", "tolerance"):
         assert getattr(env, name) == getattr(model, name)
-
-
-@pytest.mark.filterwarnings("ignore:.*Box (action|observation) space")
-def test_the_checker_finds_nothing():
-    env = PandaSqueezeEnv(render_mode="rgb_array")
-    check_env(env, skip_render_check=True)
-    env.close()
 
 
 def test_closing_gives_the_worlds_of_the_physics_and_of_the_pictures_back():

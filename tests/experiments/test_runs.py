@@ -18,7 +18,7 @@ from unittest.mock import Mock
 import numpy as np
 import pandas as pd
 import pytest
-from small_problems import assert_same_parameters, parameters
+from small_problems import assert_same_parameters, complete_runs_here, parameters
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.callbacks import TDPGProgressBar
@@ -189,12 +189,7 @@ def test_a_run_killed_between_training_and_evaluation_does_not_train_again(tmp_p
 def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     # In this process: the workers would not see the small epochs of this module.
-    monkeypatch.setattr(
-        "sb3_tdpg.paper.lava_tables.complete_runs",
-        lambda tasks, *, n_eval_episodes, jobs: [
-            complete_run(*task, n_eval_episodes=n_eval_episodes) for task in tasks
-        ],
-    )
+    monkeypatch.setattr("sb3_tdpg.paper.lava_tables.complete_runs", complete_runs_here)
     monkeypatch.setattr("sb3_tdpg.paper.lava_tables.aggregate_seeds", partial(aggregate_seeds, n_bootstrap=10))
     tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
     summary = reproduce_lava(

@@ -13,7 +13,7 @@ from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS
 from sb3_tdpg.experiments.runs import Run
 from sb3_tdpg.features import TRVCnn
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.paper import ball, common
+from sb3_tdpg.paper import ball
 
 
 @pytest.fixture
@@ -26,12 +26,6 @@ def tiny(monkeypatch):
         property(lambda run: {**block(run), "n_episodes": 4, "mi_kwargs": {}, "mi_estimator": "logdet"}),
     )
     monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
-    for module, name in (
-        (ball, "aggregate_seeds"),
-        (common, "probability_of_improvement"),
-        (common, "paired_difference"),
-    ):
-        monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     monkeypatch.setattr(ball, "trv_knowledge", partial(ball.trv_knowledge, n_walls=4))
     monkeypatch.setattr(ball, "WALL_ROWS", ball.WALL_ROWS[:10])
     monkeypatch.setattr(ball, "SHIFTS", (*ball.SHIFTS[:10], *ball.SHIFTS[100:]))

@@ -1,7 +1,5 @@
 """Table II by the paper's own algorithm, in miniature; its rule of selection; and the callback that stops at a cost."""
 
-from functools import partial
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,7 +8,7 @@ from small_problems import complete_runs_here, tiny_tdpg
 from sb3_tdpg.cli import main
 from sb3_tdpg.experiments.runs import Run
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.paper import ball_paper, common
+from sb3_tdpg.paper import ball_paper
 
 
 @pytest.fixture
@@ -24,12 +22,6 @@ def tiny(monkeypatch):
     monkeypatch.setattr(
         ball_paper, "complete_runs", lambda tasks, **given: complete_runs_here(tasks, n_eval_episodes=2)
     )
-    for module, name in (
-        (ball_paper, "aggregate_seeds"),
-        (common, "probability_of_improvement"),
-        (common, "paired_difference"),
-    ):
-        monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """The comparison with baselines in miniature: what is trained, evaluated, timed and written."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -51,7 +50,6 @@ def tiny(monkeypatch):
     small = dict(n_envs=4, batch_size=20, n_epochs=1)
     monkeypatch.setattr(Run, "settings", property(lambda self: {**run(self), "n_episodes": 20}))
     monkeypatch.setattr(SB3Run, "settings", property(lambda self: {**sb3_run(self), **small}))
-    monkeypatch.setattr(baselines, "aggregate_seeds", partial(baselines.aggregate_seeds, n_bootstrap=10))
     monkeypatch.setattr(baselines, "complete_runs", complete_runs_here)
 
 

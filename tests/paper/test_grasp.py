@@ -1,7 +1,6 @@
 """The reproduction of grasping with tiny settings, from nothing to tables, figures and records."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -27,12 +26,6 @@ def tiny(monkeypatch):
     """Small epochs, in this process."""
     block = Run.settings.fget
     monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 8, "batch_size": 8}))
-    for module, name in (
-        (grasp, "aggregate_seeds"),
-        (common, "probability_of_improvement"),
-        (common, "paired_difference"),
-    ):
-        monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     monkeypatch.setattr(knowledge, "N_MUGS", 100)
     monkeypatch.setattr(knowledge, "FITTED_MUGS", 60)
     short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in knowledge.CRITICS.items()}

@@ -1,7 +1,5 @@
 """Where the bottleneck pays, in miniature: faults, methods, tables."""
 
-from functools import partial
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,7 +11,7 @@ from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.paper import common, pays
+from sb3_tdpg.paper import pays
 from sb3_tdpg.paper.pays import MEAN, PROBLEMS, TRAINING, WORST, with_summary
 
 
@@ -152,12 +150,6 @@ def test_from_nothing_to_tables_figure_and_records(tmp_path, monkeypatch):
     methods = pays.Problem.methods
     monkeypatch.setattr(pays.Problem, "methods", lambda problem: [m for m in methods(problem) if m.label in wanted])
     monkeypatch.setattr(pays, "complete_runs", lambda tasks, **given: complete_runs_here(tasks, n_eval_episodes=4))
-    for module, name in (
-        (pays, "aggregate_seeds"),
-        (common, "probability_of_improvement"),
-        (common, "paired_difference"),
-    ):
-        monkeypatch.setattr(module, name, partial(getattr(module, name), n_bootstrap=10))
     arguments = ["--n-seeds", "2", "--n-timesteps", "2000", "--publish", str(tmp_path / "docs")]
     assert main(["reproduce", "pays", "--out", str(tmp_path / "out"), *arguments]) == 0
     summary = (tmp_path / "out" / "summary.md").read_text()

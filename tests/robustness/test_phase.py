@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import assert_same_parameters, parameters, tiny_tdpg, toy_vec_env, train_epochs
+from small_problems import assert_same_parameters, parameters, rollouts, tiny_tdpg, toy_vec_env
 
 from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.robustness import Perturbation
@@ -20,13 +20,6 @@ def shifted(*offsets):
         return dict(offset=rng.choice(offsets, (n, 1)))
 
     return Perturbation("shifted", "vector", "", (1,) * 5, lambda y, value, episode, rng: y + episode["offset"], draw)
-
-
-def rollouts(model):
-    """Roll out an epoch without an update; the batch that the update would get."""
-    model.train = lambda: None
-    train_epochs(model, 1)
-    return model.rollout_buffer.episode_batch()
 
 
 def phase_of(model, nuisance, n_steps=24):
