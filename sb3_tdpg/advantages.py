@@ -22,15 +22,7 @@ N_CENTRES = 20
 N_SHARED_CENTRES = 100
 
 AdvantageFunction = Callable[..., th.Tensor]
-"""
-``(costs, states, alive, gamma, gae_lambda) -> advantages``, with the arguments
-
-- ``costs``, ``(T, N)``; ``states``, x_t, ``(T, N, X)``; and ``alive``, ``(T, N)``;
-- ``gamma``, the discount;
-- ``gae_lambda``: 1: the observed costs; 0: the value of the next state instead of all later costs;
-
-and the result ``(T, N)``.
-"""
+"""``(costs, states, alive, gamma, gae_lambda) -> advantages``, see the functions below."""
 
 
 def episode_mean_advantages(
@@ -39,7 +31,12 @@ def episode_mean_advantages(
     """
     Subtract the batch mean from the cost of the whole episode, as in the paper.
 
-    An :data:`AdvantageFunction` without a value function: ``states`` and ``gae_lambda`` are unused.
+    :param costs: ``(T, N)``
+    :param states: ``(T, N, X)``, unused
+    :param alive: ``(T, N)``
+    :param gamma: discount
+    :param gae_lambda: unused: there is no value function
+    :return: ``(T, N)``
     """
     episode_cost = cost_to_go(costs, gamma)[0]
     return (episode_cost - episode_cost.mean()).expand_as(costs)
@@ -59,6 +56,13 @@ def regression_advantages(
     predicted from the other half: no episode's own cost enters its baseline. A smaller ``gae_lambda`` replaces later
     costs by V, which has less noise but ignores the policy's memory: it credits the TRVs too little for what they carry
     from step to step.
+
+    :param costs: ``(T, N)``
+    :param states: x_t, ``(T, N, X)``
+    :param alive: ``(T, N)``
+    :param gamma: discount
+    :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
+    :return: ``(T, N)``
     """
     targets = cost_to_go(costs, gamma)
     fold = (th.arange(costs.shape[1], device=costs.device) % 2).expand_as(costs)
@@ -134,6 +138,13 @@ class ValueFunction(nn.Module):
 
         The values of the last epoch would be those of another policy. The new ones have seen the costs that they are
         compared with: a bias that is small where an epoch has many episodes.
+
+        :param costs: ``(T, N)``
+        :param states: x_t, ``(T, N, X)``
+        :param alive: ``(T, N)``
+        :param gamma: discount
+        :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
+        :return: ``(T, N)``
         """
         with th.no_grad():
             values = alive * self(states, gamma)
