@@ -189,3 +189,12 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def with_numbers(value: Any) -> Any:
+    """Replace ``"inf"``, ``"-inf"`` and ``"nan"``, which JSON cannot write as numbers, by numbers."""
+    if isinstance(value, dict):
+        return {key: with_numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [with_numbers(item) for item in value]
+    return float(value) if value in ("inf", "-inf", "nan") else value

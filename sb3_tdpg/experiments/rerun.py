@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sb3_tdpg.common.provenance import with_numbers
 from sb3_tdpg.common.trust import plain_name, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.experiments.runs import Run, SB3Run, complete_run
@@ -53,6 +54,8 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
         )
     if run.start is not None:
         say_what_is_trusted(run.start)
+    if left_out := [row["name"] for row in content["scenarios"] if "sensor" in row]:
+        print(f"left out, for a function changes their sensor: {', '.join(left_out)}")
     return complete_run(run, Path(out), scenarios, n_eval_episodes=n_eval_episodes, progress_bar=progress_bar)
 
 
@@ -62,15 +65,6 @@ def scenarios_of(rows: Sequence[Mapping[str, Any]]) -> list[Scenario]:
         Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"]), n_episodes=row.get("n_episodes"))
         for row in rows
     ]
-
-
-def with_numbers(value: Any) -> Any:
-    """Replace ``"inf"``, ``"-inf"`` and ``"nan"``, which JSON cannot write as numbers, by numbers."""
-    if isinstance(value, dict):
-        return {key: with_numbers(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [with_numbers(item) for item in value]
-    return float(value) if value in ("inf", "-inf", "nan") else value
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

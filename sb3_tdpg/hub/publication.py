@@ -15,12 +15,12 @@ import yaml
 from pandas.errors import EmptyDataError
 from stable_baselines3.common.monitor import get_monitor_files, load_results
 
-from sb3_tdpg.common.provenance import as_typed, jsonable
+from sb3_tdpg.common.provenance import as_typed, jsonable, with_numbers
 from sb3_tdpg.common.trust import PlainLoader, plain_name, refuse_links, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.evaluation.environments import load_statistics
-from sb3_tdpg.experiments.rerun import scenarios_of, with_numbers
+from sb3_tdpg.experiments.rerun import scenarios_of
 from sb3_tdpg.experiments.runs import read_progress
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env

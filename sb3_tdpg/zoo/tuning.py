@@ -22,9 +22,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
-from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
+from sb3_tdpg.common.provenance import check_same_config, with_numbers, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.experiments.rerun import with_numbers
 from sb3_tdpg.experiments.studies import open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager

@@ -41,7 +41,7 @@ def test_a_rerun_uses_the_recorded_settings_and_not_the_block(runs, tmp_path, mo
     assert TDPG.load(tmp_path / "again" / "model.zip", device="cpu").mi_coef == 0  # beta is inf, and not a text
 
 
-def test_a_run_of_ppo_is_repeated_without_the_rows_that_a_function_changes(tmp_path):
+def test_a_run_of_ppo_is_repeated_without_the_rows_that_a_function_changes(tmp_path, capsys):
     settings = dict(n_timesteps=100, n_steps=10, batch_size=10, n_envs=1)
     run = SB3Run("PPO", "Lava-v0", "Lava-v0", 0, overrides=settings, algo="ppo")
     rows = [Scenario("Training", "Lava-v0", n_episodes=3), Scenario("Noisy", "Lava-v0", sensor=noisy)]
@@ -50,6 +50,7 @@ def test_a_run_of_ppo_is_repeated_without_the_rows_that_a_function_changes(tmp_p
     first, second = (pd.read_csv(tmp_path / folder / "episodes.csv") for folder in ("run", "again"))
     assert first["scenario"].value_counts().to_dict() == {"Noisy": 4, "Training": 3}
     pd.testing.assert_frame_equal(second, first[first["scenario"] == "Training"])
+    assert "left out, for a function changes their sensor: Noisy\n" in capsys.readouterr().out
 
 
 def noisy(env):
