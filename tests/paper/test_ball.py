@@ -19,11 +19,12 @@ from sb3_tdpg.paper import ball
 @pytest.fixture
 def tiny(monkeypatch):
     """Small epochs and the fast renderer, in this process."""
+    small = dict(n_episodes=4, mi_kwargs={}, mi_estimator="logdet")
     block = Run.settings.fget
     monkeypatch.setattr(
         Run,
         "settings",
-        property(lambda run: {**block(run), "n_episodes": 4, "mi_kwargs": {}, "mi_estimator": "logdet"}),
+        property(lambda run: {**block(run), **(small if run.algo == "tdpg" else {})}),
     )
     monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
     monkeypatch.setattr(ball, "trv_knowledge", partial(ball.trv_knowledge, n_walls=4))
