@@ -87,7 +87,7 @@ EARLIER_ENCODER = dict(
 
 def methods(launch: str) -> tuple[Method, ...]:
     """List the methods; each differs from the user's one line in what its name says, and takes as many steps."""
-    env_kwargs = LAUNCHES[launch]
+    env_kwargs = dict(LAUNCHES[launch])  # a proxy cannot be sent to another process
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:
         return Method(label, BLOCK, renderer=renderer, overrides={**overrides, "env_kwargs": env_kwargs})
@@ -159,9 +159,7 @@ def reproduce_ball(
     everything = common.seed_by_seed(chosen[: len(WITHOUT_CONTROLS)], FIRST_SEED, n_seeds)
     # The last seeds: of the published runs only theirs draw the changes of the images in today's order.
     n_controls = min(n_seeds, N_CONTROLS)
-    everything += common.seed_by_seed(
-        chosen[len(WITHOUT_CONTROLS) :], FIRST_SEED + n_seeds - n_controls, n_controls
-    )
+    everything += common.seed_by_seed(chosen[len(WITHOUT_CONTROLS) :], FIRST_SEED + n_seeds - n_controls, n_controls)
 
     def rows_of(method: Method) -> list[Scenario]:
         return [*(row.with_kwargs(renderer=method.renderer) for row in rows), *others]

@@ -1,5 +1,6 @@
 """The reproduction of ball catching with tiny settings, from nothing to tables, figures and records."""
 
+import pickle
 from functools import partial
 
 import numpy as np
@@ -33,6 +34,7 @@ def tiny(monkeypatch):
     asked = []
 
     def complete_runs(tasks, *, n_eval_episodes, jobs):
+        pickle.dumps(tasks)  # as the processes that train need it
         asked.append([run.method for run, *_ in tasks])
         complete_runs_here(tasks, n_eval_episodes=n_eval_episodes)
 
