@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-baselines reproduce-public records wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-public records wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -107,9 +107,6 @@ reproduce-pays: $(STAMP) ## where the bottleneck pays: squeeze, cue, peg and lav
 
 reproduce-panda-squeeze: $(STAMP) ## policies of the batched model in PyBullet's Panda, under faults of the sensor
 	$(PY) -m sb3_tdpg reproduce panda-squeeze --n-seeds 5 --out results/panda_squeeze --publish docs/results/panda_squeeze
-
-reproduce-baselines: $(STAMP) ## PPO, RecurrentPPO, weight decay and VIB beside TDPG, on lava and grasping
-	$(PY) -m sb3_tdpg reproduce baselines --n-grasp-seeds 2 --out results/baselines --publish docs/results/baselines
 
 reproduce-public: $(STAMP) ## our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO on public tasks
 	$(PY) -m sb3_tdpg reproduce public --out results/public_tasks --publish docs/results/public_tasks

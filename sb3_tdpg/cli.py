@@ -75,7 +75,6 @@ EXPERIMENTS = {
     "pays": Experiment("paper.pays:reproduce_pays", "pays", flags=("controls",)),
     "pays-cue": Experiment("paper.pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
     "panda-squeeze": Experiment("paper.pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",)), ("controls",)),
-    "baselines": Experiment("paper.baselines:reproduce_baselines", "baselines", flags=("n_grasp_seeds",)),
     "public": Experiment("experiments.public.study:reproduce_public", "public_tasks"),
 }
 
@@ -83,7 +82,7 @@ EXPERIMENTS = {
 def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
     chosen = EXPERIMENTS[experiment]
     given = {name: value for name, value in options.items() if value is not None}
-    for name in ("controls", "n_paper_seeds", "n_grasp_seeds"):
+    for name in ("controls", "n_paper_seeds"):
         if name in given and name not in chosen.flags:
             flag = "--no-controls" if name == "controls" else f"--{name.replace('_', '-')}"
             others = " and ".join(other for other in EXPERIMENTS if name in EXPERIMENTS[other].flags)
@@ -304,11 +303,6 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--publish", type=Path, help="copy everything except the runs to this folder")
     add("--n-seeds", type=_positive, help="training seeds of each method (default: lava and ball 10, others 5)")
     add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: 3)")
-    add(
-        "--n-grasp-seeds",
-        type=int,
-        help="baselines: training seeds on grasping (0: none; default: 1); --n-seeds: on lava",
-    )
     text = "ball: train TDPG, PG and RecurrentPPO only; a later call without this flag adds the others"
     add("--no-controls", action="store_false", dest="controls", default=None, help=text)
 

@@ -64,6 +64,8 @@ BAD = {
     "out": ([*SWEEP, *TINY, "--out", "/proc/nowhere"], "No such file or directory: '/proc/nowhere'"),
     "grace period": ([*SWEEP, "--storage", "s.log", "--grace-period", "inf"], "grace_period=inf must be at least 2 s"),
     "seed": (["demo", "--seed", "-1", "--out", "out"], "seed=-1 must be at least 0"),
+    "option": (["reproduce", "grasp", "--n-paper-seeds", "2"], "--n-paper-seeds is for lava, not for grasp"),
+    "flag": (["reproduce", "grasp", "--no-controls"], "--no-controls is for ball and ball-varying and pays"),
     "folder": (["push", "nothing", "--repo-id", "a/b"], "nothing holds no training"),
 }
 

@@ -26,7 +26,6 @@ from sb3_tdpg.experiments.runs import complete_runs, read_progress
 from sb3_tdpg.features import TRVCnn
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
-from sb3_tdpg.paper.baselines import baselines_table, training_times
 from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
 from sb3_tdpg.paper.plots import diagnosis_bars, robustness_curves, sorted_walls
@@ -219,7 +218,7 @@ def reproduce_ball(
             distances, distance_rows, quantity="final distance between robot and ball in m", digits=3
         ),
         goals=common.goals_table(aggregate_seeds(table[table["model"].isin(list(GOALS))]), GOALS),
-        shifts=baselines_table(table, SHOWN, training_times(tasks)),
+        shifts=common.methods_table(table, SHOWN, common.training_times(tasks)),
         comparisons=common.comparisons_table(table, [("TDPG", label) for label in labels[1:]], KINDS),
         knowledge=common.write_knowledge(pd.DataFrame(knowledge), ["model"], out),
     )

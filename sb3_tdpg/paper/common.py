@@ -14,7 +14,7 @@ from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import fill_template, markdown_table
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import paired_difference, probability_of_improvement
+from sb3_tdpg.evaluation import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.experiments.runs import Run, SB3Run, Task
 
 RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
@@ -63,7 +63,6 @@ class Method:
     max_attempts: int = 1
     algo: str = "tdpg"  # or "ppo", "ppo_lstm"; the block is in hyperparams/<algo>.yml
     max_seeds: float = math.inf  # fewer for expensive methods
-    is_shown: bool = True  # a first stage need not be shown
 
     def run(self, env_id: str, seed: int, start: Path | None = None, **overrides: Any) -> Run:
         """Return the run of this method with one seed."""
@@ -110,6 +109,39 @@ def means_by_seed(records: pd.DataFrame, *columns: str) -> pd.DataFrame:
     """Return the means over the episodes of each method, seed and row; default: of the cost."""
     groups = records.groupby(["model", "train_seed", "scenario"], sort=False)
     return groups[list(columns or ["cost"])].mean().reset_index()
+
+
+def training_times(tasks: Iterable[Task]) -> pd.DataFrame:
+    """Return the total ``wall_s`` and ``cpu_s`` of the training of each run, including failed attempts."""
+    rows = []
+    for run, folder, _ in tasks:
+        times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
+        rows.append(dict(model=run.method, train_seed=run.seed, **pd.DataFrame(times)[["wall_s", "cpu_s"]].sum()))
+    return pd.DataFrame(rows)
+
+
+def methods_table(records: pd.DataFrame, rows: Sequence[str], times: pd.DataFrame) -> str:
+    """
+    Write a table with a row for each method: its cost in each scenario, and the median time of its trainings.
+
+    :param times: From :func:`training_times`.
+    """
+    shown = records[records["scenario"].isin(rows)]
+    aggregated = aggregate_seeds(shown).set_index(["model", "scenario"])
+    lowest = aggregated["iqm"].groupby("scenario").min()
+    medians = times.groupby("model")[["cpu_s", "wall_s"]].median().map("{:.0f}".format)
+    lines = []
+    for model in shown["model"].unique():
+        line = {"method": model, "seeds": str(aggregated.loc[(model, rows[0]), "n_seeds"])}
+        for row in rows:
+            cell = aggregated.loc[(model, row)]
+            text = f"{cell['iqm']:.2f}"
+            if cell["n_seeds"] > 1:
+                text += f" [{cell['low']:.2f}, {cell['high']:.2f}]"
+            line[row] = f"**{text}**" if cell["iqm"] == lowest[row] else text
+        line["CPU time (s)"], line["wall time (s)"] = medians.loc[model]
+        lines.append(line)
+    return markdown_table(lines, align="lr")
 
 
 def met(condition: bool) -> str:

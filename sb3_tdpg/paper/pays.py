@@ -19,7 +19,6 @@ from sb3_tdpg.experiments.blind import BlindVecEnv
 from sb3_tdpg.experiments.runs import SB3Run, complete_runs
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
-from sb3_tdpg.paper.baselines import training_times
 from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.presets import DEFAULTS
 from sb3_tdpg.robustness import PERTURBATIONS, PerturbedVecEnv
@@ -229,7 +228,7 @@ def reproduce_pays(
     sections, frames = {}, {}
     for name, of_problem in tasks.items():
         problem, records = PROBLEMS[name], common.read_records(of_problem)
-        table, times = with_summary(records), training_times(of_problem).groupby("model")["cpu_s"].median()
+        table, times = with_summary(records), common.training_times(of_problem).groupby("model")["cpu_s"].median()
         frames[name] = by_seed = common.means_by_seed(table)
         of_tdpg = aggregate_seeds(table[table["model"] == "TDPG"])
         others = [label for label in by_seed["model"].unique() if label != "TDPG"]
