@@ -5,21 +5,23 @@ Dimension key: N environments, n of them at a time.
 """
 
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_tdpg.robustness.registry import KEEP, NOTHING, Perturbation
-from sb3_tdpg.robustness.sensor import UNKNOWN_HORIZON, Sensor, blank
+from sb3_tdpg.robustness.sensor import UNKNOWN_HORIZON, Sensor, blank, parts_of
 
 CHUNK = 64  # images perturbed at once: bounds the memory
 _DOMAIN = 0x50E7  # any constant: a perturbation must not draw what the environment with the same seed draws
 
 Observations = Any
 """An array ``(n, *obs)``, or a dict of such."""
+
+Drawn = dict[str, np.ndarray]
+States = np.ndarray | None
 
 
 def each_part(function: Callable[..., Any], *observations: Observations) -> Observations:
@@ -30,38 +32,62 @@ def each_part(function: Callable[..., Any], *observations: Observations) -> Obse
     return function(*observations)
 
 
-class Members(ABC):
-    """
-    What N episodes have of a family of perturbations: a member each.
+def take(observations: Observations, which: Any) -> Observations:
+    """Return the observations of some episodes."""
+    return each_part(lambda part: part[which], observations)
 
-    It has its own random generator, so the random numbers of the environment do not change.
+
+def put(observations: Observations, which: Any, new: Observations) -> None:
+    """Replace the observations of some episodes in place."""
+    each_part(lambda part, values: part.__setitem__(which, values), observations, new)
+
+
+class Members:
+    """
+    What N episodes have of a family of perturbations: a member each. These ones change nothing.
+
+    They have their own random generator, so the random numbers of the environment do not change. A subclass draws what
+    an episode keeps, and calls :meth:`begin` at the end of its constructor.
 
     :param names: They are part of the seed: nested perturbations and parts must not draw the same numbers.
     :param seed: ``None``: random, until :meth:`reseed`.
+    :param children: Members that are seeded with these, and begin with them.
     """
 
     uses_states = False
     """Whether a call needs the true states."""
 
-    def __init__(self, *names: str, seed: int | None) -> None:
-        names = tuple(filter(None, names))
-        self._entropy = [_DOMAIN, *(zlib.crc32(name.encode()) for name in names), *([] if seed is None else [seed])]
+    def __init__(self, n: int, *names: str, seed: int | None = None, children: Iterable["Members"] = ()) -> None:
+        codes = [zlib.crc32(name.encode()) for name in names if name]
+        self._entropy = [_DOMAIN, *codes, *([] if seed is None else [seed])]
         self._rng = np.random.default_rng(None if seed is None else self._entropy)
+        self.n, self.children = n, list(children)
+        self._episode: Drawn = {}  # what was drawn for each episode, and what it goes on with: (N, ...)
 
     def reseed(self, env_seed: int) -> None:
         """Restart the random generator from the seeds of the environments and of the perturbation."""
         self._rng = np.random.default_rng([*self._entropy, env_seed])
+        for child in self.children:
+            child.reseed(env_seed)
 
-    def begin(self, which: np.ndarray) -> None:  # noqa: B027  (a function of the observations has nothing to draw)
+    def begin(self, which: np.ndarray) -> None:
         """Begin episodes in the environments with the indices ``which``, ``(n,)``: draw what is constant in them."""
+        for name, values in self._draw(len(which)).items():
+            if len(which) == self.n:
+                self._episode[name] = values
+            else:
+                self._episode[name][which] = values
+        for child in self.children:
+            child.begin(which)
 
     def repeat(self, n: int) -> "Members":
         """Give n episodes the member that the only one has, whose next observation is its first."""
+        self._episode = {name: values.repeat(n, axis=0) for name, values in self._episode.items()}
+        self.n, self.children = n, [child.repeat(n) for child in self.children]
         return self
 
-    @abstractmethod
     def __call__(
-        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
+        self, observations: Observations, which: np.ndarray | None = None, states: States = None
     ) -> Observations:
         """
         Perturb the next observations of some episodes: a new array.
@@ -70,11 +96,26 @@ class Members(ABC):
         :param which: indices of the episodes, ``(n,)``; default: all.
         :param states: x_t, ``(n, X)``
         """
+        if which is None:  # no copies
+            return self._show(observations, np.arange(self.n), states, self._episode)
+        episode = {name: values[which] for name, values in self._episode.items()}
+        shown = self._show(observations, which, states, episode)
+        for name, values in episode.items():
+            self._episode[name][which] = values
+        return shown
+
+    def _draw(self, n: int) -> Drawn:
+        """Draw what n episodes that begin keep: arrays ``(n, ...)``."""
+        return {}
+
+    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
+        """Perturb observations, as a call does, and change in place what was drawn for their episodes."""
+        return each_part(np.copy, observations)
 
 
 class Perturber(Members):
     """
-    Apply a perturbation to whole batches, and remember what was drawn for each episode.
+    Apply a perturbation to whole batches.
 
     The perturbation applies to the space. The scales of the components of a vector have the space's shape (by key in a
     ``Dict``); images and perturbations of the timing need none.
@@ -85,7 +126,7 @@ class Perturber(Members):
         perturbation: Perturbation,
         severity: int,
         space: spaces.Space,
-        n_envs: int,
+        n: int,
         *,
         seed: int | None = None,
         scale: Any = None,
@@ -93,69 +134,39 @@ class Perturber(Members):
         groups: Mapping[str, Sequence[Any]] | None = None,
         part: str = "",
     ) -> None:
-        super().__init__(perturbation.name, part, seed=seed)
-        self.perturbation = perturbation
-        self.value = perturbation.value(severity)
-        self.n_envs = n_envs
-        self._episode: dict[str, np.ndarray] = {}
+        self.perturbation, self.value = perturbation, perturbation.value(severity)
         self.parts: dict[str, Perturber] = {}  # of a Dict that has no timing in common
         if isinstance(space, spaces.Dict) and perturbation.kind != "any":
             for key, each in space.items():
                 if perturbation.applies_to(each, horizon):
-                    how: dict[str, Any] = dict(
-                        seed=seed, scale=(scale or {}).get(key), horizon=horizon, part=f"{part} {key}".strip()
-                    )
-                    self.parts[key] = Perturber(perturbation, severity, each, n_envs, **how)
-            return
-        self.sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, groups)
-        self._spaces = dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
-        self.begin(np.arange(n_envs))
+                    how: dict[str, Any] = dict(seed=seed, horizon=horizon, part=f"{part} {key}".strip())
+                    self.parts[key] = Perturber(perturbation, severity, each, n, scale=(scale or {}).get(key), **how)
+        super().__init__(n, perturbation.name, part, seed=seed, children=self.parts.values())
+        if not self.parts:
+            self.sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, groups)
+            self._spaces = parts_of(space)
+            self.begin(np.arange(n))
 
-    def reseed(self, env_seed: int) -> None:
-        super().reseed(env_seed)
-        for part in self.parts.values():
-            part.reseed(env_seed)
-
-    def begin(self, which: np.ndarray) -> None:
+    def _draw(self, n: int) -> Drawn:
         if self.parts:
-            for part in self.parts.values():
-                part.begin(which)
-            return
-        drawn: dict[str, np.ndarray] = {"t": np.zeros(len(which), dtype=np.int64)}
+            return {}
+        drawn: Drawn = {"t": np.zeros(n, dtype=np.int64)}
         if self.perturbation.timing:
             for key, space in self._spaces.items():
-                past = np.zeros((len(which), int(self.value) + 1, *(space.shape or ())), space.dtype)
+                past = np.zeros((n, int(self.value) + 1, *(space.shape or ())), space.dtype)
                 drawn |= {f"past {key}": past, f"shown {key}": past[:, 0].copy()}
         if self.perturbation.draw is not None:
-            drawn |= self.perturbation.draw(self._rng, len(which), self.value, self.sensor)
-        if len(which) == self.n_envs:
-            self._episode = drawn
-            return
-        for name, values in drawn.items():
-            self._episode[name][which] = values
+            drawn |= self.perturbation.draw(self._rng, n, self.value, self.sensor)
+        return drawn
 
-    def repeat(self, n: int) -> Members:
-        for part in self.parts.values():
-            part.repeat(n)
-        self._episode = {name: values.repeat(n, axis=0) for name, values in self._episode.items()}
-        self.n_envs = n
-        return self
-
-    def __call__(
-        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
-    ) -> Observations:
+    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
         if self.parts:
             return {**observations, **{key: part(observations[key], which) for key, part in self.parts.items()}}
-        index = slice(None) if which is None else which
-        episode = {name: values[index] for name, values in self._episode.items()}  # views of all, or copies
         perturbed = (self._in_time if self.perturbation.timing else self._in_units)(observations, episode)
         episode["t"] += 1
-        if which is not None:
-            for name, values in episode.items():
-                self._episode[name][which] = values
         return perturbed
 
-    def _in_time(self, observations: Observations, episode: dict[str, np.ndarray]) -> Observations:
+    def _in_time(self, observations: Observations, episode: Drawn) -> Observations:
         """Show other observations than the present ones, or nothing."""
         t = episode["t"]
         source = self.perturbation.apply(t, self.value, episode, self._rng)
@@ -178,7 +189,7 @@ class Perturber(Members):
             result[key] = seen
         return result if isinstance(observations, dict) else result[""]
 
-    def _in_units(self, observations: np.ndarray, episode: dict[str, np.ndarray]) -> np.ndarray:
+    def _in_units(self, observations: np.ndarray, episode: Drawn) -> np.ndarray:
         result = np.empty((len(observations), *self.sensor.space.shape), self.sensor.space.dtype)
         at_once = CHUNK if self.sensor.is_image else max(1, len(observations))
         for start in range(0, len(observations), at_once):

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.problem import attribute_of, horizon_of
-from sb3_tdpg.robustness.core import Members, Observations, Perturber, each_part
+from sb3_tdpg.robustness.core import Drawn, Members, Observations, Perturber, States, each_part, put, take
 from sb3_tdpg.robustness.registry import N_SEVERITIES, Perturbation, find_applicable
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.training import WITH_KEYWORDS
@@ -65,23 +65,8 @@ class Family:
                 raise ValueError("'redraw' needs 'env_kwargs', the scenes that draw something anew")
         if not isinstance(entries, (list, tuple)) or not entries:
             raise ValueError(f"{declared!r} is no perturbation: expected {EXPECTED}")
-        self._makers: list[Callable[..., Members] | None] = []
-        for entry in entries:
-            if entry is None:
-                self._makers.append(None)
-                continue
-            if not (isinstance(entry, (list, tuple)) and len(entry) in (2, 3)):
-                raise ValueError(f"{entry!r} is no entry of a list: expected None or (name, severity)")
-            name, value, *factor = entry
-            if callable(value):
-                self._makers.append(partial(FunctionMembers, value))
-            elif name == "env_kwargs":
-                redraw = declared.get("redraw", ()) if isinstance(declared, Mapping) else ()
-                self._makers.append(self._scenes(value, redraw))
-            else:
-                self._makers += self._named(name, value, *factor)
-                continue
-            self._kinds.add(False)
+        redraw = declared.get("redraw", ()) if isinstance(declared, Mapping) else ()
+        self._makers = [maker for entry in entries for maker in self._makers_of(entry, redraw)]
         if len(self._kinds) > 1:
             raise ValueError(f"{declared!r} perturbs actions and observations: wrap the environment once for each")
 
@@ -92,13 +77,24 @@ class Family:
 
     def members(self, n: int, seed: int | None = None) -> Members:
         """Draw a member for each of N episodes."""
-        one = len(self._makers) == 1
-        made = [make and make(n, seed=seed, part="" if one else str(i)) for i, make in enumerate(self._makers)]
-        return made[0] if one and made[0] is not None else OneOf(made, n, seed)
+        if len(self._makers) == 1:
+            return self._makers[0](n, seed=seed)
+        return OneOf([make(n, seed=seed, part=str(i)) for i, make in enumerate(self._makers)], n, seed)
 
     def one(self, seed: int, n: int) -> Members:
         """Give N episodes the same member, whose name is the seed."""
         return self.members(1, seed).repeat(n)
+
+    def _makers_of(self, entry: Any, redraw: Any) -> list[Callable[..., Members]]:
+        if entry is None:
+            return [lambda n, seed, part="": Members(n, part, seed=seed)]
+        if not (isinstance(entry, (list, tuple)) and len(entry) in (2, 3)):
+            raise ValueError(f"{entry!r} is no entry of a list: expected None or (name, severity)")
+        name, value, *factor = entry
+        if name != "env_kwargs" and not callable(value):
+            return self._named(name, value, *factor)
+        self._kinds.add(False)
+        return [partial(FunctionMembers, value) if callable(value) else self._scenes(value, redraw)]
 
     @cached_property
     def _measured_scale(self) -> Any:
@@ -163,43 +159,24 @@ def _has_keywords(name: Any) -> bool:
 
 
 class OneOf(Members):
-    """Each episode has one of several perturbations, at random; ``None`` among them: it is not perturbed."""
+    """Each episode has one of several perturbations, at random."""
 
-    def __init__(self, members: Sequence[Members | None], n: int, seed: int | None = None) -> None:
-        super().__init__("one of", seed=seed)
-        self.members = members
-        self.uses_states = any(each.uses_states for each in members if each)
-        self.choice = np.zeros(n, dtype=np.int64)
+    def __init__(self, members: Sequence[Members], n: int, seed: int | None = None) -> None:
+        super().__init__(n, "one of", seed=seed, children=members)
+        self.uses_states = any(each.uses_states for each in members)
         self.begin(np.arange(n))
 
-    def reseed(self, env_seed: int) -> None:
-        super().reseed(env_seed)
-        for each in filter(None, self.members):
-            each.reseed(env_seed)
+    def _draw(self, n: int) -> Drawn:
+        return dict(choice=self._rng.integers(len(self.children), size=n))
 
-    def begin(self, which: np.ndarray) -> None:
-        self.choice[which] = self._rng.integers(len(self.members), size=len(which))
-        for each in filter(None, self.members):
-            each.begin(which)
-
-    def __call__(
-        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
-    ) -> Observations:
-        which = np.arange(len(self.choice)) if which is None else which
+    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
         result = each_part(np.copy, observations)
-        for i, each in enumerate(self.members):
-            mine = np.flatnonzero(self.choice[which] == i)
-            if each and len(mine):
-                part = each_part(lambda x, mine=mine: x[mine], observations)
-                seen = each(part, which[mine], None if states is None else states[mine])
-                each_part(lambda x, new, mine=mine: x.__setitem__(mine, new), result, seen)
+        for i, each in enumerate(self.children):
+            mine = np.flatnonzero(episode["choice"] == i)
+            if len(mine):
+                of_mine = None if states is None else states[mine]
+                put(result, mine, each(take(observations, mine), which[mine], of_mine))
         return result
-
-    def repeat(self, n: int) -> Members:
-        self.choice = self.choice.repeat(n)
-        for each in filter(None, self.members):
-            each.repeat(n)
-        return self
 
 
 class FunctionMembers(Members):
@@ -208,12 +185,10 @@ class FunctionMembers(Members):
     def __init__(
         self, function: Callable[[Any, np.random.Generator], Any], n: int, *, seed: int | None = None, part: str = ""
     ) -> None:
-        super().__init__(part, seed=seed)
+        super().__init__(n, part, seed=seed)
         self.function = function
 
-    def __call__(
-        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
-    ) -> Observations:
+    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
         changed = self.function(observations, self._rng)
         if not isinstance(observations, dict):
             changed = np.asarray(changed)
@@ -240,37 +215,28 @@ class SceneMembers(Members):
     def __init__(
         self, scenes: Sequence[POMDPEnv], redraw: Sequence[int], n: int, *, seed: int | None = None, part: str = ""
     ) -> None:
-        super().__init__(part, seed=seed)
+        super().__init__(n, part, seed=seed)
         self.scenes, self.redraw = scenes, redraw
-        self.scene, self.redrawn = np.zeros(n, dtype=np.int64), np.zeros((n, len(redraw)))
         self.begin(np.arange(n))
 
-    def begin(self, which: np.ndarray) -> None:
-        self.scene[which] = self._rng.integers(len(self.scenes), size=len(which))
-        for scene, chosen in self._by_scene(which):
-            if self.redraw:
-                self.redrawn[which[chosen]] = scene.initial_state(len(chosen))[:, self.redraw]
+    def _draw(self, n: int) -> Drawn:
+        number, redrawn = self._rng.integers(len(self.scenes), size=n), np.zeros((n, len(self.redraw)))
+        for scene, chosen in self._by_scene(number) if self.redraw else ():
+            redrawn[chosen] = scene.initial_state(len(chosen))[:, self.redraw]
+        return dict(number=number, redrawn=redrawn)
 
-    def _by_scene(self, which: np.ndarray) -> list[tuple[POMDPEnv, np.ndarray]]:
-        """Group the places in ``which`` by scene."""
-        scene = self.scene[which]
+    def _by_scene(self, number: np.ndarray) -> list[tuple[POMDPEnv, np.ndarray]]:
+        """Group the places in ``number`` by scene."""
         for each in self.scenes:
             each.np_random = self._rng
-        return [(self.scenes[i], np.flatnonzero(scene == i)) for i in np.unique(scene)]
+        return [(self.scenes[i], np.flatnonzero(number == i)) for i in np.unique(number)]
 
-    def __call__(
-        self, observations: Observations, which: np.ndarray | None = None, states: np.ndarray | None = None
-    ) -> Observations:
+    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
         if states is None:
             raise ValueError("other scenes need the true state of each episode: wrap the VecEnv instead")
-        which = np.arange(len(self.scene)) if which is None else which
         seen = np.array(states, dtype=np.float64)
-        seen[:, self.redraw] = self.redrawn[which]
+        seen[:, self.redraw] = episode["redrawn"]
         changed = observations.copy()
-        for scene, chosen in self._by_scene(which):
+        for scene, chosen in self._by_scene(episode["number"]):
             changed[chosen] = scene.sensor(seen[chosen])
         return changed
-
-    def repeat(self, n: int) -> Members:
-        self.scene, self.redrawn = self.scene.repeat(n), self.redrawn.repeat(n, axis=0)
-        return self

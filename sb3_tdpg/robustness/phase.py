@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import update_learning_rate
 from torch.distributions import Distribution, kl_divergence
 
 from sb3_tdpg.callbacks import TDPGCallback
-from sb3_tdpg.robustness.core import each_part
+from sb3_tdpg.robustness.core import each_part, take
 from sb3_tdpg.robustness.families import Family
 from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, automatic
 
@@ -113,7 +113,7 @@ class NuisancePhase(TDPGCallback):
         members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
         states = batch.states.cpu().numpy()
         plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
-        steps = [members(each_part(lambda x, t=t: x[t], plain), None, states[t]) for t in range(len(states))]
+        steps = [members(take(plain, t), None, states[t]) for t in range(len(states))]
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
     def remove(self, batch: Any) -> float:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.robustness.core import each_part
-from sb3_tdpg.robustness.sensor import finite_range, kind_of
+from sb3_tdpg.robustness.sensor import finite_range, kind_of, parts_of
 
 N_OBSERVATIONS = 500
 MAX_STEPS = 200
@@ -78,11 +78,6 @@ def _observations(env: VecEnv, model: Any) -> list[Any]:
         if len(seen) > MAX_STEPS or (has_ended.all() and len(seen) * env.num_envs >= N_OBSERVATIONS):
             break
     return seen
-
-
-def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
-    """Return the parts of a ``Dict`` by key; any other space is its only part."""
-    return dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
 
 
 def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None) -> Any:

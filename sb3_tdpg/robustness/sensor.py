@@ -36,6 +36,11 @@ def kind_of(space: spaces.Space) -> str | None:
     return "image" if has_pixels and np.isfinite(finite_range(space)).all() else "vector"
 
 
+def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
+    """Return the parts of a ``Dict`` by key; any other space is its only part."""
+    return dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
+
+
 def blank(space: spaces.Space) -> np.ndarray:
     """Return the observation of a dead sensor: a black image, or 0 moved into the bounds."""
     if not isinstance(space, spaces.Box):

@@ -14,7 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_tdpg.robustness.core import each_part
+from sb3_tdpg.robustness.core import each_part, put, take
 from sb3_tdpg.robustness.families import Family
 
 Scale = float | np.ndarray | Mapping[str, Any] | None
@@ -67,7 +67,7 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
         if self._is_plant:
             return observation
         batch = each_part(lambda part: np.asarray(part)[None], observation)
-        return each_part(lambda part: part[0], self._perturber(batch))
+        return take(self._perturber(batch), 0)
 
 
 class PerturbedVecEnv(VecEnvWrapper):
@@ -142,14 +142,13 @@ class PerturbedVecEnv(VecEnvWrapper):
         last = each_part(np.copy, observations)
         reported = [i for i in ended if "terminal_observation" in infos[i]]
         for i in reported:
-            each_part(lambda x, new, i=i: x.__setitem__(i, new), last, infos[i]["terminal_observation"])
+            put(last, i, infos[i]["terminal_observation"])
         perturbed, infos = self._perturber(last, None, self._states(infos)), list(infos)
         for i in reported:
-            infos[i] = {**infos[i], "terminal_observation": each_part(lambda part, i=i: part[i].copy(), perturbed)}
+            infos[i] = {**infos[i], "terminal_observation": each_part(np.copy, take(perturbed, i))}
         self._perturber.begin(ended)
         states = self._states([self.reset_infos[i] for i in ended])
-        first = self._perturber(each_part(lambda part: part[ended], observations), ended, states)
-        each_part(lambda x, new: x.__setitem__(ended, new), perturbed, first)
+        put(perturbed, ended, self._perturber(take(observations, ended), ended, states))
         return perturbed, rewards, dones, infos
 
 

@@ -11,6 +11,7 @@ from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.robustness import Perturbation, PerturbedObservation, PerturbedVecEnv
+from sb3_tdpg.robustness.core import Members
 from sb3_tdpg.robustness.families import Family, FunctionMembers, OneOf, SceneMembers
 
 N = 40
@@ -147,7 +148,8 @@ def test_one_member_is_the_same_for_all_episodes(shows):
 
 def test_an_episode_that_begins_draws_its_family_anew():
     n = 400
-    members = OneOf([FunctionMembers(lambda y, rng: y + 1, n), FunctionMembers(lambda y, rng: y - 1, n), None], n, 0)
+    up, down = (FunctionMembers(lambda y, rng, by=by: y + by, n) for by in (1, -1))
+    members = OneOf([up, down, Members(n)], n, 0)
     plain, begun = np.zeros((n, 1), np.float32), np.arange(n) % 2 == 1
     before = members(plain)[:, 0]
     assert [(before == offset).mean() for offset in (1, -1, 0)] == pytest.approx([1 / 3] * 3, abs=0.06)
