@@ -19,8 +19,7 @@ from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
-from sb3_tdpg.robustness.families import Family
-from sb3_tdpg.robustness.nuisance import automatic
+from sb3_tdpg.robustness.nuisance import held_family
 
 FAMILY = "a member for each episode"
 
@@ -74,12 +73,7 @@ def certify_nuisance(
     rows: list[dict[str, Any]] = []
     with threads(1):
         for label, model in loaded.items():
-            env = scenario_env(training, model, n_episodes=1, n_envs=1)
-            if (wanted := automatic(declared, env.observation_space, held=True)) is None:
-                raise ValueError(f"nuisance={declared!r} is none for {model.observation_space}: name the perturbations")
-            family = Family(wanted, env)
-            if family.is_plant:
-                raise ValueError(f"nuisance={declared!r} changes the actions: a certificate is for those of the sensor")
+            family = held_family(declared, scenario_env(training, model, n_episodes=1, n_envs=1))
             print(f"{label}: {n_episodes:,} training episodes")
             episodes = TrainingEpisodes(model, training, n_budget_episodes=n_budget_episodes, **settings)
             shifts = [Shift(FAMILY, nuisance=partial(family.members, seed=seed))]

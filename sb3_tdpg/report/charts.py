@@ -23,6 +23,7 @@ from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import find
+from sb3_tdpg.robustness.sensor import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,14 +131,14 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     component = int(np.argmax(spread[key]))
     unperturbed = parts[key].reshape(len(observations), -1)[:, component]
     shown = {"shown": [key or component]}  # of all groups that can fail
+    sensor = Sensor(space, plan.scale, len(observations), shown)
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
     shades = import_matplotlib().colormaps["viridis_r"]
     dots = "." if len(unperturbed) <= 30 else ""
     for axes, name in zip(panels.flat, names, strict=False):
         for row in (row for row in rows if row.perturbation == name):
-            how: dict[str, Any] = dict(seed=plan.seed, scale=plan.scale, horizon=len(observations), groups=shown)
-            perturber = Perturber(find(name), row.severity, space, 1, **how)
+            perturber = Perturber(find(name), row.severity, sensor, 1, seed=plan.seed)
             seen = [_part(perturber(observation), key).ravel()[component] for observation in observations]
             color = shades(0.1 + 0.8 * row.severity / 5)
             axes.plot(seen, dots + "-", color=color, linewidth=0.9, markersize=4, label=f"severity {row.severity}")

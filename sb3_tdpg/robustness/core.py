@@ -5,14 +5,14 @@ Dimension key: N environments, n of them at a time.
 """
 
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_tdpg.robustness.registry import KEEP, NOTHING, Perturbation
-from sb3_tdpg.robustness.sensor import UNKNOWN_HORIZON, Sensor, blank, parts_of
+from sb3_tdpg.robustness.sensor import Sensor
 
 CHUNK = 64  # images perturbed at once: bounds the memory
 _DOMAIN = 0x50E7  # any constant: a perturbation must not draw what the environment with the same seed draws
@@ -114,37 +114,27 @@ class Members:
 
 
 class Perturber(Members):
-    """
-    Apply a perturbation to whole batches.
-
-    The perturbation applies to the space. The scales of the components of a vector have the space's shape (by key in a
-    ``Dict``); images and perturbations of the timing need none.
-    """
+    """Apply a perturbation to the batches of a sensor, to whose space it applies."""
 
     def __init__(
         self,
         perturbation: Perturbation,
         severity: int,
-        space: spaces.Space,
+        sensor: Sensor,
         n: int,
         *,
         seed: int | None = None,
-        scale: Any = None,
-        horizon: int | None = None,
-        groups: Mapping[str, Sequence[Any]] | None = None,
         part: str = "",
     ) -> None:
-        self.perturbation, self.value = perturbation, perturbation.value(severity)
+        self.perturbation, self.value, self.sensor = perturbation, perturbation.value(severity), sensor
         self.parts: dict[str, Perturber] = {}  # of a Dict that has no timing in common
-        if isinstance(space, spaces.Dict) and perturbation.kind != "any":
-            for key, each in space.items():
-                if perturbation.applies_to(each, horizon):
-                    how: dict[str, Any] = dict(seed=seed, horizon=horizon, part=f"{part} {key}".strip())
-                    self.parts[key] = Perturber(perturbation, severity, each, n, scale=(scale or {}).get(key), **how)
+        if isinstance(sensor.space, spaces.Dict) and perturbation.kind != "any":
+            for key, each in sensor.parts.items():
+                if perturbation.applies_to(each.space, each.horizon):
+                    name = f"{part} {key}".strip()
+                    self.parts[key] = Perturber(perturbation, severity, each, n, seed=seed, part=name)
         super().__init__(n, perturbation.name, part, seed=seed, children=self.parts.values())
         if not self.parts:
-            self.sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, groups)
-            self._spaces = parts_of(space)
             self.begin(np.arange(n))
 
     def _draw(self, n: int) -> Drawn:
@@ -152,8 +142,8 @@ class Perturber(Members):
             return {}
         drawn: Drawn = {"t": np.zeros(n, dtype=np.int64)}
         if self.perturbation.timing:
-            for key, space in self._spaces.items():
-                past = np.zeros((n, int(self.value) + 1, *(space.shape or ())), space.dtype)
+            for key, sensor in self.sensor.parts.items():
+                past = np.zeros((n, int(self.value) + 1, *(sensor.space.shape or ())), sensor.space.dtype)
                 drawn |= {f"past {key}": past, f"shown {key}": past[:, 0].copy()}
         if self.perturbation.draw is not None:
             drawn |= self.perturbation.draw(self._rng, n, self.value, self.sensor)
@@ -179,7 +169,7 @@ class Perturber(Members):
             seen = past[each, (t - age) % past.shape[1]]
             seen[of_all == KEEP] = shown[of_all == KEEP]
             shown[:] = seen
-            nothing = blank(self._spaces[key])
+            nothing = self.sensor.parts[key].blank
             seen[of_all == NOTHING] = nothing
             if source.ndim == 2:
                 for fails, group in zip((source == NOTHING).T, self.sensor.groups, strict=True):

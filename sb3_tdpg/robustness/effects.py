@@ -33,15 +33,15 @@ def noise_minmax(images: np.ndarray, std: float, episode: Episode, rng: np.rando
     return noisy_pixels(images, std, "minmax", rng)
 
 
-def draw_sign(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw a sign for each episode."""
-    return dict(sign=rng.choice(np.array([-1, 1], np.float32), (n, 1, 1, 1)))
+def draw_signs(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
+    """Draw a sign for each image, or each component of a vector, of each episode."""
+    return dict(sign=rng.choice([-1.0, 1.0], (n, *((1, 1, 1) if sensor.is_image else sensor.shape))))
 
 
-@perturbation("image", "offset, share of the range", (0.05, 0.10, 0.20, 0.30, 0.40), draw=draw_sign)
+@perturbation("image", "offset, share of the range", (0.05, 0.10, 0.20, 0.30, 0.40), draw=draw_signs)
 def brightness(images: np.ndarray, amount: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Make all images of an episode brighter or darker; on depth images, add an offset."""
-    return images + np.float32(amount) * episode["sign"]
+    return images + np.float32(amount) * episode["sign"].astype(np.float32)
 
 
 @perturbation("image", "factor", (0.8, 0.6, 0.45, 0.3, 0.15))
@@ -170,11 +170,6 @@ def camera_shift(images: np.ndarray, distance: float, episode: Episode, rng: np.
 def vector_noise(vectors: np.ndarray, std: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Add noise to every component."""
     return vectors + std * rng.standard_normal(vectors.shape)
-
-
-def draw_signs(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw a sign for each component of each episode."""
-    return dict(sign=rng.choice([-1.0, 1.0], (n, *sensor.shape)))
 
 
 @perturbation("vector", "offset, scales", (0.05, 0.1, 0.2, 0.4, 0.8), draw=draw_signs)

@@ -19,6 +19,7 @@ from sb3_tdpg.problem import attribute_of, horizon_of
 from sb3_tdpg.robustness.core import Drawn, Members, Observations, Perturber, States, each_part, put, take
 from sb3_tdpg.robustness.registry import N_SEVERITIES, Perturbation, find_applicable
 from sb3_tdpg.robustness.scale import default_scale
+from sb3_tdpg.robustness.sensor import UNKNOWN_HORIZON, Sensor
 from sb3_tdpg.robustness.training import WITH_KEYWORDS
 
 EXPECTED = (
@@ -77,6 +78,8 @@ class Family:
 
     def members(self, n: int, seed: int | None = None) -> Members:
         """Draw a member for each of N episodes."""
+        if seed is not None and (isinstance(seed, bool) or seed < 0):
+            raise ValueError(f"seed={seed} must be None or an integer of at least 0")
         if len(self._makers) == 1:
             return self._makers[0](n, seed=seed)
         return OneOf([make(n, seed=seed, part=str(i)) for i, make in enumerate(self._makers)], n, seed)
@@ -117,13 +120,13 @@ class Family:
         if len(others) > 1 or low > high:
             raise ValueError(f"{{{name!r}: {value!r}}} must be a severity, or the lowest and the highest one")
         self._kinds.add(found.kind == "action")
-        how: dict[str, Any] = dict(horizon=horizon, groups=attribute_of(env, "observation_groups"))
-        space = env.observation_space
+        space, scale = env.observation_space, None
         if found.kind == "action":
-            space, how["scale"] = env.action_space, np.ones(env.action_space.shape or ())
-        elif not found.timing and (scale := self._measured_scale) is not None:
-            how["scale"] = each_part(lambda part: factor * part, scale)
-        return [partial(Perturber, found, severity, space, **how) for severity in range(low, high + 1)]
+            space, scale = env.action_space, np.ones(env.action_space.shape or ())
+        elif not found.timing and self._measured_scale is not None:
+            scale = each_part(lambda part: factor * part, self._measured_scale)
+        sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, attribute_of(env, "observation_groups"))
+        return [partial(Perturber, found, severity, sensor) for severity in range(low, high + 1)]
 
     def _scenes(self, env_kwargs: Any, redraw: Any) -> Callable[..., Members]:
         inner: Any = attribute_of(self._env, "unwrapped")

@@ -65,8 +65,8 @@ def perturbation_gallery(
                 rows[name] = [_frames(made(scene_kwargs), seed)[-1] for scene_kwargs in scenes[name]]
                 continue
             perturbation = find_applicable(name, space, horizon)
-            how: dict[str, Any] = dict(seed=seed, horizon=len(frames))  # what fails has failed in the last frame
-            perturbers = [Perturber(perturbation, severity, space, 1, **how) for severity in range(1, 6)]
+            sensor = Sensor(space, horizon=len(frames))  # what fails has failed in the last frame
+            perturbers = [Perturber(perturbation, severity, sensor, 1, seed=seed) for severity in range(1, 6)]
             rows[name] = [[perturber(frame[None]) for frame in frames][-1][0] for perturber in perturbers]
     return _draw(frames[-1], rows, Sensor(space))
 

@@ -2,10 +2,13 @@
 
 from typing import Any
 
+import gymnasium as gym
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdpg.robustness.families import Family
+from sb3_tdpg.robustness.sensor import parts_of
 from sb3_tdpg.robustness.wrappers import PerturbedVecEnv
 
 
@@ -32,6 +35,21 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
         raise ValueError(f"nuisance={declared!r}: {e}") from e
 
 
+def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:
+    """
+    Return the family of a declared nuisance of the sensor; in that of ``"auto"`` an episode keeps its changes.
+
+    :raises ValueError: if there is none, or it changes the actions.
+    """
+    found = automatic(declared, env.observation_space, held=True)
+    if found is None:
+        raise ValueError(f"nuisance={declared!r} is none for {env.observation_space}: name the perturbations")
+    family = Family(found, env)
+    if family.is_plant:
+        raise ValueError(f"nuisance={declared!r} changes the actions: name one of the sensor")
+    return family
+
+
 def automatic(declared: Any, space: spaces.Space, **keywords: Any) -> Any:
     """
     Replace ``"auto"``: random changes for images of bytes, ``None`` for vectors and depth images.
@@ -40,6 +58,5 @@ def automatic(declared: Any, space: spaces.Space, **keywords: Any) -> Any:
     """
     if not (isinstance(declared, str) and declared == "auto"):
         return declared
-    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-    has_images = any(isinstance(part, spaces.Box) and is_image_space(part) for part in parts)
+    has_images = any(isinstance(part, spaces.Box) and is_image_space(part) for part in parts_of(space).values())
     return {"images": keywords} if has_images else None

@@ -17,7 +17,7 @@ from torch.distributions import Distribution, kl_divergence
 from sb3_tdpg.callbacks import TDPGCallback
 from sb3_tdpg.robustness.core import each_part, take
 from sb3_tdpg.robustness.families import Family
-from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, automatic
+from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, held_family
 
 BATCH_STEPS = 400  # of a gradient step: 16 episodes of 25 steps
 
@@ -77,13 +77,8 @@ class NuisancePhase(TDPGCallback):
         assert env is not None
         if isinstance(env, NuisanceVecEnv):
             raise ValueError("NuisancePhase needs plain rollouts: give TDPG nuisance=None")
-        declared = automatic(self.nuisance, env.observation_space, held=True)
-        if declared is None:
-            raise ValueError(f"nuisance={self.nuisance!r} is none for {env.observation_space}: name the perturbations")
-        self.family = Family(declared, env)
+        self.family = held_family(self.nuisance, env)
         self.tdpg._last_obs = None  # the environment is reset once more: a scale may have been measured in it
-        if self.family.is_plant:
-            raise ValueError(f"nuisance={self.nuisance!r} changes the actions: the phase needs one of the sensor")
         self.optimizer = th.optim.Adam(self.tdpg.policy.parameters(), lr=1e-3, fused=True)
 
     def _on_training_start(self) -> None:

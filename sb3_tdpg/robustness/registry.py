@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from gymnasium import spaces
 
-from sb3_tdpg.robustness.sensor import Sensor, kind_of
+from sb3_tdpg.robustness.sensor import Sensor
 
 N_SEVERITIES = 5
 KINDS = ("image", "vector", "any", "action")
@@ -94,13 +94,12 @@ class Perturbation:
         if isinstance(space, spaces.Dict):
             objections = [self.objection(part, horizon) for part in space.values()]
             return objections[0] if objections and all(objections) else None
-        kind = kind_of(space)
-        if kind is None or not isinstance(space, spaces.Box):
+        if not isinstance(space, spaces.Box):
             return f"the observation space {space} is not a Box: use gymnasium.wrappers.FlattenObservation first"
-        if self.kind not in (kind, "any"):
+        sensor = Sensor(space)
+        if self.kind != "any" and (self.kind == "image") != sensor.is_image:
             needs = "images: a Box of three dimensions with finite bounds" if self.kind == "image" else "vectors"
             return f"it is for {needs}, and the observation space is {space}"
-        sensor = Sensor(space)
         if self.channels is not None and sensor.shape[0] not in self.channels:
             wanted = " or ".join(str(channels) for channels in self.channels)
             return f"it needs images of {wanted} channels, and these have {sensor.shape[0]} (shape {space.shape})"

@@ -5,7 +5,8 @@ Dimension key: E environments; scales have the shape of the observation space.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -39,45 +40,43 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> Any:
     generators = copy.deepcopy(vec_env.get_attr("np_random"))
     try:
         vec_env.seed(_SEED)
-        seen = _observations(vec_env, model)
-        return each_part(lambda *steps: np.concatenate(steps, dtype=np.float64).std(axis=0), *seen)
+        seen = _observations(vec_env, model or SimpleNamespace(predict=_untrained(vec_env)))
     finally:
         for i, generator in enumerate(generators):
             vec_env.set_attr("np_random", generator, indices=i)
         inner._seeds, inner._options = waiting_seeds, waiting_options
+    scale = each_part(lambda *steps: np.concatenate(steps, dtype=np.float64).std(axis=0), *seen)
+    return {key: scale[key] for key in _vectors(vec_env.observation_space)} if isinstance(scale, dict) else scale
 
 
-class _Untrained:
-    """An untrained policy: it draws standard Gaussian actions, or samples a space that is not a ``Box``."""
+def _vectors(space: spaces.Space) -> dict[str, spaces.Space]:
+    return {key: part for key, part in parts_of(space).items() if kind_of(part) == "vector"}
 
-    def __init__(self, action_space: spaces.Space) -> None:
-        self.rng, self.space = np.random.default_rng(_SEED), copy.deepcopy(action_space)
-        self.space.seed(_SEED)
 
-    def predict(self, observations: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, None]:
-        first = next(iter(observations.values())) if isinstance(observations, dict) else observations
-        n, space = len(first), self.space
+def _untrained(env: VecEnv) -> Callable[..., tuple[np.ndarray, None]]:
+    """Return a ``predict`` of clipped standard Gaussian actions, or of samples from a space that is not a ``Box``."""
+    n, rng, space = env.num_envs, np.random.default_rng(_SEED), copy.deepcopy(env.action_space)
+    space.seed(_SEED)
+
+    def predict(*args: Any, **kwargs: Any) -> tuple[np.ndarray, None]:
         if not isinstance(space, spaces.Box):
             return np.stack([space.sample() for _ in range(n)]), None
-        actions = self.rng.standard_normal((n, *space.shape))
-        return np.clip(actions, space.low, space.high).astype(space.dtype), None
+        return np.clip(rng.standard_normal((n, *space.shape)), space.low, space.high).astype(space.dtype), None
+
+    return predict
 
 
 def _observations(env: VecEnv, model: Any) -> list[Any]:
-    """Return the observations of each step of the rollout, ``(E, *obs)``; of a ``Dict`` the vectors."""
-    normalize = None if model is None else model.get_vec_normalize_env()
-    observe = None if normalize is None else normalize.normalize_obs
-    vectors = [key for key, part in parts_of(env.observation_space).items() if kind_of(part) == "vector"]
+    """Return the observations of each step of the rollout, ``(E, *obs)``."""
+    normalize = model.get_vec_normalize_env() if hasattr(model, "get_vec_normalize_env") else None
     seen: list[Any] = []
     has_ended = np.zeros(env.num_envs, dtype=bool)
-    for step in rollout(model or _Untrained(env.action_space), env, observe=observe):
-        for observations in [step.next_observations] if seen else [step.observations, step.next_observations]:
-            is_dict = isinstance(observations, dict)
-            seen.append({key: observations[key] for key in vectors} if is_dict else observations)
+    for step in rollout(model, env, observe=normalize and normalize.normalize_obs):
+        seen.append(step.observations)
         has_ended |= step.dones
-        if len(seen) > MAX_STEPS or (has_ended.all() and len(seen) * env.num_envs >= N_OBSERVATIONS):
+        if len(seen) >= MAX_STEPS or (has_ended.all() and (len(seen) + 1) * env.num_envs >= N_OBSERVATIONS):
             break
-    return seen
+    return [*seen, step.next_observations]
 
 
 def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None) -> Any:
@@ -89,7 +88,7 @@ def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None)
 
     :param scale: Given by the user and used instead: a number, or one for each component; for a ``Dict`` also by key.
     """
-    vectors = {key: part for key, part in parts_of(space).items() if kind_of(part) == "vector"}
+    vectors = _vectors(space)
     if not vectors:
         if scale is not None:
             raise ValueError(f"scale={scale} is for vectors, and the observation space is {space}: leave it out")

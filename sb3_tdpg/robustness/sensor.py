@@ -41,13 +41,6 @@ def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
     return dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
 
 
-def blank(space: spaces.Space) -> np.ndarray:
-    """Return the observation of a dead sensor: a black image, or 0 moved into the bounds."""
-    if not isinstance(space, spaces.Box):
-        return np.zeros(space.shape or (), space.dtype)
-    return space.low if kind_of(space) == "image" else np.clip(np.zeros_like(space.low), space.low, space.high)
-
-
 Group = Mapping[str, np.ndarray]
 """Components of the flattened observation that fail together, by the key of a ``Dict``; "" if there is no ``Dict``."""
 
@@ -72,10 +65,11 @@ def groups_of(space: spaces.Space, named: Mapping[str, Sequence[Any]] | None = N
         if outside := [i for indices in named.values() for i in indices if i not in components]:
             raise ValueError(f"observation_groups={named} has {outside}: use indices from 0 to {len(components) - 1}")
         return [{"": np.asarray(indices)} for indices in named.values()]
-    if kind_of(space) == "image" and len(space.shape) > 2:
-        channels = np.moveaxis(components.reshape(space.shape), -1 if Sensor(space).channels_last else -3, 0)
-        return [{"": channel.ravel()} for channel in channels]
-    return [{"": components}] if kind_of(space) == "image" else [{"": components[[i]]} for i in components]
+    sensor = Sensor(space)
+    if not sensor.is_image:
+        return [{"": components[[i]]} for i in components]
+    channels = np.moveaxis(components.reshape(-1, *sensor.frame), -1 if sensor.channels_last else 1, 0)
+    return [{"": channel.ravel()} for channel in channels]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +79,21 @@ class Sensor:
 
     An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
     becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed. A stack of
-    images becomes ``(N F, C, H, W)``. Perturbations of the timing need no units, and the space may be a ``Dict``.
+    images becomes ``(N F, C, H, W)``. Perturbations of the timing need no units.
     """
 
-    space: Any  # a Box, or a Dict
-    scale: np.ndarray | None = None  # of the components of a vector, in the space's shape; see `observation_scale`
+    space: Any
+    scale: Any = None  # of the components of a vector, in the space's shape (in a Dict by key); see `observation_scale`
     horizon: int = UNKNOWN_HORIZON
     named_groups: Mapping[str, Sequence[Any]] | None = None
+
+    @cached_property
+    def parts(self) -> dict[str, "Sensor"]:
+        """The sensor of each part of a ``Dict`` by key; any other space is its only part."""
+        if not isinstance(self.space, spaces.Dict):
+            return {"": self}
+        scale = self.scale or {}
+        return {key: Sensor(part, scale.get(key), self.horizon) for key, part in self.space.items()}
 
     @cached_property
     def groups(self) -> list[Group]:
@@ -99,48 +101,57 @@ class Sensor:
         return groups_of(self.space, self.named_groups)
 
     @property
+    def blank(self) -> np.ndarray:
+        """The observation of a dead sensor: a black image, or 0 moved into the bounds."""
+        if not isinstance(self.space, spaces.Box):
+            return np.zeros(self.space.shape or (), self.space.dtype)
+        low, high = self.space.low, self.space.high
+        return low if self.is_image else np.clip(np.zeros_like(low), low, high)
+
+    @cached_property
+    def is_image(self) -> bool:
+        """Whether there are pixels."""
+        return kind_of(self.space) == "image"
+
+    @property
+    def frame(self) -> tuple[int, ...]:
+        """Shape of one image in the order of the space, with one channel if there are only rows and columns."""
+        shape = self.space.shape[-3:]
+        return (1, *shape) if len(shape) == 2 else shape
+
+    @property
     def n_frames(self) -> int:
         """Number of stacked images F; 1 of a vector."""
         return self.space.shape[0] if self.is_image and len(self.space.shape) == 4 else 1
 
     @property
-    def is_image(self) -> bool:
-        """Whether there are pixels."""
-        return kind_of(self.space) == "image"
+    def channels_last(self) -> bool:
+        """Whether the last axis holds the channels: as for Stable-Baselines3, unless the first one is the shortest."""
+        return int(np.argmin(self.frame)) != 0
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """``(C, H, W)`` or ``(D,)``, whatever the order in the space."""
+        if not self.is_image:
+            return (int(np.prod(self.space.shape)),)
+        return (self.frame[2], *self.frame[:2]) if self.channels_last else self.frame
 
     @property
     def is_depth(self) -> bool:
         """Whether a pixel is one float: a distance, not a colour."""
         return self.is_image and np.issubdtype(self.space.dtype, np.floating) and self.shape[0] == 1
 
-    @property
-    def channels_last(self) -> bool:
-        """Whether the last axis holds the channels: as for Stable-Baselines3, unless the first one is the shortest."""
-        shape = self.space.shape[-3:]
-        return len(shape) == 3 and int(np.argmin(shape)) != 0
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """``(C, H, W)`` or ``(D,)``, whatever the order in the space."""
-        shape = self.space.shape
-        if not self.is_image:
-            return (int(np.prod(shape)),)
-        shape = shape[-3:]
-        channels = (1,) if len(shape) == 2 else ()
-        return (shape[2], *shape[:2]) if self.channels_last else (*channels, *shape)
-
     def to_units(self, observations: np.ndarray) -> np.ndarray:
         """Convert ``(N, *obs)`` to a new array ``(N, C, H, W)`` or ``(N, D)``."""
         if not self.is_image:
-            assert self.scale is not None
             scale = np.where(self.scale > 0, self.scale, 1.0)
             return (observations / scale).reshape(len(observations), -1)
         low, high = float(self.space.low.min()), float(self.space.high.max())
         units = np.multiply(observations, np.float32(1 / (high - low)), dtype=np.float32)
         if low != 0:
             units -= np.float32(low / (high - low))
-        units = units.reshape(-1, *units.shape[-3:]) if self.n_frames > 1 else units
-        return np.moveaxis(units, 3, 1) if self.channels_last else units.reshape(len(units), *self.shape)
+        units = units.reshape(-1, *self.frame)
+        return np.moveaxis(units, 3, 1) if self.channels_last else units
 
     def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """Convert back to the order, bounds and type of the space; components without a scale stay unperturbed."""
@@ -152,7 +163,6 @@ class Sensor:
             lowest, highest = float(np.min(low)), float(np.max(high))
             values = lowest + np.float32(highest - lowest) * units
         else:
-            assert self.scale is not None
             values = np.where(self.scale > 0, units.reshape(observations.shape) * self.scale, observations)
         # Clip before a cast to integers, which wraps around, but after a cast to floats, which rounds.
         if np.issubdtype(self.space.dtype, np.integer):

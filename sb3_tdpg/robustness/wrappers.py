@@ -46,7 +46,7 @@ class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
         gym.ObservationWrapper.__init__(self, env)
         family = Family(perturbation, env, severity, scale)
-        self._is_plant, self._perturber = family.is_plant, family.members(1, _checked(seed))
+        self._is_plant, self._perturber = family.is_plant, family.members(1, seed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and perturb its first observation."""
@@ -103,8 +103,7 @@ class PerturbedVecEnv(VecEnvWrapper):
         if isinstance(venv, VecNormalize) and venv.norm_obs:
             raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)
-        family = Family(perturbation, venv, severity, scale)
-        self._seed = _checked(seed)
+        family, self._seed = Family(perturbation, venv, severity, scale), seed
         self._is_plant, self._perturber = family.is_plant, family.members(venv.num_envs, seed)
         self.unperturbed: Any = None
         """The observations of the last reset or step, as they came."""
@@ -150,9 +149,3 @@ class PerturbedVecEnv(VecEnvWrapper):
         states = self._states([self.reset_infos[i] for i in ended])
         put(perturbed, ended, self._perturber(take(observations, ended), ended, states))
         return perturbed, rewards, dones, infos
-
-
-def _checked(seed: Any) -> int | None:
-    if seed is not None and (isinstance(seed, bool) or seed < 0):
-        raise ValueError(f"seed={seed} must be None or an integer of at least 0")
-    return seed

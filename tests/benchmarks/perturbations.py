@@ -6,6 +6,7 @@ import time
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.robustness import PERTURBATIONS, applicable
 from sb3_tdpg.robustness.core import Perturber
+from sb3_tdpg.robustness.sensor import Sensor
 
 REPEATS = 5
 BATCHES = {"BallCatch-v0": (200, dict(renderer="fast"), (3, 64, 64)), "PandaGrasp-v0": (50, {}, (1, 128, 128))}
@@ -24,7 +25,7 @@ def microseconds(function, n):
 def costs(name, images, space):
     """CPU time at the severities 1, 3 and 5."""
     n = len(images)
-    perturbers = [Perturber(PERTURBATIONS[name], severity, space, n, seed=0) for severity in (1, 3, 5)]
+    perturbers = [Perturber(PERTURBATIONS[name], severity, Sensor(space), n, seed=0) for severity in (1, 3, 5)]
     return [microseconds(functools.partial(perturber, images), n) for perturber in perturbers]
 
 

@@ -9,6 +9,7 @@ from small_problems import toy_vec_env
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.robustness.core import Perturber
+from sb3_tdpg.robustness.sensor import Sensor
 from sb3_tdpg.robustness.training import PATTERN_GROUP, PATTERN_SIZES, ImageMixture, images
 
 IMAGES = spaces.Box(0, 255, (3, 64, 64), np.uint8)
@@ -20,10 +21,8 @@ def of_the_ball(n=6):
 
 
 def changed(seen, **strengths):
-    members = Perturber(
-        images(**{**OFF, **strengths}), 1, spaces.Box(0, 255, seen.shape[1:], np.uint8), len(seen), seed=0
-    )
-    return members(seen).astype(float)
+    sensor = Sensor(spaces.Box(0, 255, seen.shape[1:], np.uint8))
+    return Perturber(images(**{**OFF, **strengths}), 1, sensor, len(seen), seed=0)(seen).astype(float)
 
 
 def test_with_every_strength_at_zero_the_images_are_what_they_were():
@@ -44,7 +43,7 @@ def test_every_perturbation_changes_equal_images_in_different_ways(strength):
 
 @pytest.mark.parametrize("held", [True, False])
 def test_an_episode_keeps_its_changes_only_if_they_are_held(held):
-    members = Perturber(images(held=held, noise=0.0), 1, IMAGES, 4, seed=0)
+    members = Perturber(images(held=held, noise=0.0), 1, Sensor(IMAGES), 4, seed=0)
     grey = np.full((4, *IMAGES.shape), 120, np.uint8)
     first, second = members(grey), members(grey)
     assert [(first[i] == second[i]).all() for i in range(4)] == [held] * 4
