@@ -180,11 +180,9 @@ def certificate(
     """
     Bound the expected cost under a shift, from costs in training (Equation 6, corrected).
 
-    :param costs: Costs of independent episodes in training, ``(N,)``.
+    The costs are those of independent episodes; see :func:`cost_distribution` and :func:`worst_mean`.
+
     :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.
-    :param cost_bound: Upper bound on the episode cost.
-    :param confidence: Confidence of the bound; ``None``: an estimate without allowance for the sampling error.
-    :param beta: Use this value instead of the best one.
     """
     return worst_mean(cost_distribution(costs, cost_bound, confidence), kl, beta)
 

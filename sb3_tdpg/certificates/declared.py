@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.models import load_models, write_summary
+from sb3_tdpg.certificates.models import compare, load_models, write_summary
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, wall_cost
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -51,12 +49,9 @@ def certify_nuisance(
     :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
         the cost of standing at the wall.
     :param env_kwargs: Keywords of the training environment.
-    :param n_members: Number of random members.
-    :param n_episodes: Recorded training episodes.
-    :param n_budget_episodes: Recorded episodes whose observations are changed, for each member.
+    :param n_episodes: Recorded training episodes; ``n_budget_episodes`` of them are changed by each member.
     :param n_test_episodes: Episodes under each member, to measure the cost.
     :param confidence: Confidence of each certificate.
-    :param seed: Seed of the episodes and of the members.
     :return: the summary, as Markdown
     :raises ValueError: if an argument is wrong; no episode has been run by then.
     """
@@ -79,13 +74,8 @@ def certify_nuisance(
             shifts = [Shift(FAMILY, nuisance=partial(family.members, seed=seed))]
             shifts += [Shift(f"member {i}", nuisance=partial(family.one, seed + i)) for i in range(n_members)]
             for i, shift in enumerate(tqdm(shifts, desc=label)):
-                certified = episodes.certify(shift)
-                costs, measured = episodes.measure(shift, n_test_episodes, seed=seed + 1 + i)
-                error = costs.std(ddof=1) / math.sqrt(len(costs))
-                row = dict(model=label, shift=shift.name, training_cost=episodes.costs.mean(), cost=costs.mean())
-                row.update(standard_error=error, clipped_cost=np.minimum(costs, cost_bound).mean())
-                row.update(bound=certified.bound, kl=certified.budget.kl, exceedance=certified.budget.exceedance)
-                rows.append(row | dict(measured_kl=measured))
+                row = compare(episodes, shift, n_test_episodes, seed=seed + 1 + i)
+                rows.append(dict(model=label, shift=shift.name, training_cost=episodes.costs.mean(), **row))
     records = pd.DataFrame(rows)
     write_frame_atomically(records, out / "nuisance.csv")
     settings.update(nuisance=str(declared), n_members=n_members, n_budget_episodes=n_budget_episodes)

@@ -1,4 +1,4 @@
-"""What all certificates share: the policies, and the summary."""
+"""What all certificates share: the policies, the comparison of bound and cost, and the summary."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import how_made, provenance, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
@@ -30,6 +33,19 @@ def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
         models[next(label for label in labels if label not in models)] = model
     check_models_fit(models, [training])
     return models
+
+
+def compare(
+    episodes: TrainingEpisodes, shift: Shift, n_test: int, *, seed: int, n_budget: int | None = None
+) -> dict[str, Any]:
+    """Certify one shift, and measure the cost under it."""
+    certified = episodes.certify(shift, n_budget)
+    costs, measured_kl = episodes.measure(shift, n_test, seed=seed)
+    row: dict[str, Any] = dict(cost=costs.mean(), standard_error=costs.std(ddof=1) / math.sqrt(len(costs)))
+    row["clipped_cost"] = np.minimum(costs, certified.trivial).mean()
+    row.update((name, getattr(certified, name)) for name in ("bound", "through_trvs", "through_sensor"))
+    row.update(kl=certified.budget.kl, exceedance=certified.budget.exceedance)
+    return dict(**row, measured_kl=measured_kl, sensor_kl=certified.sensor_kl)
 
 
 def write_summary(out: Path, sections: Sequence[str], models: Sequence[Path], settings: Mapping[str, Any]) -> str:

@@ -8,11 +8,10 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.models import load_models, write_summary
+from sb3_tdpg.certificates.models import compare, load_models, write_summary
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts, wall_cost
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically
@@ -91,7 +90,8 @@ def certify_lava(
             paper += [dict(model=label, **_paper_row(episodes, row, 10 * n_test_episodes)) for row in rows]
             few = min(N_RANDOM_BUDGET_EPISODES, n_budget)
             for i, shift in enumerate(tqdm(shifts, desc=f"{label}: random shifts", disable=not shifts)):
-                random.append(dict(model=label, **_row(episodes, shift, few, n_test_episodes, seed + 2 + i)))
+                row = _row(episodes, shift, n_test_episodes, seed=seed + 2 + i, n_budget=few)
+                random.append(dict(model=label, **row))
             theorem += [dict(model=label, **_theorem_row(episodes, inverse)) for inverse in PAPER_INVERSE_BETAS]
 
     frames = dict(paper=pd.DataFrame(paper), theorem=pd.DataFrame(theorem))
@@ -104,21 +104,14 @@ def certify_lava(
     return write_summary(out, _sections(frames, confidence, bound), models, settings)
 
 
-def _row(episodes: TrainingEpisodes, shift: Shift, n_budget: int | None, n_test: int, test_seed: int) -> dict[str, Any]:
-    """Certify one shift, and measure the cost under it."""
-    certified = episodes.certify(shift, n_budget)
-    costs, measured_kl = episodes.measure(shift, n_test, seed=test_seed)
-    row = {key: shift.env_kwargs.get(key) for key in ("sensor_noise_std", "sensor_bias", "start_beta")}
-    row.update(cost=costs.mean(), standard_error=costs.std(ddof=1) / math.sqrt(len(costs)))
-    row["clipped_cost"] = np.minimum(costs, certified.trivial).mean()
-    row.update((name, getattr(certified, name)) for name in ("bound", "through_trvs", "through_sensor"))
-    row.update(kl=certified.budget.kl, exceedance=certified.budget.exceedance)
-    return dict(shift=shift.name, **row, measured_kl=measured_kl, sensor_kl=certified.sensor_kl)
+def _row(episodes: TrainingEpisodes, shift: Shift, n_test: int, **how: Any) -> dict[str, Any]:
+    keywords = {key: shift.env_kwargs.get(key) for key in ("sensor_noise_std", "sensor_bias", "start_beta")}
+    return dict(shift=shift.name, **keywords, **compare(episodes, shift, n_test, **how))
 
 
 def _paper_row(episodes: TrainingEpisodes, shift: Shift, n_test: int) -> dict[str, Any]:
     """Add two certificates: one without an allowance for sampling, and one of the unclipped cost."""
-    row = _row(episodes, shift, None, n_test, episodes.seed + 1)
+    row = _row(episodes, shift, n_test, seed=episodes.seed + 1)
     estimate = episodes.allowing(None).certify(shift).bound
     unclipped = episodes.allowing(episodes.confidence, episodes.true_cost_bound).certify(shift).bound
     return dict(**row, estimate=estimate, unclipped_bound=unclipped)
