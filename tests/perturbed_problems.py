@@ -53,6 +53,44 @@ class PictureEnv(gym.Env):
         return self._observe(), -info["cost"], self.t == self.lengths, False, info
 
 
+DICT = spaces.Dict(
+    dict(
+        camera=spaces.Box(0, 255, (3, 10, 10), np.uint8),
+        gyro=spaces.Box(-10, 1000, (2,), np.float32),
+        touch=spaces.Discrete(1000),
+    )
+)
+
+
+class ClockEnv(gym.Env):
+    """An episode whose observation is the time of the step, from 10 on, in every part; it remembers its actions."""
+
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    horizon = 12
+
+    def __init__(self, space=DICT, name=0):
+        self.observation_space, self.name = space, name
+
+    def _observe(self):
+        now = self.t + 10
+        if isinstance(self.observation_space, spaces.Dict):
+            parts = {
+                key: np.full(part.shape, now, part.dtype) for key, part in self.observation_space.items() if part.shape
+            }
+            return {**parts, "touch": now}
+        return np.full(self.observation_space.shape, now, self.observation_space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.actions = 0, []
+        return self._observe(), {}
+
+    def step(self, action):
+        self.t += 1
+        self.actions.append(action)
+        return self._observe(), 0.0, self.t == self.horizon, False, {"actions": np.array(self.actions)}
+
+
 def dummy(make, n):
     return DummyVecEnv([functools.partial(make, i) for i in range(n)])
 

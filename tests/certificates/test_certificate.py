@@ -69,48 +69,17 @@ def test_a_divergence_of_nothing_gives_the_mean_and_a_large_one_the_largest_cost
     assert certificate(np.full(4, 2.5), 1.0, confidence=None).bound == 2.5
 
 
-def printed_bound(costs, p, beta, information):
-    return entropic_risk(costs, beta, p) + information
-
-
-def lamp(error, cost=10.0):
-    """
-    A lamp is on or off, the TRV tells which, wrongly with probability ``error``; acting on the wrong one costs.
-
-    :return: joint probabilities of (lamp, TRV) and costs, of the four outcomes; information in nats
-    """
-    joint = 0.5 * np.array([1 - error, error, error, 1 - error])
-    return joint, np.array([0.0, cost, cost, 0.0]), kl(joint, np.full(4, 0.25))
-
-
 def test_the_printed_condition_is_met_where_the_printed_bound_fails():
-    p, costs, information = lamp(0.01)
-    shifted, _, _ = lamp(0.99)
-    beta = 0.1
+    """A lamp is on or off, the TRV tells which, wrongly with some probability; acting on the wrong one costs."""
+
+    def joint(error):
+        return 0.5 * np.array([1 - error, error, error, 1 - error])
+
+    p, shifted, costs, beta = joint(0.01), joint(0.99), np.array([0.0, 10.0, 10.0, 0.0]), 0.1
+    information = kl(p, np.full(4, 0.25))
     assert beta * kl(shifted, p) <= information  # as the paper prints it
-    assert shifted @ costs > 10 * printed_bound(costs, p, beta, information)
+    assert shifted @ costs > 10 * (entropic_risk(costs, beta, p) + information)
     assert kl(shifted, p) > beta * information  # the corrected condition is not met
-
-
-def test_the_corrected_condition_is_enough_for_every_shift_of_the_example():
-    p, costs, information = lamp(0.01)
-    n_met = 0
-    for beta in (0.01, 0.1, 0.5, 1.0, 3.0):
-        for error in np.linspace(0.001, 0.999, 999):
-            shifted, _, _ = lamp(error)
-            if kl(shifted, p) <= beta * information:
-                n_met += 1
-                assert shifted @ costs <= printed_bound(costs, p, beta, information) + 1e-12
-    assert n_met > 500
-
-
-def test_the_printed_condition_is_enough_for_beta_of_at_least_one():
-    random = np.random.default_rng(3)
-    for _ in range(500):
-        p, shifted, costs = random_problem(random)
-        beta = 10.0 ** random.uniform(0, 2)
-        information = beta * kl(shifted, p)  # just met
-        assert shifted @ costs <= printed_bound(costs, p, beta, information) + 1e-8
 
 
 # Name -> (sampler, cost bound, cumulant generating function at beta).
@@ -139,21 +108,6 @@ def test_the_confidence_bound_covers_all_betas_at_once(name, n):
         risks += [entropic_risk(distribution.values, beta, distribution.probabilities) for beta in betas]
         n_covered += (np.array(risks) >= np.append(truth[0], truth) - 1e-9).all()
     assert n_covered >= 175  # 180 expected if the band were exact; it is wider
-
-
-def test_the_band_lies_below_the_distribution_function_at_all_ranks_at_once():
-    random = np.random.default_rng(8)
-    n_below = 0
-    for _ in range(200):
-        distribution = cost_distribution(random.uniform(0, 1, 1000), cost_bound=1.0, confidence=0.9)
-        n_below += (np.cumsum(distribution.probabilities)[:-1] <= distribution.values[:-1]).all()
-    assert n_below >= 175
-
-
-def test_without_allowance_the_estimate_is_below_the_truth_half_of_the_time():
-    random = np.random.default_rng(5)
-    estimates = [certificate(random.uniform(0, 1, 50), 0.0, confidence=None).bound for _ in range(200)]
-    assert 60 < np.sum(np.array(estimates) < 0.5) < 140
 
 
 def test_the_band_is_narrow_in_the_tail():

@@ -28,7 +28,6 @@ from sb3_tdpg.certificates.shifts import (
     gaussian_kl,
     lava_shift,
     random_lava_shifts,
-    record_episodes,
 )
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.lava import LavaEnv
@@ -130,14 +129,6 @@ def test_random_shifts_depend_on_the_seed_alone_and_change_something():
     assert shifts != random_lava_shifts(200, seed=4)
     assert all(shift.env_kwargs and np.isfinite(shift.start_kl + shift.sensor_kl) for shift in shifts)
     assert {len(shift.env_kwargs) for shift in shifts} == {1, 2, 3}
-
-
-def test_the_same_sensor_shows_the_same_again(model):
-    env = LavaEnv()
-    recorded = record_episodes(model, env, 50, (0, 0))
-    for again, first in zip(encode(model, env, recorded), recorded.densities, strict=True):
-        np.testing.assert_allclose(again.mean, first.mean, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(again.stddev, first.stddev, rtol=1e-5)
 
 
 def test_no_shift_has_no_divergence_and_more_noise_more(episodes):
@@ -284,6 +275,7 @@ def test_certify_on_the_command_line(model, tmp_path, capsys):
         (["model.zip", "--n-test-episodes", "1"], "n_test_episodes=1 must be at least 2"),
         (["model.zip", "--confidence", "1.5"], "confidence=1.5 must lie between 0 and 1"),
         (["model.zip", "--cost-bound", "nan"], "cost_bound=nan must be finite"),
+        (["model.zip", "--cost-bound", "-1"], "cost_bound=-1.0 must be finite and above 0"),
         # The shifts' divergences are from a uniform start and no bias.
         (["model.zip", "--env-kwargs", "start_beta=[2,2]"], "leave start_beta out"),
         (["model.zip", "--env-kwargs", "sensor_bias=[1,0]"], "leave sensor_bias out"),
@@ -351,7 +343,6 @@ def test_half_of_the_error_is_for_the_cost_and_half_for_all_divergences_together
     asked.clear()
     allowed.budgets(lava_shift("", sensor_noise_std=0.05))
     assert asked == [pytest.approx(1 - 0.1 / 12)] * 6  # five steps and the last action
-    assert 1 - asked[0] == pytest.approx((1 - 0.95) / 6)
 
 
 def test_the_cost_bound_has_a_stage_cost_for_every_control():
@@ -361,12 +352,11 @@ def test_the_cost_bound_has_a_stage_cost_for_every_control():
     assert two.cost_bound - one.cost_bound == pytest.approx(farthest + 2.0 * 3.0)
 
 
-@pytest.mark.parametrize("bound, message", [("-1", "above 0"), ("1", "is below a cost of")])
-def test_a_bound_below_a_cost_in_training_is_refused(bound, message, model, tmp_path, capsys):
+def test_a_bound_below_a_cost_in_training_is_refused(model, tmp_path, capsys):
     model.save(tmp_path / "model.zip")
     arguments = ["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--n-episodes", "3000"]
-    assert main([*arguments, "--cost-bound", bound, "--out", str(tmp_path / "out")]) == 2
-    assert re.search(message, capsys.readouterr().err)
+    assert main([*arguments, "--cost-bound", "1", "--out", str(tmp_path / "out")]) == 2
+    assert "is below a cost of" in capsys.readouterr().err
 
 
 def test_the_budget_with_the_lowest_bound_is_taken(episodes, monkeypatch):

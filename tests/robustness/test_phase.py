@@ -28,6 +28,13 @@ def phase_of(model, nuisance, n_steps=24):
     return phase
 
 
+def react_more(module):
+    """Make a policy that reacts to its observations."""
+    with th.no_grad():
+        for parameter in module.parameters():
+            parameter.mul_(3.0)
+
+
 def known(model, batch, seen):
     """How far the actions are from those on plain observations, in nats a step."""
     with th.no_grad():
@@ -50,11 +57,8 @@ def test_the_phase_lowers_what_the_actions_know_of_the_nuisance(env, settings):
     if not model.policy.time_varying:
         batch = batch.segments(2)
     phase = phase_of(model, shifted(-1.0, 1.0), 40)
-    for group in phase.optimizer.param_groups:
-        group["lr"] = 1e-2
-    with th.no_grad():  # a policy that reacts to its observations
-        for parameter in model.policy.encoder.parameters():
-            parameter.mul_(3.0)
+    phase.optimizer.param_groups[0]["lr"] = 1e-2
+    react_more(model.policy.encoder)
     th.manual_seed(1)
     perturbed = phase.perturbed(batch)
     before = known(model, batch, perturbed)
@@ -66,9 +70,8 @@ def test_the_phase_lowers_what_the_actions_know_of_the_nuisance(env, settings):
 def test_on_plain_observations_the_policy_stays_as_it_was():
     model = tiny_tdpg("Lava-v0")
     batch, phase = rollouts(model), phase_of(model, shifted(2.0), 40)
-    with th.no_grad():  # a policy that reacts to its observations
-        for parameter in model.policy.encoder.parameters():
-            parameter.mul_(3.0)
+    react_more(model.policy.encoder)
+    with th.no_grad():
         before, shift = actions(model.policy, batch, batch.observations), known(model, batch, batch.observations + 2.0)
     phase.optimizer.param_groups[0]["lr"] = 1e-2
     phase.remove(batch)
@@ -90,9 +93,7 @@ def test_a_nuisance_that_changes_nothing_changes_no_parameter():
 def test_a_huge_divergence_moves_the_policy_by_a_bounded_step():
     model = tiny_tdpg("Lava-v0")
     batch = rollouts(model)
-    with th.no_grad():  # a policy that reacts strongly to what it sees
-        for parameter in model.policy.parameters():
-            parameter.mul_(3.0)
+    react_more(model.policy)
     phase = phase_of(model, shifted(1000.0), 1)
     assert known(model, batch, phase.perturbed(batch)) > 100
     # Plain gradient descent, as Adam's own steps have about one length.
