@@ -137,12 +137,10 @@ def _textures(channels: int, height: int, width: int) -> np.ndarray:
     return sized
 
 
-def draw_texture(rng: np.random.Generator, n: int, opacity: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw the texture of each episode."""
-    return dict(texture=rng.integers(0, N_TEXTURES, n))
-
-
-@perturbation("image", "opacity", (0.1, 0.2, 0.35, 0.5, 0.7), draw=draw_texture, channels=(1, 3), on_depth=False)
+@perturbation(
+    "image", "opacity", (0.1, 0.2, 0.35, 0.5, 0.7), channels=(1, 3), on_depth=False,
+    draw=lambda rng, n, opacity, sensor: dict(texture=rng.integers(0, N_TEXTURES, n)),
+)  # fmt: skip
 def texture_overlay(images: np.ndarray, opacity: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Lay one of 16 textures half-transparently over all images of an episode."""
     texture = _textures(*images.shape[1:])[episode["texture"]]
@@ -202,12 +200,10 @@ def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Gen
     return np.where((t > 0) & (rng.random(len(t)) < probability), KEEP, 0)
 
 
-def draw_lag(rng: np.random.Generator, n: int, longest: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw the delay of each episode."""
-    return dict(delay=rng.integers(1, int(longest) + 1, n), age=np.zeros(n, dtype=np.int64))
-
-
-@perturbation("any", "longest delay, steps", (1, 2, 4, 6, 8), draw=draw_lag, later_only=True, timing=True)
+@perturbation(
+    "any", "longest delay, steps", (1, 2, 4, 6, 8), later_only=True, timing=True,
+    draw=lambda rng, n, longest, sensor: dict(delay=rng.integers(1, int(longest) + 1, n), age=np.zeros(n, np.int64)),
+)  # fmt: skip
 def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Show the observation of some steps ago, a delay drawn for the episode, with a jitter of one step."""
     due = (episode["delay"] + rng.integers(-1, 2, len(t))).clip(0, int(longest))
@@ -216,12 +212,11 @@ def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generato
     return age.copy()
 
 
-def draw_burst(rng: np.random.Generator, n: int, steps: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw when the burst of each episode starts, so that it ends before the horizon if it can."""
-    return dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n))
-
-
-@perturbation("any", "steps", (1, 2, 4, 8, 16), draw=draw_burst, later_only=True, timing=True)
+@perturbation(
+    "any", "steps", (1, 2, 4, 8, 16), later_only=True, timing=True,
+    # It ends before the horizon if it can.
+    draw=lambda rng, n, steps, sensor: dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n)),
+)  # fmt: skip
 def blackout(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Show nothing (0, or a black image) for a burst of steps, once in an episode."""
     since = t - episode["start"]
@@ -257,10 +252,7 @@ def group_failure(t: np.ndarray, latest: float, episode: Episode, rng: np.random
     return np.where(t[:, None] >= episode["start"], NOTHING, 0)
 
 
-@perturbation("action", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), draw=draw_signs)
-def actuator_gain(actions: np.ndarray, factor: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Multiply every component of the actions by a factor or divide it, constant for an episode."""
-    return actions * factor ** episode["sign"]
+perturbation("action", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), name="actuator_gain", draw=draw_signs)(vector_scale)
 
 
 @perturbation("action", "steps", (1, 2, 3, 4, 5), timing=True)

@@ -41,37 +41,6 @@ def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
     return dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
 
 
-Group = Mapping[str, np.ndarray]
-"""Components of the flattened observation that fail together, by the key of a ``Dict``; "" if there is no ``Dict``."""
-
-
-def groups_of(space: spaces.Space, named: Mapping[str, Sequence[Any]] | None = None) -> list[Group]:
-    """
-    Return the groups of components of an observation that can fail together.
-
-    :param space: The observation space.
-    :param named: An environment's ``observation_groups``: indices of a vector, or keys of a ``Dict``, by the name of
-        the group. Default: each part of a ``Dict``, each channel of an image, each component of a vector.
-    """
-    if isinstance(space, spaces.Dict):
-        whole = {key: np.arange(int(np.prod(part.shape or ()))) for key, part in space.items()}
-        groups = [[key] for key in whole] if named is None else [list(keys) for keys in named.values()]
-        if unknown := [key for keys in groups for key in keys if key not in whole]:
-            raise ValueError(f"observation_groups={named} has {unknown}: use keys of the observation, {list(whole)}")
-        return [{key: whole[key] for key in keys} for keys in groups]
-    assert isinstance(space, spaces.Box)
-    components = np.arange(int(np.prod(space.shape)))
-    if named is not None:
-        if outside := [i for indices in named.values() for i in indices if i not in components]:
-            raise ValueError(f"observation_groups={named} has {outside}: use indices from 0 to {len(components) - 1}")
-        return [{"": np.asarray(indices)} for indices in named.values()]
-    sensor = Sensor(space)
-    if not sensor.is_image:
-        return [{"": components[[i]]} for i in components]
-    channels = np.moveaxis(components.reshape(-1, *sensor.frame), -1 if sensor.channels_last else 1, 0)
-    return [{"": channel.ravel()} for channel in channels]
-
-
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """
@@ -85,7 +54,7 @@ class Sensor:
     space: Any
     scale: Any = None  # of the components of a vector, in the space's shape (in a Dict by key); see `observation_scale`
     horizon: int = UNKNOWN_HORIZON
-    named_groups: Mapping[str, Sequence[Any]] | None = None
+    named_groups: Mapping[str, Sequence[Any]] | None = None  # of the environment: indices, or keys of a Dict, by name
 
     @cached_property
     def parts(self) -> dict[str, "Sensor"]:
@@ -96,9 +65,29 @@ class Sensor:
         return {key: Sensor(part, scale.get(key), self.horizon) for key, part in self.space.items()}
 
     @cached_property
-    def groups(self) -> list[Group]:
-        """The groups of components that can fail together; see :func:`groups_of`."""
-        return groups_of(self.space, self.named_groups)
+    def groups(self) -> list[dict[str, np.ndarray]]:
+        """
+        The components of the flattened observation that fail together, by part.
+
+        They are the named ones, or each part of a ``Dict``, each channel of an image, each component of a vector.
+        """
+        whole = {key: np.arange(int(np.prod(part.space.shape or ()))) for key, part in self.parts.items()}
+        is_dict, named = isinstance(self.space, spaces.Dict), self.named_groups
+        groups: Any
+        known = whole if is_dict else whole[""]
+        if named is not None:
+            groups = named.values()
+            if unknown := [name for group in groups for name in group if name not in known]:
+                wanted = f"keys of the observation, {list(whole)}" if is_dict else f"indices from 0 to {len(known) - 1}"
+                raise ValueError(f"observation_groups={named} has {unknown}: use {wanted}")
+        elif is_dict:
+            groups = [[key] for key in whole]
+        elif self.is_image:
+            channels = np.moveaxis(whole[""].reshape(-1, *self.frame), -1 if self.channels_last else 1, 0)
+            groups = channels.reshape(len(channels), -1)
+        else:
+            groups = whole[""][:, None]
+        return [{key: whole[key] for key in group} if is_dict else {"": np.asarray(group)} for group in groups]
 
     @property
     def blank(self) -> np.ndarray:

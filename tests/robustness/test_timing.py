@@ -9,7 +9,7 @@ from small_problems import ToyEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_tdpg.robustness import PerturbedVecEnv, observation_scale
-from sb3_tdpg.robustness.sensor import groups_of
+from sb3_tdpg.robustness.sensor import Sensor
 
 HORIZON = ClockEnv.horizon
 
@@ -95,14 +95,17 @@ def test_groups_have_the_names_of_the_environment(monkeypatch):
 
 
 def test_groups_of_vectors_and_images():
+    def groups(space, named=None):
+        return [group[""].tolist() for group in Sensor(space, named_groups=named).groups]
+
     vector, image = spaces.Box(-1, 1, (3,), np.float32), spaces.Box(0, 255, (4, 4, 3), np.uint8)
-    assert [group[""].tolist() for group in groups_of(vector)] == [[0], [1], [2]]
-    assert [group[""].tolist() for group in groups_of(vector, {"imu": [0, 2]})] == [[0, 2]]
-    assert [group[""].tolist() for group in groups_of(image)] == [list(range(c, 48, 3)) for c in range(3)]
+    assert groups(vector) == [[0], [1], [2]]
+    assert groups(vector, {"imu": [0, 2]}) == [[0, 2]]
+    assert groups(image) == [list(range(c, 48, 3)) for c in range(3)]
     with pytest.raises(ValueError, match=r"has \[3\]: use indices from 0 to 2"):
-        groups_of(vector, {"imu": [0, 3]})
+        groups(vector, {"imu": [0, 3]})
     with pytest.raises(ValueError, match=r"has \['nose'\]: use keys of the observation"):
-        groups_of(DICT, {"face": ["nose"]})
+        groups(DICT, {"face": ["nose"]})
 
 
 def test_nothing_is_zero_or_black_as_far_as_the_bounds_allow():
