@@ -11,7 +11,7 @@ from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.robustness import Perturbation, PerturbedObservation, PerturbedVecEnv
-from sb3_tdpg.robustness.core import Members
+from sb3_tdpg.robustness.core import Members, take
 from sb3_tdpg.robustness.families import Family, FunctionMembers, OneOf, SceneMembers
 
 N = 40
@@ -92,8 +92,7 @@ def shows(request):
     members = draw(N, 0)
 
     def show(which, members=members):
-        some = {key: x[which] for key, x in plain.items()} if isinstance(plain, dict) else plain[which]
-        return flat(members(some, which, states[which]))
+        return flat(members(take(plain, which), which, states[which]))
 
     return draw, members, show
 
@@ -127,18 +126,10 @@ def test_the_seed_names_the_members(shows):
     assert (show(np.arange(N), again) != show(np.arange(N), other)).any()  # the environment's seed counts, too
 
 
-def test_one_member_is_the_same_for_all_episodes(shows):
-    draw, *_ = shows
-    plain = np.zeros(N, np.int64)  # all episodes show what the first one shows
-
-    def seen(seed, n=N):
-        return flat(draw(1, seed).repeat(n)(*of_first(n)))
-
-    def of_first(n):
-        space = next(space for space, other in MEMBERS.values() if other is draw)
-        first = sampled(space)
-        some = {key: x[plain[:n]] for key, x in first.items()} if isinstance(first, dict) else first[plain[:n]]
-        return some, None, np.full((n, 2), 1.5)
+@pytest.mark.parametrize(("space", "draw"), MEMBERS.values(), ids=MEMBERS)
+def test_one_member_is_the_same_for_all_episodes(space, draw):
+    def seen(seed, n=N):  # by n episodes that show what the first one shows
+        return flat(draw(1, seed).repeat(n)(take(sampled(space), np.zeros(n, int)), None, np.full((n, 2), 1.5)))
 
     one = seen(1)
     assert (one == one[:1]).all()
