@@ -22,7 +22,7 @@ from sb3_tdpg.report.numbers import Numbers
 from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
 from sb3_tdpg.robustness.core import Perturber
-from sb3_tdpg.robustness.registry import find
+from sb3_tdpg.robustness.registry import PERTURBATIONS
 from sb3_tdpg.robustness.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     dots = "." if len(unperturbed) <= 30 else ""
     for axes, name in zip(panels.flat, names, strict=False):
         for row in (row for row in rows if row.perturbation == name):
-            perturber = Perturber(find(name), row.severity, sensor, 1, seed=plan.seed)
+            perturber = Perturber(PERTURBATIONS[name], row.severity, sensor, 1, seed=plan.seed)
             seen = [_part(perturber(observation), key).ravel()[component] for observation in observations]
             color = shades(0.1 + 0.8 * row.severity / 5)
             axes.plot(seen, dots + "-", color=color, linewidth=0.9, markersize=4, label=f"severity {row.severity}")

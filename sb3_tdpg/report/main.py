@@ -28,7 +28,7 @@ from sb3_tdpg.report.page import Knowledge, Page, to_html, write_page
 from sb3_tdpg.report.plan import Models, Plan, complete_rows, default_episodes, missing_rows, seconds_of_a_row
 from sb3_tdpg.report.rows import Row, make_rows
 from sb3_tdpg.robustness import perturbation_gallery
-from sb3_tdpg.robustness.registry import find
+from sb3_tdpg.robustness.registry import PERTURBATIONS
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.sensor import kind_of
 from sb3_tdpg.tdpg import TDPG
@@ -268,7 +268,7 @@ def _draw(
         figures["comparison"] = comparison_figure(numbers)
     # One picture does not show the timing.
     of_sensor = [row for row in rows if row.kind == "sensor"]
-    shown = [row for row in of_sensor if find(row.perturbation).kind == "image"]
+    shown = [row for row in of_sensor if PERTURBATIONS[row.perturbation].kind == "image"]
     shown += [row for row in rows if row.kind == "scene"]
     if kind_of(space) == "image" and shown:
         names = list(dict.fromkeys(row.perturbation for row in shown))

@@ -13,7 +13,7 @@ from sb3_tdpg.common.markdown import escaped, fill_template, markdown_table
 from sb3_tdpg.report.numbers import CLEAR, Numbers
 from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED, Row
-from sb3_tdpg.robustness.registry import find
+from sb3_tdpg.robustness.registry import PERTURBATIONS
 
 MIN_SEEDS = 5
 """With fewer models of a method, its interval is not reliable."""
@@ -166,7 +166,7 @@ def _severities_table(page: Page) -> str:
     for name in dict.fromkeys(row.perturbation for row in perturbed):
         rows = [row for row in perturbed if row.perturbation == name]
         if rows[0].kind != "scene":
-            what, parameter = find(name).summary, find(name).parameter
+            what, parameter = PERTURBATIONS[name].summary, PERTURBATIONS[name].parameter
             values = [f"{row.value:g}" for row in rows]
         else:
             keywords = [row.scenario.env_kwargs for row in rows]

@@ -6,9 +6,16 @@ Robustness: perturbations of any environment's observations, in five severities,
 
 from sb3_tdpg.robustness import effects as effects  # fills the registry
 from sb3_tdpg.robustness.gallery import perturbation_gallery
-from sb3_tdpg.robustness.registry import PERTURBATIONS, Perturbation, applicable, register, severity_table
+from sb3_tdpg.robustness.registry import (
+    PERTURBATIONS,
+    SCENES,
+    Perturbation,
+    applicable,
+    register,
+    scene_perturbations,
+    severity_table,
+)
 from sb3_tdpg.robustness.scale import observation_scale
-from sb3_tdpg.robustness.scenes import SCENES, scene_perturbations
 from sb3_tdpg.robustness.wrappers import PerturbedObservation, PerturbedVecEnv
 
 __all__ = [

@@ -137,10 +137,8 @@ class Family:
                 f"{type(inner).__name__}: give a function of the observations instead"
             )
         names = list(getattr(inner, "state_names", ()))
-        if not isinstance(redraw, (list, tuple)):
+        if not (isinstance(redraw, (list, tuple)) and all(name in names for name in redraw)):
             raise ValueError(f"redraw={redraw!r} must be a list of components of the state, some of {names}")
-        if unknown := [name for name in redraw if name not in names]:
-            raise ValueError(f"redraw={unknown} are no components of the state: use some of {names}")
         own = {} if inner.spec is None else inner.spec.kwargs
         given = [env_kwargs] if isinstance(env_kwargs, Mapping) else env_kwargs
         if not (isinstance(given, Sequence) and given and all(isinstance(kwargs, Mapping) for kwargs in given)):

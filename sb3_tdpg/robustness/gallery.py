@@ -13,8 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdpg.evaluation.figures import new_figure
 from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.robustness.core import Perturber
-from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find, find_applicable
-from sb3_tdpg.robustness.scenes import scene_perturbations
+from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS, applicable, find_applicable, scene_perturbations
 from sb3_tdpg.robustness.sensor import Sensor, kind_of
 from sb3_tdpg.vec_env import make_episodes_env
 
@@ -59,7 +58,7 @@ def perturbation_gallery(
             raise ValueError(f"a gallery shows images, and the observation space is {space}")
         rows: dict[str, list[np.ndarray]] = {}
         # One picture does not show the timing.
-        shown = [name for name in applicable(space, horizon) if find(name).kind == "image"]
+        shown = [name for name in applicable(space, horizon) if PERTURBATIONS[name].kind == "image"]
         for name in [*shown, *scenes] if names is None else names:
             if name in scenes:
                 rows[name] = [_frames(made(scene_kwargs), seed)[-1] for scene_kwargs in scenes[name]]

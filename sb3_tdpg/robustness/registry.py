@@ -1,4 +1,4 @@
-"""The registry of perturbations: each row is a :class:`Perturbation`."""
+"""The registries of perturbations: of the sensor and the actuators, and of the scene."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -138,13 +138,6 @@ def perturbation(
     return add
 
 
-def find(name: str) -> Perturbation:
-    """Return a perturbation by its name."""
-    if name not in PERTURBATIONS:
-        raise ValueError(f"perturbation={name!r} is unknown: use one of {list(PERTURBATIONS)}")
-    return PERTURBATIONS[name]
-
-
 def find_applicable(
     perturbation: str | Perturbation,
     space: spaces.Space,
@@ -152,7 +145,9 @@ def find_applicable(
     action_space: spaces.Space | None = None,
 ) -> Perturbation:
     """Return a perturbation, or the one of a name, if it applies; see :meth:`Perturbation.objection`."""
-    found = find(perturbation) if isinstance(perturbation, str) else perturbation
+    if isinstance(perturbation, str) and perturbation not in PERTURBATIONS:
+        raise ValueError(f"perturbation={perturbation!r} is unknown: use one of {list(PERTURBATIONS)}")
+    found = PERTURBATIONS[perturbation] if isinstance(perturbation, str) else perturbation
     if (objection := found.objection(space, horizon, action_space)) is not None:
         raise ValueError(f"the perturbation {found.name!r} does not apply: {objection}")
     return found
@@ -171,3 +166,35 @@ def severity_table(kind: str | None = None) -> pd.DataFrame:
         if kind in (None, row.kind)
     }
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("perturbation")
+
+
+Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each
+
+# The true state, and with it the task, does not change: no mugs in other places.
+SCENES: dict[str, dict[str, Severities]] = {
+    "BallCatch-v0": {
+        # Another texture, blended into the training texture.
+        "texture": tuple(dict(texture=f"{share}%-turquoise_waves") for share in (20, 40, 60, 80, 100)),
+        # By default the camera is 2 m high and looks up by 30 degrees.
+        "camera_pose": tuple(
+            dict(camera_pitch=pitch, camera_height=height)
+            for pitch, height in ((31.0, 2.05), (32.0, 2.1), (34.0, 2.2), (37.0, 2.35), (40.0, 2.5))
+        ),
+    },
+    "PandaGrasp-v0": {
+        "camera_pose": tuple(dict(camera_shift=height) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
+    },
+}
+"""Keywords by environment, perturbation and severity; add rows for your own environment."""
+
+
+def scene_perturbations(env_id: str) -> dict[str, Severities]:
+    """
+    Return the perturbations in :data:`SCENES` of an environment: the ``env_kwargs`` of the five severities by name.
+
+    :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
+    """
+    rows = SCENES.get(env_id.rpartition(":")[2], {})
+    for name, severities in rows.items():
+        check_severities(f"SCENES[{env_id!r}][{name!r}]", severities)
+    return dict(rows)
