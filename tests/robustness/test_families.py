@@ -64,7 +64,8 @@ MEMBERS = {
     "images": (IMAGES, family({"images": dict(noise=0.0, held=True)}, IMAGES).members),
     "a perturbation": (VECTOR, family({"vector_bias": 5}, VECTOR).members),
     "several": (VECTOR, family({"vector_bias": (1, 5)}, VECTOR).members),
-    "parts": (PARTS, family({"vector_bias": 5, "hue": 5}, PARTS).members),
+    "a part": (PARTS, family({"vector_bias": 5}, PARTS).members),
+    "several parts": (PARTS, family({"vector_bias": 5, "hue": 5}, PARTS).members),
     "scenes": (VECTOR, scenes),
     "one of two": (VECTOR, one_of),
 }
