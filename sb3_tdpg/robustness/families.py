@@ -22,11 +22,6 @@ from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.sensor import UNKNOWN_HORIZON, Sensor
 from sb3_tdpg.robustness.training import WITH_KEYWORDS
 
-EXPECTED = (
-    "the name of a perturbation, a dict of names and severities such as {'noise': (1, 3), 'contrast': 2}, a list such "
-    "as [None, ('vector_noise', 3)], or a function of the observations and a random generator"
-)
-
 
 class Family:
     """
@@ -65,7 +60,11 @@ class Family:
             if declared and not entries:
                 raise ValueError("'redraw' needs 'env_kwargs', the scenes that draw something anew")
         if not isinstance(entries, (list, tuple)) or not entries:
-            raise ValueError(f"{declared!r} is no perturbation: expected {EXPECTED}")
+            raise ValueError(
+                f"{declared!r} is no perturbation: expected the name of a perturbation, a dict of names and severities "
+                "such as {'noise': (1, 3), 'contrast': 2}, a list such as [None, ('vector_noise', 3)], or a function "
+                "of the observations and a random generator"
+            )
         redraw = declared.get("redraw", ()) if isinstance(declared, Mapping) else ()
         self._makers = [maker for entry in entries for maker in self._makers_of(entry, redraw)]
         if len(self._kinds) > 1:

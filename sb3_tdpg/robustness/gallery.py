@@ -14,7 +14,7 @@ from sb3_tdpg.evaluation.figures import new_figure
 from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS, applicable, find_applicable, scene_perturbations
-from sb3_tdpg.robustness.sensor import Sensor, kind_of
+from sb3_tdpg.robustness.sensor import Sensor
 from sb3_tdpg.vec_env import make_episodes_env
 
 if TYPE_CHECKING:
@@ -43,44 +43,42 @@ def perturbation_gallery(
     if env_kwargs and not isinstance(env, str):
         raise ValueError("env_kwargs are for an environment that is made here: give its id in place of it")
     scenes = scene_perturbations(env) if isinstance(env, str) else {}
-    with contextlib.ExitStack() as stack:
 
-        def made(scene_kwargs: Mapping[str, Any]) -> VecEnv:
-            if not isinstance(env, str):
-                return env
-            kwargs = {**(env_kwargs or {}), **scene_kwargs}
-            own = make_episodes_env(env, 1, env_kwargs=kwargs, use_processes=False)
-            return stack.enter_context(contextlib.closing(own))
+    def look(scene_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, int | None, list[np.ndarray]]:
+        if not isinstance(env, str):
+            return _look(env, seed)
+        kwargs = {**(env_kwargs or {}), **scene_kwargs}
+        with contextlib.closing(make_episodes_env(env, 1, env_kwargs=kwargs, use_processes=False)) as made:
+            return _look(made, seed)
 
-        plain = made({})
-        space, horizon, frames = plain.observation_space, horizon_of(plain), _frames(plain, seed)
-        if not isinstance(space, spaces.Box) or kind_of(space) != "image":
-            raise ValueError(f"a gallery shows images, and the observation space is {space}")
-        rows: dict[str, list[np.ndarray]] = {}
-        # One picture does not show the timing.
-        shown = [name for name in applicable(space, horizon) if PERTURBATIONS[name].kind == "image"]
-        for name in [*shown, *scenes] if names is None else names:
-            if name in scenes:
-                rows[name] = [_frames(made(scene_kwargs), seed)[-1] for scene_kwargs in scenes[name]]
-                continue
-            perturbation = find_applicable(name, space, horizon)
-            sensor = Sensor(space, horizon=len(frames))  # what fails has failed in the last frame
-            perturbers = [Perturber(perturbation, severity, sensor, 1, seed=seed) for severity in range(1, 6)]
-            rows[name] = [[perturber(frame[None]) for frame in frames][-1][0] for perturber in perturbers]
-    return _draw(frames[-1], rows, Sensor(space))
+    space, horizon, frames = look({})
+    sensor = Sensor(space, horizon=len(frames))  # what fails has failed in the last frame
+    if not sensor.is_image:
+        raise ValueError(f"a gallery shows images, and the observation space is {space}")
+    rows: dict[str, list[np.ndarray]] = {}
+    # One picture does not show the timing.
+    shown = [name for name in applicable(space, horizon) if PERTURBATIONS[name].kind == "image"]
+    for name in [*shown, *scenes] if names is None else names:
+        if name in scenes:
+            rows[name] = [look(scene_kwargs)[-1][-1] for scene_kwargs in scenes[name]]
+            continue
+        perturbation = find_applicable(name, space, horizon)
+        perturbers = [Perturber(perturbation, severity, sensor, 1, seed=seed) for severity in range(1, 6)]
+        rows[name] = [[perturber(frame[None]) for frame in frames][-1][0] for perturber in perturbers]
+    return _draw(frames[-1], rows, sensor)
 
 
-def _frames(env: VecEnv, seed: int) -> list[np.ndarray]:
-    """Return the images of an episode of the first environment, up to the one that is drawn."""
+def _look(env: VecEnv, seed: int) -> tuple[spaces.Space, int | None, list[np.ndarray]]:
+    """Return space and horizon, and the images of an episode of the first environment, up to the one that is drawn."""
     env.seed(seed)
-    frames = [np.asarray(env.reset())[0]]
+    frames, horizon = [np.asarray(env.reset())[0]], horizon_of(env)
     actions = np.zeros((env.num_envs, *(env.action_space.shape or ())), env.action_space.dtype)
-    for _ in range(min(N_STEPS, (horizon_of(env) or N_STEPS + 1) - 1)):
+    for _ in range(min(N_STEPS, (horizon or N_STEPS + 1) - 1)):
         observations, _, dones, _ = env.step(actions)
         if dones[0]:
             break
         frames.append(np.asarray(observations)[0])
-    return frames
+    return env.observation_space, horizon, frames
 
 
 def _draw(unperturbed: np.ndarray, rows: Mapping[str, Sequence[np.ndarray]], sensor: Sensor) -> Figure:

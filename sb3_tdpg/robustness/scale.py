@@ -35,18 +35,31 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> Any:
     :return: in the shape of the observation space, float64; for the vectors in a ``Dict``, by key
     """
     vec_env = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
+    normalize = None if model is None else model.get_vec_normalize_env()
+    actor = model or SimpleNamespace(predict=_untrained(vec_env))
+    keys = _vectors(vec_env.observation_space)
     inner = vec_env.unwrapped
     waiting_seeds, waiting_options = list(inner._seeds), list(inner._options)
     generators = copy.deepcopy(vec_env.get_attr("np_random"))
+    seen: list[Any] = []
+    has_ended = np.zeros(vec_env.num_envs, dtype=bool)
+
+    def see(observations: Any) -> None:
+        seen.append({key: observations[key] for key in keys} if isinstance(observations, dict) else observations)
+
     try:
         vec_env.seed(_SEED)
-        seen = _observations(vec_env, model or SimpleNamespace(predict=_untrained(vec_env)))
+        for step in rollout(actor, vec_env, observe=normalize and normalize.normalize_obs):
+            see(step.observations)
+            has_ended |= step.dones
+            if len(seen) >= MAX_STEPS or (has_ended.all() and (len(seen) + 1) * vec_env.num_envs >= N_OBSERVATIONS):
+                break
+        see(step.next_observations)
     finally:
         for i, generator in enumerate(generators):
             vec_env.set_attr("np_random", generator, indices=i)
         inner._seeds, inner._options = waiting_seeds, waiting_options
-    scale = each_part(lambda *steps: np.concatenate(steps, dtype=np.float64).std(axis=0), *seen)
-    return {key: scale[key] for key in _vectors(vec_env.observation_space)} if isinstance(scale, dict) else scale
+    return each_part(lambda *steps: np.concatenate(steps, dtype=np.float64).std(axis=0), *seen)
 
 
 def _vectors(space: spaces.Space) -> dict[str, spaces.Space]:
@@ -64,19 +77,6 @@ def _untrained(env: VecEnv) -> Callable[..., tuple[np.ndarray, None]]:
         return np.clip(rng.standard_normal((n, *space.shape)), space.low, space.high).astype(space.dtype), None
 
     return predict
-
-
-def _observations(env: VecEnv, model: Any) -> list[Any]:
-    """Return the observations of each step of the rollout, ``(E, *obs)``."""
-    normalize = model.get_vec_normalize_env() if hasattr(model, "get_vec_normalize_env") else None
-    seen: list[Any] = []
-    has_ended = np.zeros(env.num_envs, dtype=bool)
-    for step in rollout(model, env, observe=normalize and normalize.normalize_obs):
-        seen.append(step.observations)
-        has_ended |= step.dones
-        if len(seen) >= MAX_STEPS or (has_ended.all() and (len(seen) + 1) * env.num_envs >= N_OBSERVATIONS):
-            break
-    return [*seen, step.next_observations]
 
 
 def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None) -> Any:

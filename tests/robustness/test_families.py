@@ -265,9 +265,7 @@ def test_a_scene_may_redraw_components_of_the_state():
     states = np.stack([info["state"] for info in env.reset_infos])
     states[:, 0] = 1.0
     np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast").sensor(states))
-    with pytest.raises(
-        ValueError, match=r"redraw=\['e'\] must be .* of the state, some of \['d \(m\)'"
-    ):
+    with pytest.raises(ValueError, match=r"redraw=\['e'\] must be .* of the state, some of \['d \(m\)'"):
         PerturbedVecEnv(env, {**declared, "redraw": ["e"]})
     with pytest.raises(ValueError, match="wrap the VecEnv instead"):
         PerturbedObservation(env.env, declared).reset()
