@@ -89,13 +89,7 @@ class PerturbedVecEnv(VecEnvWrapper):
     """
 
     def __init__(
-        self,
-        venv: VecEnv,
-        perturbation: Any,
-        severity: int | None = 3,
-        *,
-        seed: int | None = None,
-        scale: Scale = None,
+        self, venv: VecEnv, perturbation: Any, severity: int | None = 3, *, seed: int | None = None, scale: Scale = None
     ) -> None:
         if not isinstance(venv, VecEnv):
             name = type(venv).__name__

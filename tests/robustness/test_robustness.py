@@ -27,14 +27,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.robustness import (
-    PERTURBATIONS,
-    Perturbation,
-    PerturbedObservation,
-    PerturbedVecEnv,
-    applicable,
-    register,
-)
+from sb3_tdpg.robustness import PERTURBATIONS, Perturbation, PerturbedObservation, PerturbedVecEnv, applicable, register
 from sb3_tdpg.robustness.core import take
 
 
