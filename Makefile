@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # A name of a target is not a file: docs/ exists and must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-panda-squeeze reproduce-public records wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-pays-controls reproduce-panda-squeeze reproduce-public records wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -78,7 +78,7 @@ pictures: $(STAMP) ## draw the pictures of the documentation (PICTURES="lava.gif
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py
 
-reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-varying reproduce-grasp reproduce-grasp-camera ## reproduce every experiment
+reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-pays-controls reproduce-panda-squeeze reproduce-public ## reproduce every experiment (days)
 
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
@@ -102,8 +102,11 @@ reproduce-grasp-camera: $(STAMP) ## the same where the camera's height varies, a
 	$(PY) -m sb3_tdpg reproduce grasp-camera --out results/panda_grasp_camera --publish docs/results/panda_grasp_camera
 
 reproduce-pays: $(STAMP) ## where the bottleneck pays: squeeze, cue, peg and lava under faults that nobody declared
-	$(PY) -m sb3_tdpg reproduce pays --out results/pays --publish docs/results/pays
+	$(PY) -m sb3_tdpg reproduce pays --no-controls --out results/pays --publish docs/results/pays
 	$(PY) -m sb3_tdpg reproduce pays-cue --out results/pays_cue --publish docs/results/pays_cue
+
+reproduce-pays-controls: $(STAMP) ## add PPO and RecurrentPPO, plain and told the faults
+	$(PY) -m sb3_tdpg reproduce pays --out results/pays --publish docs/results/pays
 
 reproduce-panda-squeeze: $(STAMP) ## policies of the batched model in PyBullet's Panda, under faults of the sensor
 	$(PY) -m sb3_tdpg reproduce panda-squeeze --n-seeds 5 --out results/panda_squeeze --publish docs/results/panda_squeeze
