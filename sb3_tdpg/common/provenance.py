@@ -12,9 +12,11 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
+from functools import partial
 from importlib import metadata
 from itertools import zip_longest
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -142,8 +144,8 @@ def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
         raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
     # Without mtime the compressed file would differ from one second to the next.
     compression: Any = dict(method="gzip", mtime=0) if path.suffix == ".gz" else "infer"
-    with replaced_atomically(path) as partial:
-        frame.to_csv(partial, index=False, compression=compression)
+    with replaced_atomically(path) as unfinished:
+        frame.to_csv(unfinished, index=False, compression=compression)
 
 
 def _command() -> str:
@@ -179,7 +181,15 @@ def _git() -> dict[str, Any] | None:
 
 
 def jsonable(value: Any) -> Any:
-    """Turn a value into what JSON can hold: infinite numbers and unknown types become text, as in ``"inf"``."""
+    """
+    Turn a value into what JSON can hold: infinite numbers and unknown types become text, as in ``"inf"``.
+
+    The same function gives the same text in every process, unless it is a closure, whose text does not tell what it holds.
+    """
+    if isinstance(value, partial):
+        return jsonable(dict(function=value.func, arguments=value.args, **value.keywords))
+    if isinstance(value, FunctionType) and "<" not in value.__qualname__:
+        return f"{value.__module__}.{value.__qualname__}"
     if isinstance(value, Mapping):
         return {str(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):

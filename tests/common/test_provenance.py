@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_tdpg.common.provenance import check_same_config, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.provenance import check_same_config, jsonable, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.paper.ball import gamma
+from sb3_tdpg.robustness import PerturbedVecEnv
 
 
 @pytest.fixture
@@ -128,3 +131,14 @@ def test_a_failing_write_leaves_the_old_file_whole(records, tmp_path, monkeypatc
 def test_a_frame_needs_a_name_that_tells_its_format(records, tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.csv, \.csv\.gz or \.csv\.xz"):
         write_frame_atomically(records, tmp_path / "episodes.parquet")
+
+
+def test_what_changes_a_sensor_is_told_alike_by_every_process_and_a_closure_apart():
+    sensor = partial(PerturbedVecEnv, perturbation={"images": gamma}, severity=3)
+    code = "from sb3_tdpg.paper.ball import *; from sb3_tdpg.common.provenance import jsonable; import json;"
+    code += "print(json.dumps(jsonable(partial(PerturbedVecEnv, perturbation={'images': gamma}, severity=3))))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert json.loads(found) == jsonable(sensor)
+    assert jsonable(sensor)["perturbation"] == {"images": "sb3_tdpg.paper.ball.gamma"}
+    assert jsonable(partial(PerturbedVecEnv, severity=4)) != jsonable(partial(PerturbedVecEnv, severity=5))
+    assert jsonable(lambda x: x) != jsonable(lambda x: x)
