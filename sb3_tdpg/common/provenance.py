@@ -184,7 +184,7 @@ def jsonable(value: Any) -> Any:
     """
     Turn a value into what JSON can hold: infinite numbers and unknown types become text, as in ``"inf"``.
 
-    The same function gives the same text in every process, unless it is a closure, whose text does not tell what it holds.
+    A function has the same text in every process, unless it is a closure: its name does not tell what it holds.
     """
     if isinstance(value, partial):
         return jsonable(dict(function=value.func, arguments=value.args, **value.keywords))
