@@ -18,7 +18,7 @@ TINY_CRITIC = dict(hidden_sizes=(8,), batch_size=5, gradient_steps=2, warmup_gra
 
 def words(value):
     """Name the case of a test without the characters that a tool which runs single tests cannot pass on."""
-    return re.sub(r"\W+", " ", str(value)).strip()
+    return re.sub(r"\W+", " ", str(getattr(value, "__name__", value))).strip()
 
 
 def tiny_tdpg(env="Lava-v0", **kwargs):
@@ -87,6 +87,8 @@ class ToyEnv(gym.Env):
         space = self.observation_space if space is None else space
         if isinstance(space, spaces.Dict):
             return {name: self._observe(part) for name, part in space.items()}
+        if isinstance(space, spaces.Discrete):
+            return int(self.x > 0)
         if space.dtype == np.uint8:
             return np.full(space.shape, int(127 * (self.x + 1)), np.uint8)
         return np.full(space.shape, self.x, space.dtype)

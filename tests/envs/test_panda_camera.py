@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from panda_oracle import random_states
 
 from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.panda_camera import DISTANCE, EDGES, FAR, IMAGE_SIZE, NEAR, PITCH, TARGET, YAW, DepthCamera
@@ -27,14 +28,6 @@ def pixel(camera, point):
     column = (NEAR * to_right / depth - left) / (right - left) * IMAGE_SIZE
     row = IMAGE_SIZE - 1 - (NEAR * upward / depth - bottom) / (top - bottom) * IMAGE_SIZE
     return row, column, depth
-
-
-def random_states(n, seed=0):
-    rng = np.random.default_rng(seed)
-    states = np.zeros((n, 4))
-    states[:, :2] = np.add((0.5, 0.0), rng.uniform(-0.075, 0.075, (n, 2)))
-    states[:, 3] = rng.uniform(0, 2 * np.pi, n)
-    return states
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +114,7 @@ def test_the_handle_is_seen_where_the_yaw_has_it(camera):
 
 
 def test_the_mug_before_the_known_table_is_what_pybullet_draws_of_both(camera):
-    states = random_states(20)
+    states = random_states(20, half_width=0.075)
     edges = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
     whole = reference_depth(
         states, size=IMAGE_SIZE, projection=lambda c: c.computeProjectionMatrix(*edges, NEAR, FAR)
@@ -130,7 +123,7 @@ def test_the_mug_before_the_known_table_is_what_pybullet_draws_of_both(camera):
 
 
 def test_the_image_is_a_part_of_a_larger_one_with_a_field_of_view_of_90_degrees(camera):
-    states = random_states(3, seed=1)
+    states = random_states(3, seed=1, half_width=0.075)
     part = reference_depth(
         states, size=480, projection=lambda c: c.computeProjectionMatrixFOV(90.0, 4 / 3, NEAR, FAR),
         from_row=168, from_column=176,
@@ -153,7 +146,7 @@ def test_depths_are_in_metres_within_the_space_and_finite():
 
 
 def test_an_image_does_not_depend_on_those_before_it(camera):
-    states = random_states(10)
+    states = random_states(10, half_width=0.075)
     images = camera.images(states)
     np.testing.assert_array_equal(camera.images(states[::-1])[::-1], images)
     another = DepthCamera(SCENE)

@@ -253,33 +253,18 @@ def test_two_environments_in_one_process_do_not_disturb_each_other(env):
     np.testing.assert_array_equal(outcomes(env, states, actions)[0], alone)
 
 
-def leaked(n):
-    """Run some trials, then n more; the memory in kB and the bodies that the latter added."""
+@pytest.mark.slow
+def test_three_thousand_trials_leak_neither_memory_nor_bodies(env):
     resource = pytest.importorskip("resource")
-    env = PandaGraspEnv()
     env.reset(seed=0)
+    clients = env._world.simulation.client, env._world.camera.client
 
-    def trials(count):
-        for start in range(0, count, 50):
+    def peak_memory_after(n):
+        for start in range(0, n, 50):
             states, _ = env.reset_batch(50)
             env.step_batch(states, mixed_actions(states, seed=start), is_last=True)
+        assert [client.getNumBodies() for client in clients] == [3, 1]
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB
 
-    def bodies():
-        return env._world.simulation.client.getNumBodies(), env._world.camera.client.getNumBodies()
-
-    trials(100)
-    before, bodies_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, bodies()
-    trials(n)
-    assert bodies() == bodies_before == (3, 1)
-    env.close()
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-
-
-@pytest.mark.slow
-def test_hundreds_of_trials_leak_neither_memory_nor_bodies():
-    assert leaked(300) < 3_000
-
-
-@pytest.mark.slow
-def test_three_thousand_trials_leak_neither_memory_nor_bodies():
-    assert leaked(3000) < 6_000
+    before = peak_memory_after(100)
+    assert peak_memory_after(3000) - before < 6_000

@@ -11,8 +11,7 @@ from sb3_tdpg.envs.squeeze_bullet import Inserted
 from sb3_tdpg.envs.squeeze_fit import fit_angles, fit_squeeze
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv, wrap
 from sb3_tdpg.envs.squeeze_scene import PART, SqueezeScene
-
-DEGREE = math.pi / 180
+from tests.envs.test_squeeze_insert import DEGREE, parts
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +21,6 @@ def env():
     env.reset(seed=0)
     yield env
     env.close()
-
-
-def parts(*yaws):
-    """States with the given yaws in degrees."""
-    yaw = np.array(yaws) * DEGREE
-    return np.column_stack([np.sin(2 * yaw), np.cos(2 * yaw)])
 
 
 def squeeze(env, state, jaws):
@@ -286,21 +279,3 @@ def test_a_closed_environment_says_so():
     env.reset(seed=0)
     with pytest.raises(RuntimeError, match="has been closed"):
         env.step(np.zeros(1))
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        (dict(friction=-0.1), "friction=-0.1 must be between 0 and 1"),
-        (dict(friction=math.nan), "friction=nan must be between"),
-        (dict(centring_error=0.01), "centring_error=0.01 must be between 0 and 0.0035 m: else a jaw may come down"),
-        (dict(tolerance=0.3), "tolerance=0.3 must be between 0 and 0.2 rad"),
-        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite and not negative"),
-        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
-        (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
-        (dict(render_mode="human"), "render_mode='human' must be None or one of"),
-    ],
-)
-def test_a_bad_keyword_is_named(keywords, message):
-    with pytest.raises(ValueError, match=message):
-        PandaSqueezeEnv(**keywords)

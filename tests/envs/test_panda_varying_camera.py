@@ -110,14 +110,6 @@ def test_processes_give_the_same_images(env):
     shared.close()
 
 
-@pytest.mark.parametrize("camera_range", [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05, (0.0,)], ids=str)
-def test_a_bad_range_is_refused_with_the_mend(camera_range):
-    with pytest.raises(
-        ValueError, match=r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1"
-    ):
-        PandaGraspEnv(camera_range=camera_range)
-
-
 @pytest.mark.parametrize("shift", [0.03, -0.02])
 def test_a_camera_that_is_higher_in_every_trial_sees_the_same_and_the_state_does_not_tell(env, shift):
     shifted, both = PandaGraspEnv(camera_shift=shift), PandaGraspEnv(**PANDA_CAMERA, camera_shift=shift)
@@ -130,9 +122,3 @@ def test_a_camera_that_is_higher_in_every_trial_sees_the_same_and_the_state_does
     np.testing.assert_array_equal(first["state"], second["state"])
     for each in (shifted, both):
         each.close()
-
-
-@pytest.mark.parametrize(("shift", "camera_range"), [(0.11, None), (np.nan, None), (0.08, (-0.03, 0.03))], ids=str)
-def test_a_camera_out_of_reach_is_refused(shift, camera_range):
-    with pytest.raises(ValueError, match=r"camera_shift=.* must leave the camera within 0.1 m of its usual height"):
-        PandaGraspEnv(camera_shift=shift, camera_range=camera_range)

@@ -58,9 +58,3 @@ def test_the_picture_shows_peg_hole_and_fence():
     assert (rows.mean() < 60, columns.mean() > 140) == (True, True)  # up and to the right
     rows, columns = np.nonzero((image == (90, 90, 95)).all(-1))
     assert (rows.mean() > 130, columns.mean() < 70) == (True, True)
-
-
-@pytest.mark.parametrize("keyword", ["friction", "tolerance", "sensor_noise_std", "max_action", "actuator_gain"])
-def test_a_bad_keyword_is_named(keyword):
-    with pytest.raises(ValueError, match=f"{keyword}=-1.0 must be finite"):
-        PegCornerEnv(**{keyword: -1.0})

@@ -106,19 +106,3 @@ def test_the_picture_shows_the_part_turn_and_the_fingers_after_a_squeeze():
     orange = (after == (235, 130, 30)).all(-1)
     assert np.ptp(np.flatnonzero(orange.any(0))) == 71  # lies along the slot
     assert np.ptp(np.flatnonzero(orange.any(1))) == 19
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        (dict(turn=(0.9, 1.1)), r"turn\[1\]=1.1 must be between 0 and 1: a squeeze does not turn the part too far"),
-        (dict(turn=(0.9, 0.8)), "low <= high"),
-        (dict(basin=2.0), "basin=2.0 must be between 0 and 1.5708 rad"),
-        (dict(tolerance=-0.1), "tolerance=-0.1 must be finite and not negative"),
-        (dict(sensor_noise_std=math.nan), "sensor_noise_std=nan must be finite"),
-        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
-    ],
-)
-def test_a_bad_keyword_is_named(keywords, message):
-    with pytest.raises(ValueError, match=message):
-        SqueezeInsertEnv(**keywords)

@@ -1,0 +1,274 @@
+"""What every registered environment must satisfy, and what the constructors refuse."""
+
+import re
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from small_problems import words
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_tdpg import BatchedVecEnv
+from sb3_tdpg.envs import ENTRY_POINTS
+from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
+from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
+from sb3_tdpg.envs.peg_corner import PegCornerEnv
+from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
+
+EVERY_ID = pytest.mark.parametrize("env_id", sorted(ENTRY_POINTS))
+
+
+@EVERY_ID
+@pytest.mark.parametrize("check_env", [gymnasium_check_env, sb3_check_env], ids=["gymnasium", "sb3"])
+def test_every_registered_environment_passes_the_checkers(env_id, check_env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Our observations and Lava's velocity have no bounds; everything else must be without a warning.
+        warnings.filterwarnings("ignore", message=".*Box observation space m(in|ax)imum value is.*infinity.*")
+        warnings.filterwarnings("ignore", message=".*symmetric and normalized.*space.*")
+        warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes.*")
+        # A depth image is in metres, not in bytes.
+        warnings.filterwarnings("ignore", message="It seems that your observation.*is an image but")
+        env = gym.make(env_id).unwrapped
+        # A window needs a display.
+        env.metadata = {**env.metadata, "render_modes": [m for m in env.metadata["render_modes"] if m != "human"]}
+        check_env(env)
+
+
+@EVERY_ID
+def test_every_registered_environment_is_reproducible_from_its_seed(env_id):
+    def episode(seed):
+        env = gym.make(env_id)
+        env.action_space.seed(7)
+        observations = [env.reset(seed=seed)[0]]
+        for _ in range(env.unwrapped.horizon):
+            observations.append(env.step(env.action_space.sample())[0])
+        return np.stack([*observations, env.reset()[0]])
+
+    np.testing.assert_array_equal(episode(3), episode(3))
+    assert not np.array_equal(episode(3), episode(4))
+
+
+@EVERY_ID
+def test_an_episode_stays_in_the_state_space_pays_its_cost_and_is_terminated_at_the_horizon(env_id):
+    env = gym.make(env_id)
+    horizon, state_space = env.unwrapped.horizon, env.unwrapped.state_space
+    for seed in range(20):
+        env.action_space.seed(seed)
+        _, info = env.reset(seed=seed)
+        ends = []
+        for _ in range(horizon):
+            assert state_space.contains(info["state"])
+            _, reward, *end, info = env.step(env.action_space.sample())
+            assert reward == -info["cost"]
+            ends.append(end)
+        assert state_space.contains(info["state"])
+        assert ends == [[False, False]] * (horizon - 1) + [[True, False]]  # and never truncated
+
+
+@EVERY_ID
+def test_every_component_of_the_state_has_a_name_with_a_unit(env_id):
+    env = gym.make(env_id).unwrapped
+    assert (len(env.state_names),) == env.state_space.shape
+    assert all(re.fullmatch(r".+ \(.+\)", name) for name in env.state_names)
+
+
+@EVERY_ID
+def test_the_state_in_info_is_a_copy_that_may_be_overwritten(env_id):
+    env, untouched = gym.make(env_id), gym.make(env_id)
+    action = np.zeros(env.action_space.shape, np.float32)
+    _, info = env.reset(seed=0)
+    untouched.reset(seed=0)
+    info["state"][:] = 99.0
+    _, _, _, _, info = env.step(action)
+    _, _, _, _, expected = untouched.step(action)
+    np.testing.assert_array_equal(info["state"], expected["state"])
+    kept = info["state"].copy()
+    env.step(action) if env.unwrapped.horizon > 1 else env.reset()
+    np.testing.assert_array_equal(info["state"], kept)
+
+
+@EVERY_ID
+def test_a_picture_needs_a_render_mode_and_a_reset_and_shows_the_episode_s_own_state(env_id):
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=0)
+    assert env.render() is None
+    drawing = gym.make(env_id, render_mode="rgb_array").unwrapped
+    with pytest.raises(ValueError, match="before the first reset"):
+        drawing.render()
+    batch = BatchedVecEnv(drawing, 2)
+    batch.seed(0)
+    batch.reset()
+    images = batch.get_images()
+    assert not np.array_equal(*images)
+    batch.close()
+
+
+def still_ball(**kwargs):
+    """Ball catching that draws no number but for noise."""
+    return BallCatchEnv(robot_range=(0.5, 0.5), **kwargs)
+
+
+@pytest.mark.parametrize("vectorise", [
+    lambda make, **kwargs: DummyVecEnv([lambda: make(**kwargs)]),
+    lambda make, **kwargs: BatchedVecEnv(make(**kwargs), 1),
+], ids=["DummyVecEnv", "BatchedVecEnv"])  # fmt: skip
+@pytest.mark.parametrize(("make", "perturbation"), [
+    (LavaEnv, dict(sensor_noise_std=50.0)),
+    (still_ball, dict(pixel_noise_std=0.2)),
+    (still_ball, dict(pixel_noise_std=0.2, noise_mode="clip")),
+    (still_ball, dict(texture="violet_dots")),
+], ids=words)  # fmt: skip
+def test_a_perturbation_reaches_the_observation_in_every_episode_and_never_the_true_state(
+    make, perturbation, vectorise
+):
+    def run(**kwargs):
+        env = vectorise(make, horizon=4, **kwargs)
+        env.seed(0)
+        observations, states = [env.reset()[0]], [env.reset_infos[0]["state"]]
+        for _ in range(11):
+            observation, _, dones, infos = env.step(np.full((1, 1), 0.3))
+            observations.append(observation[0])
+            states.append(env.reset_infos[0]["state"] if dones[0] else infos[0]["state"])
+        return np.array(observations), np.array(states)
+
+    observations, states = run(**perturbation)
+    clean_observations, clean_states = run(**dict.fromkeys(perturbation.keys() & {"sensor_noise_std"}, 0.0))
+    np.testing.assert_array_equal(states, clean_states)
+    assert ((observations != clean_observations).reshape(12, -1).mean(axis=1) > 0.3).all()
+
+
+@pytest.mark.parametrize("make", [lambda: BallCatchEnv(renderer="pybullet", render_mode="rgb_array"),
+                                  lambda: PandaGraspEnv(render_mode="rgb_array")], ids=["ball", "panda"])  # fmt: skip
+@pytest.mark.parametrize("is_used", [True, False])
+def test_closing_twice_is_fine_and_a_closed_environment_says_so(make, is_used):
+    env = make()
+    if is_used:
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape))
+        env.render()
+    env.close()
+    env.close()
+    with pytest.raises(RuntimeError, match="has been closed: make a new one"):
+        env.reset()
+
+
+# -- what the constructors refuse ------------------------------------------------------------------------------------
+
+CAMERA_RANGE = r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1"
+CAMERA_SHIFT = r"camera_shift=.* must leave the camera within 0.1 m of its usual height"
+REFUSED = {
+    LavaEnv: [
+        (dict(sensor_noise_std=-0.1), "sensor_noise_std=-0.1 must be finite and not negative"),
+        (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
+        (dict(sensor_noise_std=np.inf), "sensor_noise_std=inf must be finite"),
+        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
+        (dict(horizon=2.5), "horizon=2.5 must be an integer of at least 1"),
+        (dict(max_action=0.0), "max_action=0.0 must be finite and positive"),
+        (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
+        (dict(action_cost=np.nan), "action_cost=nan must be finite"),
+        (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
+        (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
+        (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
+    ],
+    BallCatchEnv: [
+        (dict(pixel_noise_std=-0.1), "pixel_noise_std=-0.1 must be finite and not negative"),
+        (dict(pixel_noise_std=np.nan), "pixel_noise_std=nan must be finite"),
+        (dict(noise_mode="max"), r"noise_mode='max' must be one of \['minmax', 'clip'\]"),
+        (dict(renderer="opengl"), r"renderer='opengl' must be one of \['pybullet', 'fast'\]"),
+        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
+        (dict(n_processes=0), "n_processes=0 must be"),
+        (dict(dt=0.0), "dt=0.0 must be finite and positive"),
+        (dict(control_gain=-1.0), "control_gain=-1.0 must be finite and positive"),
+        (dict(gravity=np.inf), "gravity=inf must be finite"),
+        (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
+        (dict(robot_range=(1.0, -1.0)), r"robot_range=\(1.0, -1.0\) must be \(low, high\)"),
+        (dict(robot_range=2.0), r"robot_range=2.0 must be \(low, high\)"),
+        (dict(ball_start_range=(8.0, 1.0)), r"ball_start_range=\(8.0, 1.0\) must be \(\(low_x, low_y\)"),
+        (dict(ball_speed_range=((-4, 8), (-5, 8))), r"ball_speed_range=.* must be \(\(low_x, low_y\).* low <= high"),
+        (dict(ball_color=(0, 255, 0)), r"ball_color=\(0, 255, 0\) must be \(red, green, blue\), each between 0 and 1"),
+        (dict(ball_radius=0.0), "ball_radius=0.0 must be finite and positive"),
+        (dict(camera_height=-1.0), "camera_height=-1.0 must be finite and positive"),
+        (dict(camera_pitch=90.0), "camera_pitch=90.0 must be between -90 and 90 degrees"),
+        (dict(fov=np.nan), "fov=nan must be between 0 and 180 degrees"),
+        (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
+        (dict(texture="bricks"), r"texture='bricks' is unknown: use one of \['brick', 'blue_tiles', .*'red_planks'\]"),
+        (dict(texture=np.zeros((8, 8), np.uint8)), r"shape \(8, 8\) and dtype uint8; expected \(height, width, 3\)"),
+        (dict(texture=np.zeros((8, 8, 3))), "dtype float64; expected"),
+    ],
+    PandaGraspEnv: [
+        (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.2 m"),
+        (dict(xy_half_width=np.nan), "xy_half_width=nan must be between 0 and 0.2 m"),
+        (dict(yaw_range=(1.0, -1.0)), r"yaw_range=\(1.0, -1.0\) must be \(low, high\) of finite numbers in rad"),
+        (dict(yaw_range=3.0), "yaw_range=3.0 must be"),
+        (dict(yaw_range=(0.0, np.inf)), "yaw_range=.* must be"),
+        (dict(mug_scale=0.0), "mug_scale=0.0 must be between 0.5 and 1.5"),
+        (dict(frame_offset=1.0), "frame_offset=1.0 must be between -0.05 and 0.05 m"),
+        (dict(friction=-1.0), "friction=-1.0 must be finite and not negative"),
+        (dict(solver_iterations=0), "solver_iterations=0 must be None or an integer of at least 1"),
+        (dict(solver_iterations=1.5), "solver_iterations=1.5 must be None or an integer"),
+        (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
+        (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
+        (dict(depth_noise_std=np.nan), "depth_noise_std=nan must be finite"),
+        (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
+        *((dict(camera_range=value), CAMERA_RANGE)
+          for value in [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05, (0.0,)]),
+        (dict(camera_shift=0.11), CAMERA_SHIFT),
+        (dict(camera_shift=np.nan), CAMERA_SHIFT),
+        (dict(camera_shift=0.08, camera_range=(-0.03, 0.03)), CAMERA_SHIFT),
+    ],
+    PandaSqueezeEnv: [
+        (dict(friction=-0.1), "friction=-0.1 must be between 0 and 1"),
+        (dict(friction=np.nan), "friction=nan must be between"),
+        (dict(centring_error=0.01), "centring_error=0.01 must be between 0 and 0.0035 m: else a jaw may come down"),
+        (dict(tolerance=0.3), "tolerance=0.3 must be between 0 and 0.2 rad"),
+        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite and not negative"),
+        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
+        (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
+        (dict(render_mode="human"), "render_mode='human' must be None or one of"),
+    ],
+    SqueezeInsertEnv: [
+        (dict(turn=(0.9, 1.1)), r"turn\[1\]=1.1 must be between 0 and 1: a squeeze does not turn the part too far"),
+        (dict(turn=(0.9, 0.8)), "low <= high"),
+        (dict(basin=2.0), "basin=2.0 must be between 0 and 1.5708 rad"),
+        (dict(tolerance=-0.1), "tolerance=-0.1 must be finite and not negative"),
+        (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
+        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
+    ],
+    PegCornerEnv: [
+        (dict(friction=-1.0), "friction=-1.0 must be finite"),
+        (dict(tolerance=-1.0), "tolerance=-1.0 must be finite"),
+        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite"),
+        (dict(max_action=-1.0), "max_action=-1.0 must be finite"),
+        (dict(actuator_gain=-1.0), "actuator_gain=-1.0 must be finite"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("make", "keywords", "message"), [(make, *row) for make, rows in REFUSED.items() for row in rows], ids=words
+)
+def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(make, keywords, message):
+    with pytest.raises(ValueError, match=message):
+        make(**keywords)
+
+
+@pytest.mark.parametrize("make", REFUSED, ids=words)
+def test_a_misspelt_keyword_is_not_swallowed(make):
+    with pytest.raises(TypeError, match="sensor_nois"):
+        make(sensor_nois=0.1)
+
+
+def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no_such_wall.png'.*no such image file"):
+        BallCatchEnv(texture=tmp_path / "no_such_wall.png")
+    for kind, name, content in ((str, "a.png", b"\x89PNG\r\n\x1a\n but then nothing"), (Path, "a.jpg", b"text")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}' cannot be read as an image"):
+            BallCatchEnv(texture=kind(tmp_path / name))
