@@ -20,7 +20,6 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.envs.lava import LavaEnv
 
 IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
-DEPTH = spaces.Box(0.2, 0.7, (1, 16, 16), np.float32)
 
 
 def lava(n=20, **kwargs):
@@ -38,6 +37,10 @@ class NamedTwice(LavaEnv):
 
 # Name of the case: what is done, and what the message must say (regular expressions, in any order).
 ARGUMENTS = {
+    **{f"policy {name}": (dict(policy=name), f"policy='{name}'", r"\['TRVPolicy'\]", "takes vectors, images and dicts")
+       for name in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy", "MlpLstmPolicy")},
+    "policy of PPO": (dict(policy=PPO.policy_aliases["MlpPolicy"]), "ActorCriticPolicy", "TRVPolicy"),
+    "policy a number": (dict(policy=3), "policy=3", "TRVPolicy"),
     "beta zero": (dict(beta=0.0), "beta=0.0", "positive number", "inf"),
     "beta negative": (dict(beta=-1.0), "beta=-1.0", "positive number"),
     "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
@@ -71,7 +74,9 @@ ARGUMENTS = {
         dict(mi_estimator="mime"), "mi_estimator='mime'", r"\['directed', .* 'smile', 'vib'\]"
     ),
     "estimator of a wrong class": (dict(mi_estimator=th.nn.Linear), "mi_estimator", "InformationEstimator"),
-    "unknown key of mi_kwargs": (dict(mi_kwargs=dict(hiden_sizes=(8,))), "mi_kwargs", "hiden_sizes"),
+    "unknown key of mi_kwargs": (
+        dict(mi_estimator="mine", mi_kwargs=dict(hiden_sizes=3)), "mi_kwargs", "'hiden_sizes': did you mean 'hidden_si"
+    ),
     "mi_kwargs for another estimator": (
         dict(mi_estimator="logdet", mi_kwargs=dict(batch_size=5)), "mi_kwargs", "batch_size", "LogDet"
     ),
@@ -89,7 +94,9 @@ ARGUMENTS = {
     "n_episodes a float": (dict(n_episodes=20.0), "n_episodes=20.0", "integer"),
     "n_envs zero": (dict(n_envs=0), "n_envs=0", "integer of at least 1"),
     "n_envs for an environment": (dict(env=lava(20), n_envs=10), "n_envs=10", "leave n_envs out"),
-    "unknown baseline": (dict(baseline="median"), "baseline='median'", r"\['mean', 'regression', 'value'\]"),
+    "unknown baseline": (
+        dict(baseline="median"), r"baseline='median' is unknown: use one of \['mean', 'regression', 'value'\]"
+    ),
     "unknown encoder gradient": (
         dict(encoder_gradient="sore"), "encoder_gradient='sore'", r"\['score', 'pathwise'\]"
     ),
@@ -147,8 +154,12 @@ ARGUMENTS = {
     ),
     "both lengths": (dict(n_episodes=10, epoch_steps=100), "n_episodes=10 and epoch_steps=100", "give one of them"),
     "rewards normalised": (dict(env=VecNormalize(lava())), "norm_reward=False", "beta"),
-    "unknown key of policy_kwargs": (dict(policy_kwargs=dict(trv_dims=2)), "policy_kwargs", "trv_dims"),
-    "policy_kwargs of a wrong type": (dict(policy_kwargs="trv_dim=2"), "policy_kwargs", "dict"),
+    "unknown key of policy_kwargs": (
+        dict(policy_kwargs=dict(trv_dims=2)), "policy_kwargs", "'trv_dims': did you mean 'trv_dim'"
+    ),
+    "policy_kwargs of a wrong type": (
+        dict(policy_kwargs="trv_dim=2"), "policy_kwargs='trv_dim=2' must be a dict of keywords of TRVPolicy$"
+    ),
     "unknown key of net_arch": (
         dict(policy_kwargs=dict(net_arch=dict(pi=[64]))), "net_arch", r"\['action_head', 'encoder'\]"
     ),
@@ -165,74 +176,32 @@ ARGUMENTS = {
 @pytest.mark.parametrize("case", ARGUMENTS)
 def test_a_bad_argument_is_refused_with_the_mend(case):
     kwargs, *fragments = ARGUMENTS[case]
-    kwargs = {"env": "Lava-v0", "n_episodes": 20, "device": "cpu", **kwargs}
     with pytest.raises((ValueError, gym.error.Error)) as error:
-        TDPG("TRVPolicy", **kwargs)
+        TDPG(**{"policy": "TRVPolicy", "env": "Lava-v0", "n_episodes": 20, "device": "cpu", **kwargs})
     for fragment in fragments:
         assert re.search(fragment, str(error.value)), f"{fragment!r} is not in {error.value!s}"
 
 
-@pytest.mark.parametrize(("policy", "fragments"), [
-    ("MlpPolicy", ["policy='MlpPolicy'", r"\['TRVPolicy'\]"]),
-    (PPO.policy_aliases["MlpPolicy"], ["ActorCriticPolicy", "TRVPolicy"]),
-    (3, ["policy=3", "TRVPolicy"]),
-], ids=["unknown", "foreign", "no_class"])  # fmt: skip
-def test_a_foreign_policy_is_refused_with_the_mend(policy, fragments):
-    with pytest.raises(ValueError) as error:
-        TDPG(policy, "Lava-v0", n_episodes=20, device="cpu")
-    for fragment in fragments:
-        assert re.search(fragment, str(error.value)), error.value
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        (dict(n_episods=3), "no argument 'n_episods': did you mean 'n_episodes'"),
-        (dict(n_step=3), "no argument 'n_step': use epoch_steps"),
-        (dict(xyz=3), "no argument 'xyz'$"),
-        (dict(policy_kwargs=dict(trv_dims=3)), "'trv_dims': did you mean 'trv_dim'"),
-        (dict(mi_estimator="mine", mi_kwargs=dict(batchsize=3)), "'batchsize': did you mean 'batch_size'"),
-        (dict(policy_kwargs=3), "policy_kwargs=3 must be a dict of keywords of TRVPolicy$"),
-    ],
-)
-def test_an_unknown_keyword_is_told_with_the_nearest_name(keywords, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        TDPG("TRVPolicy", "Lava-v0", **keywords)
-
-
-@pytest.mark.parametrize(("given", "equivalent"), [
-    (dict(n_steps=2048), "use epoch_steps"),
-    (dict(ent_coef=0.0), "action_log_var_init"),
-    (dict(use_sde=True), "encoder_log_var_init"),
+@pytest.mark.parametrize(("name", "mend"), [
+    ("n_episods", ": did you mean 'n_episodes'"),
+    ("xyz", "$"),
+    ("n_step", ": use epoch_steps"),
+    ("n_steps", ": use epoch_steps"),  # this one and those below are PPO's
+    ("ent_coef", ".*action_log_var_init"),
+    ("use_sde", ".*encoder_log_var_init"),
 ])  # fmt: skip
-def test_an_argument_of_ppo_is_refused_with_its_equivalent(given, equivalent):
-    (name,) = given
-    with pytest.raises(TypeError, match=f"no argument '{name}'.*{equivalent}"):
-        TDPG("TRVPolicy", **given)
-
-
-@pytest.mark.parametrize("name", ["MlpPolicy", "CnnPolicy", "MultiInputPolicy", "MlpLstmPolicy"])
-def test_a_policy_of_ppo_is_refused_with_ours(name):
-    with pytest.raises(ValueError, match=f"{name}.*TRVPolicy takes vectors, images and dicts"):
-        TDPG(name, "Lava-v0")
+def test_an_unknown_argument_is_told_with_the_nearest_name_or_its_equivalent(name, mend):
+    with pytest.raises(TypeError, match=f"no argument '{name}'{mend}"):
+        TDPG("TRVPolicy", **{name: 3})
 
 
 # -- files -----------------------------------------------------------------------------------------------------
 
 
-def corrupt(path):
+def half(path):
     tiny_tdpg().save(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-
-
-def text(path):
-    path.write_text("no zip file")
-
-
-def empty_archive(path):
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("readme.txt", "something else")
 
 
 def rewritten(change):
@@ -255,9 +224,10 @@ def part(wanted, content):
 
 
 DAMAGED = {
-    "half": corrupt,
-    "text": text,
+    "half": half,
+    "text": lambda path: path.write_text("no zip file"),
     "empty": lambda path: path.write_bytes(b""),
+    "nothing in an archive": rewritten(lambda name, old: None),
     "no weights": part("policy.pth", None),
     "half of the weights": rewritten(lambda name, old: old[: len(old) // 2] if name == "policy.pth" else old),
     "no settings": part("data", None),
@@ -287,53 +257,28 @@ def test_a_damaged_model_is_told_in_a_line_that_names_it(write, tmp_path, capsys
         assert not out.exists()
 
 
-def test_an_argument_that_does_not_fit_is_not_taken_for_a_damaged_model(tmp_path):
-    tiny_tdpg().save(tmp_path / "model")
-    with pytest.raises(Exception) as error:
-        TDPG.load(tmp_path / "model", device="cpu", mi_estimator="mine")
-    assert "damaged" not in str(error.value)
-
-
-def saved_ppo(path):
-    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(path)
-
-
-@pytest.mark.parametrize(("write", "fragments"), [
-    (corrupt, ["model.zip", "zip|corrupt|damaged|whole"]),
-    (text, ["model.zip", "zip"]),
-    (empty_archive, ["model.zip", "saved|TDPG"]),
-    (saved_ppo, ["TRVPolicy", "class that saved it"]),
-], ids=["corrupt", "no_zip", "foreign_zip", "saved_by_PPO"])  # fmt: skip
-def test_a_file_that_is_no_tdpg_model_is_refused(write, fragments, tmp_path):
-    path = tmp_path / "model.zip"
-    write(path)
-    with pytest.raises(ValueError) as error:
-        TDPG.load(path, device="cpu")
-    for fragment in fragments:
-        assert re.search(fragment, str(error.value)), error.value
-
-
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no_such_model"):
         TDPG.load(tmp_path / "no_such_model", device="cpu")
 
 
-def test_a_model_is_not_loaded_for_an_environment_of_another_horizon(tmp_path):
+def test_a_model_of_ppo_is_refused(tmp_path):
+    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"TRVPolicy.*class that saved it"):
+        TDPG.load(tmp_path / "model", device="cpu")
+
+
+@pytest.mark.parametrize(("kwargs", "error", "message"), [
+    (dict(env=lava(horizon=7)), ValueError, r"horizon=7.*made for horizon=5.*same shape"),
+    (dict(env=lava(6)), ValueError, "use 18 or 24"),
+    (dict(env=lava(), beta=-1.0), ValueError, "beta=-1.0 must be a positive number"),
+    (dict(mi_estimator="mine"), RuntimeError, "loading state_dict for Mine"),
+], ids=["horizon", "n_envs", "beta", "estimator"])  # fmt: skip
+def test_a_model_is_not_loaded_with_what_does_not_fit_and_not_taken_for_damaged(kwargs, error, message, tmp_path):
     tiny_tdpg().save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"horizon=7.*made for horizon=5.*same shape"):
-        TDPG.load(tmp_path / "model", env=lava(horizon=7), device="cpu")
-
-
-def test_a_model_is_not_loaded_for_a_number_of_environments_that_does_not_fit(tmp_path):
-    tiny_tdpg().save(tmp_path / "model")
-    with pytest.raises(ValueError, match="use 18 or 24"):
-        TDPG.load(tmp_path / "model", env=lava(6), device="cpu")
-
-
-def test_a_bad_beta_is_refused_when_a_model_is_loaded_with_it(tmp_path):
-    tiny_tdpg().save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"beta=-1.0 must be a positive number"):
-        TDPG.load(tmp_path / "model", env=lava(), beta=-1.0, device="cpu")
+    with pytest.raises(error, match=message) as refused:
+        TDPG.load(tmp_path / "model", **kwargs, device="cpu")
+    assert "damaged" not in str(refused.value)
 
 
 # -- a model that stands ---------------------------------------------------------------------------------------
@@ -357,28 +302,23 @@ def test_a_dict_is_refused_by_predict():
         tiny_tdpg().predict({"a": np.zeros(2, np.float32)})
 
 
-@pytest.mark.parametrize(("kwargs", "message"), [
-    (dict(), "give cost_limit .* mi_limit .* or both"),
-    (dict(cost_limit=math.nan), "cost_limit is NaN"),
-    (dict(mi_limit=math.nan), "mi_limit is NaN"),
-    (dict(mi_limit=-0.1), "mi_limit=-0.1 must not be negative"),
-], ids=str)  # fmt: skip
-def test_a_selection_without_sensible_limits_is_refused(kwargs, message):
+POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete(2), lr_schedule=lambda _: 1e-3)
+
+
+@pytest.mark.parametrize(("make", "kwargs", "message"), [
+    (SelectionCallback, dict(), "give cost_limit .* mi_limit .* or both"),
+    (SelectionCallback, dict(cost_limit=math.nan), "cost_limit is NaN"),
+    (SelectionCallback, dict(mi_limit=math.nan), "mi_limit is NaN"),
+    (SelectionCallback, dict(mi_limit=-0.1), "mi_limit=-0.1 must not be negative"),
+    (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=0), "save_freq=0 must be at least 1"),
+    (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=-1), "save_freq=-1 must be at least 1"),
+    (TRVPolicy, dict(POLICY, horizon=0), "horizon.*at least 1"),
+    (TRVPolicy, dict(POLICY, horizon=-1), "horizon.*at least 1"),
+    (TRVPolicy, dict(POLICY, horizon=2.5), "horizon.*at least 1"),
+])  # fmt: skip
+def test_a_callback_or_a_policy_of_its_own_refuses_a_bad_argument(make, kwargs, message):
     with pytest.raises(ValueError, match=message):
-        SelectionCallback(**kwargs)
-
-
-@pytest.mark.parametrize("save_freq", [0, -1])
-def test_a_checkpoint_frequency_below_one_is_refused(save_freq, tmp_path):
-    with pytest.raises(ValueError, match=rf"save_freq={save_freq} must be at least 1"):
-        TrainingCheckpointCallback(tmp_path / "checkpoint", save_freq=save_freq)
-
-
-@pytest.mark.parametrize("horizon", [0, -1, 2.5])
-def test_a_policy_of_its_own_needs_a_horizon(horizon):
-    space = spaces.Box(-1, 1, (2,), np.float32)
-    with pytest.raises(ValueError, match=r"horizon.*at least 1"):
-        TRVPolicy(space, space, lambda _: 1e-3, horizon=horizon)
+        make(**kwargs)
 
 
 class Payload:
@@ -392,13 +332,9 @@ class Payload:
 
 
 def test_a_payload_among_the_weights_is_refused_in_one_line(tmp_path):
-    model, marker = tmp_path / "model.zip", tmp_path / "marker"
-    tiny_tdpg().save(model)
-    changed = io.BytesIO()
+    marker, changed = tmp_path / "marker", io.BytesIO()
     th.save({"weight": Payload(marker)}, changed)
-    with zipfile.ZipFile(model) as old, zipfile.ZipFile(tmp_path / "bad.zip", "w") as new:
-        for name in old.namelist():
-            new.writestr(name, changed.getvalue() if name == "policy.pth" else old.read(name))
+    part("policy.pth", changed.getvalue())(tmp_path / "bad.zip")
     with pytest.raises(ValueError, match="is not a model of TDPG") as refused:
         TDPG.load(tmp_path / "bad.zip")
     assert len(str(refused.value).splitlines()) == 1
