@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs
+from small_problems import ToyEnv, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
 
 from sb3_tdpg import TDPG, TRVPolicy
 from sb3_tdpg.buffers import RebuiltTRVs, each
@@ -125,8 +125,10 @@ def test_the_memory_matters_and_is_cleared_where_an_episode_starts():
     observation = np.random.default_rng(0).normal(size=(N, 3)).astype(np.float32)
     fresh, fresh_state = policy.predict(observation, deterministic=True)
     _, memory = policy.predict(5 * observation, deterministic=True)
-    start = np.array([True, False] * 3)
+    kept, start = [x.copy() for x in memory], np.array([True, False] * 3)
     mixed, mixed_state = policy.predict(observation, memory, start, deterministic=True)
+    for x, expected in zip(memory, kept, strict=True):  # what is passed in is not changed
+        np.testing.assert_array_equal(x, expected)
     np.testing.assert_array_equal(mixed[start], fresh[start])
     np.testing.assert_array_equal(mixed_state[0][start], fresh_state[0][start])
     assert (np.abs(mixed_state[0] - fresh_state[0])[~start] > 1e-5).all()
@@ -148,16 +150,6 @@ def test_a_gate_keeps_the_last_trvs_where_it_is_closed_and_replaces_them_where_i
     assert make_policy(gate=False, trv_dim=2).encoder.sizes[-1] == 4
     with pytest.raises(ValueError, match="gate=True and skip=True"):
         make_policy(gate=True, skip=True, trv_dim=3)
-
-
-def test_the_state_that_is_passed_in_is_not_changed():
-    policy = make_policy()
-    observation = np.ones((N, 3), np.float32)
-    _, state = policy.predict(observation)
-    kept = [x.copy() for x in state]
-    policy.predict(observation, state, np.ones(N, bool))
-    for x, expected in zip(state, kept, strict=True):
-        np.testing.assert_array_equal(x, expected)
 
 
 @pytest.mark.parametrize("time_varying", [True, False])
@@ -351,18 +343,30 @@ def test_a_saved_policy_predicts_the_same(tmp_path):
 # -- spaces ----------------------------------------------------------------------------------------------------
 
 
+MORE_ACTION_SPACES = {
+    **ACTION_SPACES,
+    "scalar": spaces.Box(-1, 1, (), np.float32),
+    "binary matrix": spaces.MultiBinary((2, 3)),
+    "discrete matrix": spaces.MultiDiscrete(np.array([[2, 3], [4, 5]])),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array")  # a scalar action
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
-@pytest.mark.parametrize("name", ACTION_SPACES)
-def test_every_kind_of_action_space_trains_and_gives_valid_actions(name, encoder_gradient, tmp_path):
+@pytest.mark.parametrize("space", MORE_ACTION_SPACES.values(), ids=MORE_ACTION_SPACES)
+def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encoder_gradient, tmp_path):
     # ToyEnv itself asserts that each action is in the space.
-    model = tiny_tdpg(toy_vec_env(action_space=ACTION_SPACES[name]), encoder_gradient=encoder_gradient, beta=0.1)
+    model = tiny_tdpg(toy_vec_env(action_space=space), encoder_gradient=encoder_gradient, beta=0.1)
+    before = parameters(model.policy)
     train_epochs(model, 2)
+    assert not same_parameters(before, parameters(model.policy))
     observation = model.observation_space.sample()
     for deterministic in (True, False):
         action, _ = model.predict(observation, deterministic=deterministic)
-        assert ACTION_SPACES[name].contains(action if np.ndim(action) else np.int64(action))
+        assert isinstance(action, np.ndarray)
+        assert space.contains(action)
         batch, _ = model.predict(np.stack([observation] * 5), deterministic=deterministic)
-        assert batch.shape == (5, *ACTION_SPACES[name].shape)
+        assert batch.shape == (5, *space.shape)
     model.save(tmp_path / "model")
     loaded = TDPG.load(tmp_path / "model", device="cpu")
     expected, _ = model.predict(observation, deterministic=True)
@@ -412,24 +416,13 @@ def test_images_train_in_either_layout(space, tmp_path):
     train_epochs(loaded, 1)
 
 
-def test_a_discrete_observation_is_taken_as_the_state():
-    space = spaces.Discrete(2)
-
-    class Coin(ToyEnv):
-        def _observe(self):
-            return int(self.x > 0)
-
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
-    model = tiny_tdpg(DummyVecEnv([lambda: Coin(space, gives_state=False)] * 2), beta=0.1)
+@pytest.mark.parametrize("space", [VECTOR, spaces.Box(-1, 1, (4, 2), np.float32), spaces.Discrete(2)], ids=str)
+def test_without_a_true_state_the_observation_is_taken_for_it(space):
+    model = tiny_tdpg(toy_vec_env(observation_space=space, gives_state=False), beta=0.1)
     train_epochs(model, 2)
-    assert model.predict(1)[0].shape == (1,)
-
-
-def test_an_environment_without_a_true_state_is_taken_as_fully_observed():
-    model = tiny_tdpg(toy_vec_env(gives_state=False), beta=0.1)
-    train_epochs(model, 1)
-    np.testing.assert_array_equal(model.rollout_buffer.states, model.rollout_buffer.observations)
+    states, observations = model.rollout_buffer.states, model.rollout_buffer.observations
+    np.testing.assert_array_equal(states, observations.reshape(states.shape))
+    assert model.predict(space.sample())[0].shape == (1,)
 
 
 def test_no_observation_drives_the_trv_means_out_of_the_unit_box_unless_asked_to():
