@@ -23,6 +23,14 @@ def rows(n, value):
     return {name: np.full((n, *shape), value, np.float32) for name, shape in SHAPES.items()}
 
 
+def fill(buffer, value_of_step=lambda t: 1.0):
+    """Store an epoch of N episodes of T steps."""
+    for t in range(T):
+        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, value_of_step(t)))
+    buffer.full = True
+    return buffer.episode_batch()
+
+
 def test_a_step_is_stored_at_its_time_and_in_its_episode(buffer):
     buffer.add_step(np.array([0, 2, 1]), np.array([3, 0, 1]), **rows(3, 7.0))
     expected = np.zeros((T, N), np.float32)
@@ -36,10 +44,7 @@ def test_a_step_is_stored_at_its_time_and_in_its_episode(buffer):
 
 
 def test_the_batch_has_every_field_as_a_tensor_and_does_not_change_with_the_next_epoch(buffer):
-    for t in range(T):
-        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, float(t)))
-    buffer.full = True
-    batch = buffer.episode_batch()
+    batch = fill(buffer, float)
     for name in STORED:
         np.testing.assert_array_equal(getattr(batch, name), getattr(buffer, name))
         assert isinstance(getattr(batch, name), th.Tensor)
@@ -65,16 +70,11 @@ def test_a_reset_forgets_the_last_epoch(buffer):
 
 
 def test_the_previous_trvs_are_those_of_the_step_before_and_zero_at_the_start(buffer):
-    for t in range(T):
-        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, t + 1.0))
-    buffer.full = True
-    batch = buffer.episode_batch()
-    assert batch.prev_trvs[:, 0, 0].tolist() == [0, 1, 2]
+    assert fill(buffer, lambda t: t + 1.0).prev_trvs[:, 0, 0].tolist() == [0, 1, 2]
 
 
 def test_the_cost_of_an_episode_is_the_sum_of_its_steps(buffer):
-    for t in range(T):
-        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, 10.0**t))
+    fill(buffer, lambda t: 10.0**t)
     np.testing.assert_array_equal(buffer.episode_costs, [111.0] * N)
 
 
@@ -91,8 +91,7 @@ def test_the_information_batch_has_a_mask_only_if_an_episode_ended_early(buffer)
 
 
 def test_a_forgotten_episode_has_neither_cost_nor_life(buffer):
-    for t in range(T):
-        buffer.add_step(np.full(N, t), np.arange(N), **rows(N, 1.0))
+    fill(buffer)
     buffer.clear_episodes(np.array([1]))
     assert buffer.costs.sum(0).tolist() == [T, 0, *[T] * (N - 2)]
     assert buffer.alive.sum(0).tolist() == [T, 0, *[T] * (N - 2)]

@@ -2,6 +2,7 @@
 
 import math
 from itertools import permutations
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from small_problems import parameters, tiny_tdpg, toy_vec_env, train_epochs
 
-from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg import TDPG, BatchedVecEnv, TRVPolicy
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import BALL_CATCH
 from sb3_tdpg.evaluation import evaluate_scenarios
@@ -18,26 +19,13 @@ IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
 PASSES = dict(n_epochs=3, batch_size=8, clip_range=0.2)
 
 
-def steps_of(model, monkeypatch):
-    """Count the optimiser's steps, and the episodes that each has seen."""
-    seen = []
-    original = model.policy.evaluate_episodes
-
-    def counting(batch, *args, **kwargs):
-        if th.is_grad_enabled():
-            seen.append(batch.costs.shape[1])
-        return original(batch, *args, **kwargs)
-
-    monkeypatch.setattr(model.policy, "evaluate_episodes", counting)
-    return seen
-
-
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
 def test_an_epoch_makes_so_many_passes_over_minibatches_of_whole_episodes(encoder_gradient, monkeypatch):
     model = tiny_tdpg(**PASSES, encoder_gradient=encoder_gradient)
-    seen = steps_of(model, monkeypatch)
+    evaluate = Mock(wraps=model.policy.evaluate_episodes)
+    monkeypatch.setattr(model.policy, "evaluate_episodes", evaluate)
     train_epochs(model, 1)
-    assert seen == [7, 7, 6] * 3
+    assert [call.args[0].costs.shape[1] for call in evaluate.call_args_list] == [7, 7, 6] * 3
     assert model.epoch == 1
     assert model._n_updates == 3
 
@@ -142,11 +130,13 @@ def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
 
 
 def test_vectors_are_learnt_from_with_one_update_an_epoch():
-    model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
+    model = TDPG(env="Lava-v0", device="cpu").learn(2500)
+    assert model.epoch == 1
+    assert isinstance(model.policy, TRVPolicy)
     assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, None)
     assert (model.clip_range(1.0), model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "logdet")
     assert not model.normalize_advantage
-    assert model.env.num_envs == 500
+    assert model.rollout_buffer.n_envs == model.env.num_envs == 500
 
 
 def test_images_are_learnt_from_with_ppos_passes_a_nuisance_and_a_bottleneck():
