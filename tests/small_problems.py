@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg.cli import main
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.experiments.runs import complete_run
@@ -224,3 +225,11 @@ def complete_runs_here(tasks, *, n_eval_episodes, jobs=None):
         complete_run(*task, n_eval_episodes=n_eval_episodes)
         waiting.remove(task)
         unfinished.remove(task[1])
+
+
+def error_line(capsys, *command):
+    """Run a command of the package that must fail with exit code 2 and one line about it; return that line."""
+    assert main([str(argument) for argument in command]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("error: ")
+    return line

@@ -5,6 +5,7 @@ import re
 
 import pandas as pd
 import pytest
+from small_problems import error_line
 
 from sb3_tdpg.cli import main
 
@@ -73,10 +74,7 @@ BAD = {
 @pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
 def test_bad_input_is_told_in_a_line(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert re.search(message, error)
-    assert len(error.splitlines()) == 1
+    assert re.search(message, error_line(capsys, *arguments))
     assert not list(tmp_path.iterdir())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from PIL import Image
-from small_problems import ToyEnv, tiny_tdpg
+from small_problems import ToyEnv, error_line, tiny_tdpg
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
@@ -77,6 +77,13 @@ def frames_of(path):
             frames.append(np.asarray(film.convert("RGB")))
             durations.append(film.info["duration"])
     return frames, durations
+
+
+def animate(path, *, n_trvs=2, trv=0.0, width=400, fps=10):
+    """Record three steps with white pictures and constant TRVs."""
+    pictures = [np.full((40, width, 3), 255, np.uint8)] * 4
+    save_animation([Episode(pictures, np.full((3, n_trvs), trv), np.ones(3))], path, horizon=3, fps=fps)
+    return path
 
 
 def costs_printed(text):
@@ -179,29 +186,20 @@ def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(registered, tm
 
 
 def test_the_letters_grow_with_the_picture(tmp_path):
-    panels = []
-    for width in (400, 800):
-        pictures = [np.full((40, width, 3), 255, np.uint8)] * 4
-        path = tmp_path / f"{width}.gif"
-        save_animation([Episode(pictures, np.zeros((3, 2)), np.ones(3))], path, horizon=3, fps=10)
-        panels.append(frames_of(path)[0][0][40:])
+    panels = [frames_of(animate(tmp_path / "film.gif", width=width))[0][0][40:] for width in (400, 800)]
     small, large = (panel.mean(-1) < 128 for panel in panels)
     assert large.shape == (2 * small.shape[0], 2 * small.shape[1])
     assert large.mean() == pytest.approx(small.mean(), rel=0.3)  # half as dark if letters and lines stayed as they are
 
 
 def test_many_trvs_and_constant_ones_can_be_drawn(tmp_path):
-    pictures = [np.full((40, 500, 3), 10 * t, np.uint8) for t in range(4)]
-    save_animation([Episode(pictures, np.zeros((3, 20)), np.ones(3))], tmp_path / "film.gif", horizon=3, fps=1000)
-    assert frames_of(tmp_path / "film.gif")[1] == [20, 20, 20, 1000]
+    assert frames_of(animate(tmp_path / "film.gif", n_trvs=20, fps=1000))[1] == [20, 20, 20, 1000]
 
 
 def test_few_trvs_are_lines_and_many_are_rows_of_colours_up_to_the_present_step(tmp_path):
-    pictures = [np.full((40, 400, 3), 255, np.uint8)] * 4
     for n_trvs, is_coloured in ((8, False), (9, True)):
-        path = tmp_path / f"{n_trvs}.gif"
-        save_animation([Episode(pictures, np.full((3, n_trvs), 5.0), np.ones(3))], path, horizon=3, fps=10)
-        panels = [frame[40 + 26 : -42, 62:-76].astype(int) for frame in frames_of(path)[0]]
+        frames, _ = frames_of(animate(tmp_path / "film.gif", n_trvs=n_trvs, trv=5.0))
+        panels = [frame[40 + 26 : -42, 62:-76].astype(int) for frame in frames]
         # The largest value is dark red, and so is the whole row up to the present step.
         red = [((x[..., 0] > x[..., 1] + 60) & (x[..., 0] > x[..., 2] + 60)).mean() for x in panels]
         assert (red[2] > 0.5) == is_coloured
@@ -211,8 +209,7 @@ def test_few_trvs_are_lines_and_many_are_rows_of_colours_up_to_the_present_step(
 
 
 def test_a_film_that_could_not_be_written_leaves_the_old_one_and_nothing_else(tmp_path, monkeypatch):
-    pictures = [np.zeros((40, 500, 3), np.uint8)] * 4
-    episodes, path = [Episode(pictures, np.zeros((3, 2)), np.ones(3))], tmp_path / "film.gif"
+    path = tmp_path / "film.gif"
     path.write_bytes(b"old")
 
     def interrupted(image, file, *args, **kwargs):
@@ -221,7 +218,7 @@ def test_a_film_that_could_not_be_written_leaves_the_old_one_and_nothing_else(tm
 
     monkeypatch.setattr(Image.Image, "save", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        save_animation(episodes, path, horizon=3, fps=10)
+        animate(path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -292,28 +289,14 @@ def test_bad_input_is_reported_in_one_line_with_exit_code_2(arguments, fragments
     assert not list(tmp_path.iterdir())
 
 
-def a_missing_file(path):
-    return "cannot be read (No such file"
-
-
-def a_folder(path):
-    path.mkdir()
-    return "cannot be read (Is a directory)"
-
-
-def no_zip(path):
-    path.write_text("text")
-    return "cannot be read (File is not a zip file)"
-
-
-@pytest.mark.parametrize("make", [a_missing_file, a_folder, no_zip])
-def test_what_is_no_model_is_reported_in_one_line_with_exit_code_2(make, tmp_path, capsys):
-    path = tmp_path / "model.zip"
-    expected = make(path)
-    assert main(["enjoy", str(path), "--env", "Lava-v0"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("error: ")
-    assert expected in line
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda path: None, "cannot be read (No such file"),
+    (lambda path: path.mkdir(), "cannot be read (Is a directory)"),
+    (lambda path: path.write_text("text"), "cannot be read (File is not a zip file)"),
+], ids=["nothing", "folder", "text"])  # fmt: skip
+def test_what_is_no_model_is_reported_in_one_line_with_exit_code_2(make, message, tmp_path, capsys):
+    make(tmp_path / "model.zip")
+    assert message in error_line(capsys, "enjoy", tmp_path / "model.zip", "--env", "Lava-v0")
 
 
 def test_without_ffmpeg_an_mp4_is_refused_before_an_episode_is_run(lava, tmp_path, monkeypatch, capsys):
@@ -348,10 +331,9 @@ def test_a_missing_package_for_pictures_is_told_in_a_line(registered, tmp_path, 
     registered(PictureEnv)
     monkeypatch.setattr(PictureEnv, "render", render)
     tiny_tdpg("Own-v0").save(tmp_path / "own.zip")
-    film = tmp_path / "film.gif"
-    assert main(["enjoy", str(tmp_path / "own.zip"), "--env", "Own-v0", "--record", str(film)]) == 2
-    assert "cannot be drawn: pygame is not installed" in capsys.readouterr().err
-    assert not film.exists()
+    line = error_line(capsys, "enjoy", tmp_path / "own.zip", "--env", "Own-v0", "--record", tmp_path / "film.gif")
+    assert "cannot be drawn: pygame is not installed" in line
+    assert not (tmp_path / "film.gif").exists()
 
 
 # -- other algorithms ------------------------------------------------------------------------------------------------
@@ -400,5 +382,5 @@ def test_a_model_plays_with_the_statistics_and_the_stack_of_its_training(tmp_pat
 
 def test_a_model_of_another_environment_is_not_taken_for_a_stack(tmp_path, capsys):
     PPO("MlpPolicy", "CartPole-v1", n_steps=10, batch_size=10, device="cpu").save(tmp_path / "model.zip")
-    assert main(["enjoy", str(tmp_path / "model.zip"), "--env", "Lava-v0"]) == 2  # 4 components there, 2 here
-    assert "does not fit" in capsys.readouterr().err
+    # 4 components there, 2 here.
+    assert "does not fit" in error_line(capsys, "enjoy", tmp_path / "model.zip", "--env", "Lava-v0")

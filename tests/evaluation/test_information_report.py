@@ -6,12 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from information_problems import channel, gaussian_batch, generator
-from small_problems import CountdownEnv, tiny_tdpg, train_epochs
+from small_problems import CountdownEnv, lava_env, tiny_tdpg, train_epochs
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tdpg import BatchedVecEnv, InformationCallback, SelectionCallback, make_episodes_env
+from sb3_tdpg import InformationCallback, SelectionCallback, make_episodes_env
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.evaluation import information as information_module
 from sb3_tdpg.evaluation import (
@@ -108,32 +108,18 @@ def test_a_component_is_never_known_better_than_the_whole_state(monkeypatch):
     assert "components FAILED" in str(report)
 
 
-class CalledEnv(LavaEnv):
-    """The lava problem with other names of its state."""
-
-    state_names = ("place", "speed")
-
-
-class NamelessEnv(LavaEnv):
-    """The lava problem whose state has no names."""
-
-    state_names = None
-
-
-@pytest.mark.parametrize(
-    "env_class, names",
-    [(LavaEnv, {"d (m)", "v (m/step)"}), (CalledEnv, {"place", "speed"}), (NamelessEnv, {"x0", "x1"})],
-)
-def test_the_report_calls_the_components_as_the_environment_does(env_class, names):
-    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(env_class(), 50), n_episodes=50, seed=0)
-    assert set(report.knowledge["component"]) == names
+@pytest.mark.parametrize(("of_env", "given", "shown"), [
+    (LavaEnv.state_names, None, {"d (m)", "v (m/step)"}),
+    (("place", "speed"), None, {"place", "speed"}),
+    (None, None, {"x0", "x1"}),
+    (LavaEnv.state_names, ("a", "b"), {"a", "b"}),
+], ids=str)  # fmt: skip
+def test_the_report_calls_the_components_as_it_is_told_or_as_the_environment_does(of_env, given, shown, monkeypatch):
+    monkeypatch.setattr(LavaEnv, "state_names", of_env)
+    report = information_report(tiny_tdpg(PROBLEM), lava_env(50), n_episodes=50, seed=0, names=given)
+    assert set(report.knowledge["component"]) == shown
     labels = report.figures()["knowledge"].axes[0].get_yticklabels()
-    assert {label.get_text() for label in labels} == names
-
-
-def test_names_that_are_given_win_over_those_of_the_environment():
-    report = information_report(tiny_tdpg(PROBLEM), BatchedVecEnv(LavaEnv(), 50), 50, names=("a", "b"))
-    assert set(report.knowledge["component"]) == {"a", "b"}
+    assert {label.get_text() for label in labels} == shown
 
 
 def test_a_report_tells_of_the_steps_that_its_sum_leaves_out():
@@ -143,25 +129,11 @@ def test_a_report_tells_of_the_steps_that_its_sum_leaves_out():
     assert "60 episodes, 2 steps with too few of them left out" in str(report)
 
 
-@pytest.mark.parametrize(
-    "model, env, message",
-    [
-        (
-            lambda: PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8),
-            lambda: make_episodes_env(PROBLEM, 4),
-            "is of PPO.*TDPG",
-        ),
-        (
-            tiny_tdpg,
-            lambda: make_vec_env("Pendulum-v1", 4),
-            r"observation_space is Box\(-inf.*environment's is Box\(\[",
-        ),
-    ],
-    ids=["another algorithm", "another environment"],
-)
-def test_a_report_of_what_does_not_fit_is_refused(model, env, message):
-    with pytest.raises(ValueError, match=message):
-        information_report(model(), env(), n_episodes=40)
+def test_a_report_of_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"is of PPO.*TDPG"):
+        information_report(PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8), lava_env(4), n_episodes=40)
+    with pytest.raises(ValueError, match=r"observation_space is Box\(-inf.*environment's is Box\(\["):
+        information_report(tiny_tdpg(), make_vec_env("Pendulum-v1", 4), n_episodes=40)
 
 
 @pytest.mark.parametrize("callback", [InformationCallback(), SelectionCallback(cost_limit=1.0)])
