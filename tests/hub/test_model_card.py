@@ -13,10 +13,9 @@ import pandas as pd
 import pytest
 import yaml
 from published_cards import REPO_ID, blocks, costs_of, text_of
-from small_problems import assert_same_parameters, parameters, tiny_tdpg, train_epochs
+from small_problems import assert_same_parameters, error_line, parameters, tiny_tdpg, train_epochs
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.rerun import rerun
@@ -100,10 +99,7 @@ def test_the_command_of_a_user_is_shown_and_that_of_a_worker_process_is_not(runs
             ("python -c 'from multiprocessing.spawn import spawn_main; spawn_main()' --multiprocessing-fork", None),
         )
     ):
-        copy = tmp_path / f"run{i}"
-        copy.mkdir()
-        for name in ("model.zip", "episodes.csv", "progress_00000000.csv"):
-            (copy / name).write_bytes((folder / name).read_bytes())
+        copy = shutil.copytree(folder, tmp_path / f"run{i}")
         config["provenance"]["command"] = command
         (copy / "config.json").write_text(json.dumps(config))
         assert read_run(copy).command == told
@@ -159,46 +155,42 @@ def test_the_video_of_an_episode_is_in_the_folder_of_the_card(runs, tmp_path):
     assert "[replay.mp4](replay.mp4)" in text_of(card)
 
 
-@pytest.mark.parametrize("missing", ["config.json", "model.zip", "episodes.csv"])
-def test_an_unfinished_run_is_refused_and_nothing_is_written(missing, runs, tmp_path):
+def cut(share):
+    return lambda file: file.write_text(file.read_text()[: int(share * file.stat().st_size)])
+
+
+@pytest.mark.parametrize(("name", "damage", "message"), [
+    ("config.json", Path.unlink, "holds no training"),
+    ("model.zip", Path.unlink, "no finished run, since model.zip is missing"),
+    ("episodes.csv", Path.unlink, "no finished run, since episodes.csv is missing"),
+    *(("episodes.csv", damage, r"episodes\.csv.*Delete it and run the command again")
+      for damage in (cut(0), cut(0.5), cut(0.98), lambda file: file.write_text("model,seed\nPG,0\n"))),
+    *(("config.json", lambda file, text=text: file.write_text(text),
+       r"config\.json does not describe a run \(.*\): give a run's folder")
+      for text in ("{}", "[]", "3", "{", '{"settings": 3}')),
+])  # fmt: skip
+def test_a_run_that_is_not_whole_is_refused_in_a_line_and_nothing_is_written(
+    name, damage, message, runs, tmp_path, capsys
+):
     copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
-    (copy / missing).unlink()
-    message = "holds no training" if missing == "config.json" else f"no finished run, since {missing} is missing"
-    with pytest.raises(ValueError, match=message):
-        write_model_card(copy, tmp_path / "card", REPO_ID)
+    damage(copy / name)
+    line = error_line(capsys, "push", copy, "--repo-id", REPO_ID, "--dry-run", "--card", tmp_path / "card")
+    assert re.search(message, line)
     assert not (tmp_path / "card").exists()
 
 
-@pytest.mark.parametrize("kept", [0, 0.5, 0.98, "model,seed\nPG,0\n"])
-def test_records_that_are_not_whole_are_refused(kept, runs, tmp_path, capsys):
-    copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
-    text = (copy / "episodes.csv").read_text()
-    (copy / "episodes.csv").write_text(kept if isinstance(kept, str) else text[: int(kept * len(text))])
-    assert main(["push", str(copy), "--repo-id", REPO_ID, "--dry-run", "--card", str(tmp_path / "card")]) == 2
-    message = capsys.readouterr().err.strip()
-    assert "episodes.csv" in message and "Delete it and run the command again" in message
-    assert "\n" not in message
-    assert not (tmp_path / "card").exists()
-
-
-def test_records_that_are_not_of_one_policy_are_refused(runs, tmp_path):
-    run = read_run(runs / "pg-seed0")
-    for records, message in (
-        (pd.concat([run.records, run.records.assign(train_seed=7)]), r"the records are of train_seed \[0, 7\]"),
-        (pd.concat([run.records, run.records.assign(model="TDPG")]), r"the records are of model \['PG', 'TDPG'\]"),
-        (run.records[:31], "at least 2 episodes of each scenario"),
-        (run.records[:0], "at least 2 episodes of each scenario"),
+def test_records_that_are_not_of_one_policy_or_a_damaged_model_are_refused(runs, tmp_path):
+    run, damaged = read_run(runs / "pg-seed0"), tmp_path / "model.zip"
+    damaged.write_bytes(b"no zip")
+    for change, message in (
+        (dict(records=pd.concat([run.records, run.records.assign(train_seed=7)])), r"are of train_seed \[0, 7\]"),
+        (dict(records=pd.concat([run.records, run.records.assign(model="TDPG")])), r"are of model \['PG', 'TDPG'\]"),
+        (dict(records=run.records[:31]), "at least 2 episodes of each scenario"),
+        (dict(records=run.records[:0]), "at least 2 episodes of each scenario"),
+        (dict(model=damaged), "wasn't a zip-file"),
     ):
         with pytest.raises(ValueError, match=message):
-            write_model_card(replace(run, records=records), tmp_path / "card", REPO_ID)
-    assert not (tmp_path / "card").exists()
-
-
-def test_a_damaged_model_is_refused_and_no_card_is_written(runs, tmp_path):
-    damaged = tmp_path / "model.zip"
-    damaged.write_bytes(b"no zip")
-    with pytest.raises(ValueError, match="wasn't a zip-file"):
-        write_model_card(replace(read_run(runs / "pg-seed0"), model=damaged), tmp_path / "card", REPO_ID)
+            write_model_card(replace(run, **change), tmp_path / "card", REPO_ID)
     assert not (tmp_path / "card").exists()
 
 
@@ -217,17 +209,6 @@ def test_a_folder_that_is_not_empty_is_left_alone(card, runs, tmp_path):
         with pytest.raises(ValueError, match="exists already: choose another folder, or remove it"):
             refused()
     assert {path: path.read_bytes() for path in card.rglob("*") if path.is_file()} == before
-
-
-@pytest.mark.parametrize("content", ["{}", "[]", "3", "{", '{"settings": 3}'])
-def test_a_record_that_describes_no_run_is_told_in_a_line(content, runs, tmp_path, capsys):
-    copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
-    (copy / "config.json").write_text(content)
-    assert main(["push", str(copy), "--repo-id", REPO_ID, "--dry-run", "--card", str(tmp_path / "card")]) == 2
-    message = capsys.readouterr().err.strip()
-    assert re.search(r"config\.json does not describe a run \(.*\): give a run's folder", message)
-    assert "\n" not in message
-    assert not (tmp_path / "card").exists()
 
 
 def test_a_negative_number_of_filmed_episodes_is_refused(runs, tmp_path):
@@ -254,8 +235,8 @@ def test_a_symbolic_link_is_never_published(runs, card, tmp_path, capsys):
     (copy / "progress_9.csv").symlink_to("/etc/hostname")
     (ready / "secret").symlink_to("/etc/hostname")
     for folder in (copy, ready):
-        assert main(["push", str(folder), "--repo-id", REPO_ID, "--dry-run", "--card", str(tmp_path / "card")]) == 2
-        assert "is a symbolic link" in capsys.readouterr().err
+        line = error_line(capsys, "push", folder, "--repo-id", REPO_ID, "--dry-run", "--card", tmp_path / "card")
+        assert "is a symbolic link" in line
     with pytest.raises(ValueError, match="ready/secret is a symbolic link"):
         push_to_hub(ready, REPO_ID)
     assert not (tmp_path / "card").exists()

@@ -19,18 +19,15 @@ pytest.importorskip("rliable")
 pytest.importorskip("markdown_it")
 
 
-@pytest.mark.parametrize(
-    "kind, horizon, n_episodes",
-    [
-        ("vector", 5, 500),
-        ("vector", 150, 50),  # of 66: each of 50 environments runs as many
-        ("vector", 500, 20),
-        ("vector", 27_000, 1),
-        ("vector", None, 10),
-        (None, 200, 50),
-        ("image", 5, 100),
-    ],
-)
+@pytest.mark.parametrize(("kind", "horizon", "n_episodes"), [
+    ("vector", 5, 500),
+    ("vector", 150, 50),  # of 66: each of 50 environments runs as many
+    ("vector", 500, 20),
+    ("vector", 27_000, 1),
+    ("vector", None, 10),
+    (None, 200, 50),
+    ("image", 5, 100),
+])  # fmt: skip
 def test_long_episodes_are_fewer(kind, horizon, n_episodes):
     assert plan.default_episodes(kind, horizon, 10_000) == n_episodes
 
