@@ -9,7 +9,7 @@ import tempfile
 import optuna
 import pytest
 import yaml
-from small_problems import tiny_tdpg
+from small_problems import error_line, tiny_tdpg
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_tdpg import TDPG, BatchedVecEnv
@@ -100,11 +100,7 @@ def test_what_is_measured_is_on_fresh_episodes_and_leaves_the_training_alone():
     assert information == pytest.approx(information_bounds(measured.batch).upper)
     assert trial.user_attrs == dict(cost=cost, information=information)
     assert len(measured.costs) == 50
-    assert len(study_values(trial)) == 5
-
-
-def study_values(trial):
-    return trial.study.get_trials()[trial.number].intermediate_values
+    assert len(trial.study.get_trials()[trial.number].intermediate_values) == 5
 
 
 def test_episodes_that_end_early_count_until_then():
@@ -207,17 +203,12 @@ def test_two_workers_share_a_study(here):  # noqa: F811
     assert all("best of" in output for output in outputs)
 
 
-@pytest.mark.parametrize(
-    ("sampler", "pruner"),
-    [
-        ("random", "median"),
-        ("tpe", "halving"),
-        *(
-            pytest.param(sampler, pruner, marks=pytest.mark.slow)
-            for sampler, pruner in (("random", "none"), ("random", "halving"), ("tpe", "none"), ("tpe", "median"))
-        ),
-    ],
-)
+@pytest.mark.parametrize(("sampler", "pruner"), [
+    ("random", "median"),
+    ("tpe", "halving"),
+    *(pytest.param(*both, marks=pytest.mark.slow)
+      for both in (("random", "none"), ("random", "halving"), ("tpe", "none"), ("tpe", "median"))),
+])  # fmt: skip
 def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):  # noqa: F811
     """As the zoo's own tests try them."""
     arguments = ["--env", "CartPole-v1", "-n", "100", "-params", 'policy_kwargs:"dict(trv_dim=3)"', "n_envs:1"]
@@ -237,10 +228,7 @@ def test_a_limit_that_no_trial_meets_is_told(here, capsys):  # noqa: F811
 
 BAD = {
     "no shift": (["--objective", "shift"], "--objective shift needs --eval-env-kwargs"),
-    "no limit": (
-        ["--env", "Pendulum-v1", "--block", "Pendulum-v1-pg"],
-        "needs a limit on the expected cost .*--cost-limit",
-    ),
+    "no limit": (["--env", "Pendulum-v1", "--block", "Pendulum-v1-pg"], "a limit on the expected cost .*--cost-limit"),
     "threads": (["--n-jobs", "2"], "--n-jobs 2 would be threads .* start the same command several times"),
     "keyword": (["--eval-env-kwargs", "foo:1"], "cannot be made with env_kwargs={'foo': 1}"),
     "space": (["--space", "none.yml"], "the search space none.yml cannot be read"),
@@ -250,11 +238,9 @@ BAD = {
 
 @pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
 def test_bad_input_is_told_in_a_line(arguments, message, here, capsys):  # noqa: F811
-    assert main(["tune", *TINY, *arguments]) == 2
-    error = capsys.readouterr().err
-    assert re.search(message, error), error
-    assert "secret" not in error
-    assert len(error.splitlines()) == 1
+    line = error_line(capsys, "tune", *TINY, *arguments)
+    assert re.search(message, line)
+    assert "secret" not in line
 
 
 def test_other_algorithms_are_tuned_as_the_zoo_does_it(here, capsys):  # noqa: F811

@@ -25,8 +25,7 @@ LAVA = ["--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1", "-
 # Twenty epochs of 20 episodes, with a checkpoint in the tenth.
 SHORT = [*LAVA, "-params", "n_episodes:20", "-n", "2000"]
 FILES = sorted(Path(hyperparams.__file__).parent.glob("*.yml"))
-
-
+PATH = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 CARTPOLE = ["-params", "n_episodes:4", "batch_size:100", "-n", "100", "--eval-freq", "-1"]
 
 
@@ -72,11 +71,8 @@ def test_our_environments_run_as_a_batch_for_any_algorithm(here, monkeypatch):
     assert main([*arguments, "-params", "n_envs:20", "batch_size:50"]) == 0
     assert main([*arguments, "-params", "n_envs:2", "batch_size:10", "--vec-env", "subproc"]) == 0
     assert main(["train", "--env", "CartPole-v1", *CARTPOLE]) == 0
-    assert [(type(env).__name__, env.num_envs) for env in made] == [
-        ("BatchedVecEnv", 20),
-        ("SubprocVecEnv", 2),
-        ("DummyVecEnv", 4),
-    ]
+    kinds = [(type(env).__name__, env.num_envs) for env in made]
+    assert kinds == [("BatchedVecEnv", 20), ("SubprocVecEnv", 2), ("DummyVecEnv", 4)]
     PPO.load(folder_of(here, algo="ppo") / "Lava-v0.zip", device="cpu")
 
 
@@ -125,18 +121,21 @@ def assert_same_training(path):
 
 
 def start(arguments, folder):
-    command = [sys.executable, "-m", "sb3_tdpg", *arguments]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     return subprocess.Popen(
-        command,
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+        [sys.executable, "-m", "sb3_tdpg", *arguments],
+        cwd=folder, env={**os.environ, **PATH}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         # A shell that runs the tests in the background has it ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
+    )  # fmt: skip
+
+
+def run(command, folder, **environment):
+    """Run Python to its end in a folder."""
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=folder, env={**os.environ, **PATH, **environment}, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
 
 
 def wait_for(path, process):
@@ -201,15 +200,9 @@ BAD = {
     "number as text": (["--env", "Lava-v0", "--conf-file", "text.yml"], "learning_rate: 1e-3.*write 0.001"),
     "no such file": (["--env", "Lava-v0", "--conf-file", "none.yml"], "none.yml has no readable block .*No such file"),
     "no YAML": (["--env", "Lava-v0", "--conf-file", "broken.yml"], "broken.yml has no readable block .*while parsing"),
-    "no such block": (
-        ["--env", "MountainCar-v0"],
-        "no readable block 'MountainCar-v0' for tdpg .* with --block",
-    ),
+    "no such block": (["--env", "MountainCar-v0"], "no readable block 'MountainCar-v0' for tdpg .* with --block"),
     "keyword": (["--env", "Lava-v0", "--env-kwargs", "bar:1"], "cannot be made with env_kwargs={'bar': 1}"),
-    "unquoted text": (
-        ["--env", "Lava-v0", "--env-kwargs", "a:violet"],
-        "'violet' is not defined: .* text in quotes",
-    ),
+    "unquoted text": (["--env", "Lava-v0", "--env-kwargs", "a:violet"], "'violet' is not defined: .* text in quotes"),
     "setting": ([*LAVA, "-params", "n_episodes:0"], "n_episodes=0 must be an integer of at least 1"),
     "agent": ([*LAVA, "-i", "none.zip"], "must be a valid path"),
     "resume": (["--resume", "nothing"], "nothing is not the folder of a training"),
@@ -253,14 +246,8 @@ def test_no_number_of_our_files_is_read_as_text(path):
             float(text)
 
 
-OTHERS = [
-    (algo, env_id)
-    for algo in ("a2c", "ppo", "ppo_lstm", "trpo")
-    for env_id in ("Lava-v0", "BallCatch-v0", "PandaGrasp-v0")
-]
-
-
-@pytest.mark.parametrize("algo, env_id", OTHERS)
+@pytest.mark.parametrize("algo", ["a2c", "ppo", "ppo_lstm", "trpo"])
+@pytest.mark.parametrize("env_id", ["Lava-v0", "BallCatch-v0", "PandaGrasp-v0"])
 def test_blocks_of_other_algorithms_train(algo, env_id, here):
     few = ["n_envs:4", *([] if algo == "a2c" else ["batch_size:20" if env_id != "PandaGrasp-v0" else "batch_size:4"])]
     assert main(["train", "--algo", algo, "--env", env_id, "-params", *few, "-n", "8", "--eval-freq", "-1"]) == 0
@@ -276,13 +263,8 @@ def test_the_zoos_own_program_takes_tdpg_as_its_documentation_says(here):
         'if __name__ == "__main__":\n    train()\n'
     )
     path = Path(hyperparams.__file__).with_name("tdpg.yml")
-    command = [sys.executable, "train.py", "--algo", "tdpg", *SHORT[:2], "--conf-file", str(path), "-n", "200"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    done = subprocess.run(
-        [*command, "-params", "n_episodes:20", "--eval-freq", "-1"],
-        cwd=here, env=environment, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    command = ["train.py", "--algo", "tdpg", *SHORT[:2], "--conf-file", str(path), "-n", "200"]
+    run([*command, "-params", "n_episodes:20", "--eval-freq", "-1"], here)
     assert folder_of(here).joinpath("Lava-v0.zip").exists()
 
 
@@ -292,10 +274,8 @@ def test_a_training_is_continued_from_a_model_with_other_settings(here):
     assert main(["train", *SHORT, "-i", "logs/tdpg/Lava-v0_1/Lava-v0.zip", "-params", "n_episodes:20", "beta:0.5"]) == 0
     second = TDPG.load(folder_of(here, 2) / "Lava-v0.zip", device="cpu")
     assert (first.beta, second.beta) == (1 / 75, 0.5)
-    assert (
-        second.policy.optimizer.state_dict()["state"][0]["step"]
-        > first.policy.optimizer.state_dict()["state"][0]["step"]
-    )
+    n_steps = [model.policy.optimizer.state_dict()["state"][0]["step"] for model in (first, second)]
+    assert n_steps[1] > n_steps[0]
 
 
 def test_blocks_from_a_python_file_or_package_and_a_policy_by_its_path(here, monkeypatch):

@@ -10,7 +10,7 @@ from stable_baselines3.common.monitor import load_results
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.cli import main
-from tests.zoo.test_zoo import folder_of, here  # noqa: F401
+from tests.zoo.test_zoo import folder_of, here, run  # noqa: F401
 
 pytest.importorskip("rl_zoo3")
 import optuna
@@ -73,16 +73,11 @@ def test_an_environment_and_a_block_from_a_package_of_ones_own(here):  # noqa: F
         "from gymnasium.envs.classic_control import PendulumEnv\nfrom gymnasium import register\n"
         'register("Mine-v0", entry_point=PendulumEnv, max_episode_steps=20)\n'
     )
-    block = dict(policy="TRVPolicy", n_timesteps=80, n_episodes=2, mi_estimator="logdet", beta=1.0)
-    blocks = {"Mine-v0": block}
+    blocks = {"Mine-v0": dict(policy="TRVPolicy", n_timesteps=80, n_episodes=2, mi_estimator="logdet", beta=1.0)}
     (here / "my_package" / "config.py").write_text(f"hyperparams = {blocks}\n")
     command = ["train", "--env", "Mine-v0", "--gym-packages", "my_package", "--conf-file", "my_package.config"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (str(here), *sys.path) if p)}
-    done = subprocess.run(
-        [sys.executable, "-m", "sb3_tdpg", *command, *NO_EVALUATION],
-        cwd=here, env=environment, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    path = os.pathsep.join(p for p in (str(here), *sys.path) if p)
+    run(["-m", "sb3_tdpg", *command, *NO_EVALUATION], here, PYTHONPATH=path)
     assert loaded(here, "Mine-v0").num_timesteps == 80
 
 
@@ -141,13 +136,8 @@ def test_the_zoos_benchmark_evaluates_tdpg(here):  # noqa: F811
         "from rl_zoo3.enjoy import enjoy\n\nfrom sb3_tdpg.zoo import register\n\nregister()\nenjoy()\n"
     )
     path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])  # it calls `python`
-    environment = {**os.environ, "PATH": path, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    done = subprocess.run(
-        [sys.executable, "-m", "rl_zoo3.benchmark", "-n", "100", "--log-dir", "logs/", "--benchmark-dir", "benchmark",
-         "--test-mode", "--no-hub"],
-        cwd=here, env=environment, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    command = ["-m", "rl_zoo3.benchmark", "-n", "100", "--log-dir", "logs/", "--benchmark-dir", "benchmark"]
+    run([*command, "--test-mode", "--no-hub"], here, PATH=path)
     assert "|tdpg|Lava-v0|" in (here / "benchmark" / "benchmark.md").read_text().replace(" ", "")
 
 
