@@ -4,27 +4,28 @@ import math
 
 import numpy as np
 import pytest
-from small_problems import parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+from small_problems import lava_env, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
 
-from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingDivergedError
+from sb3_tdpg import TDPG, SelectionCallback, TrainingDivergedError
 from sb3_tdpg.auto_weight import LEVEL_EPOCHS, WINDOW, AutoWeight, share_of
-from sb3_tdpg.envs.lava import LavaEnv
 
 
-def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above():
-    weight = AutoWeight(cost_limit=10.0)
+@pytest.mark.parametrize(("limit", "above", "met", "below"), [(10.0, 12.0, 9.0, 5.0), (-400.0, -100.0, -450.0, -490.0)])
+def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above(limit, above, met, below):
+    """Costs are negative returns, and many environments pay rewards."""
+    weight = AutoWeight(cost_limit=limit)
     for _ in range(5):
-        weight.update(cost=30.0, information=4.0)
+        weight.update(cost=above, information=4.0)
         assert weight.value == 0.0
-    weight.update(cost=9.0, information=4.0)
+    weight.update(cost=met, information=4.0)
     start = weight.value
-    assert start * 4.0 == pytest.approx(10.0)
-    weight.update(cost=5.0, information=4.0)
+    assert start * 4.0 == pytest.approx(abs(limit))
+    weight.update(cost=below, information=4.0)
     assert weight.value > start
     larger = weight.value
-    weight.update(cost=12.0, information=4.0)
+    weight.update(cost=above, information=4.0)
     assert 0 < weight.value < larger
-    weight.update(cost=10.0, information=4.0)
+    weight.update(cost=limit, information=4.0)
     at_the_limit = weight.value
     weight.update(cost=1e9, information=4.0)
     assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
@@ -60,18 +61,6 @@ def test_costs_that_are_not_finite_leave_the_weight_alone():
     assert math.isfinite(model.mi_coef)
 
 
-def test_the_weight_follows_a_limit_below_zero():
-    """Costs are negative returns, and many environments pay rewards."""
-    weight = AutoWeight(cost_limit=-400.0)
-    weight.update(cost=-100.0, information=1.0)
-    assert weight.value == 0.0
-    weight.update(cost=-450.0, information=1.0)
-    start = weight.value
-    assert start > 0
-    weight.update(cost=-490.0, information=1.0)
-    assert weight.value > start
-
-
 def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
     passes = dict(n_epochs=4, clip_range=0.2, learning_rate=5e-3)
     arguments = dict(n_episodes=200, encoder_gradient="pathwise", gae_lambda=0.95, **passes)
@@ -90,30 +79,28 @@ def test_the_weight_is_saved_and_goes_on_where_it_was(tmp_path):
     train_epochs(model, 3)
     assert model.mi_coef > 0
     model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), device="cpu")
+    loaded = TDPG.load(tmp_path / "model", env=lava_env(), device="cpu")
     assert loaded.mi_coef == model.mi_coef
     train_epochs(loaded, 1, reset_num_timesteps=False)
     assert loaded.mi_coef > model.mi_coef
-    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), cost_limit=5.0, device="cpu").mi_coef == 0
-    assert TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 20), beta=0.5, device="cpu").mi_coef == 2
+    assert TDPG.load(tmp_path / "model", env=lava_env(), cost_limit=5.0, device="cpu").mi_coef == 0
+    assert TDPG.load(tmp_path / "model", env=lava_env(), beta=0.5, device="cpu").mi_coef == 2
 
 
 def test_a_policy_gradient_model_may_go_on_with_a_cost_limit(tmp_path):
-    model = tiny_tdpg(beta=math.inf)
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(beta=math.inf), 2)
     model.save(tmp_path / "pg")
-    loaded = TDPG.load(tmp_path / "pg", env=BatchedVecEnv(LavaEnv(), 20), beta="auto", cost_limit=1e4, device="cpu")
-    train_epochs(loaded, 1)
-    assert loaded.mi_coef > 0
 
+    def load(**kwargs):
+        return TDPG.load(tmp_path / "pg", env=lava_env(), **kwargs, device="cpu")
 
-def test_a_cost_limit_given_to_load_asks_for_the_weight_too(tmp_path):
-    model = tiny_tdpg(beta=math.inf)
-    model.save(tmp_path / "pg")
-    loaded = TDPG.load(tmp_path / "pg", cost_limit=8.0, device="cpu")
+    assert train_epochs(load(beta="auto", cost_limit=1e4), 1).mi_coef > 0
+    loaded = load(cost_limit=8.0)  # which asks for the weight, too
     assert (loaded.beta, loaded.cost_limit) == ("auto", 8.0)
+    loaded = load(beta="auto")  # the improvement counts from the first epoch of all
+    assert (loaded.cost_limit, loaded.auto_weight.first_cost) == ("95%", model.first_cost)
     with pytest.raises(ValueError, match=r"cost_limit=8.0.*beta=0.5"):
-        TDPG.load(tmp_path / "pg", beta=0.5, cost_limit=8.0, device="cpu")
+        load(beta=0.5, cost_limit=8.0)
 
 
 def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():
@@ -224,7 +211,7 @@ def test_the_default_share_needs_no_number_and_is_logged():
 
 
 def test_the_share_goes_on_where_it_was_after_a_save(tmp_path):
-    env = BatchedVecEnv(LavaEnv(), 20)
+    env = lava_env()
     model = tiny_tdpg(cost_limit="80%")
     train_epochs(model, 16)
     model.save(tmp_path / "model")
@@ -233,14 +220,6 @@ def test_the_share_goes_on_where_it_was_after_a_save(tmp_path):
     # Another share begins anew, but the improvement counts from the first epoch of all.
     other = TDPG.load(tmp_path / "model", env=env, cost_limit="70%", device="cpu")
     assert (other.mi_coef, other.auto_weight.first_cost) == (0.0, model.first_cost)
-
-
-def test_after_policy_gradient_the_improvement_counts_from_its_first_epoch(tmp_path):
-    model = tiny_tdpg(beta=math.inf)
-    train_epochs(model, 2)
-    model.save(tmp_path / "pg")
-    loaded = TDPG.load(tmp_path / "pg", env=BatchedVecEnv(LavaEnv(), 20), beta="auto", device="cpu")
-    assert (loaded.cost_limit, loaded.auto_weight.first_cost) == ("95%", model.first_cost)
 
 
 def test_what_was_kept_is_told_at_the_end_of_a_training(capsys):

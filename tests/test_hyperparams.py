@@ -20,6 +20,10 @@ def env_id_of(block):
     return block[: block.index("-v") + 3]
 
 
+def lava(block="Lava-v0", **overrides):
+    return make_training("Lava-v0", load_hyperparams(block), **overrides)
+
+
 @pytest.mark.parametrize("block", BLOCKS)
 def test_every_key_of_a_block_is_an_argument(block):
     settings = load_hyperparams(block)
@@ -34,10 +38,9 @@ def test_every_key_of_a_block_is_an_argument(block):
 def test_every_block_trains_for_an_epoch(block):
     if env_id_of(block) == "Swimmer-v5":
         pytest.importorskip("mujoco")
-    settings = load_hyperparams(block)
-    cheap = {"mi_kwargs": {**settings.get("mi_kwargs", {}), "gradient_steps": 2, "warmup_gradient_steps": 2}}
-    if settings.get("mi_estimator") != "mine":
-        cheap = {}
+    settings, cheap = load_hyperparams(block), {}
+    if settings.get("mi_estimator") == "mine":
+        cheap["mi_kwargs"] = {**settings.get("mi_kwargs", {}), "gradient_steps": 2, "warmup_gradient_steps": 2}
     if "batch_size" in settings:
         cheap["batch_size"] = 20
     training = make_training(env_id_of(block), settings, n_episodes=20, seed=0, **cheap)
@@ -46,10 +49,7 @@ def test_every_block_trains_for_an_epoch(block):
 
 
 def test_a_baseline_block_differs_from_its_tdpg_block_by_no_penalty_and_no_selection():
-    pg, tdpg = (
-        make_training("Lava-v0", load_hyperparams("Lava-v0-pg")),
-        make_training("Lava-v0", load_hyperparams("Lava-v0")),
-    )
+    pg, tdpg = lava("Lava-v0-pg"), lava()
     assert pg.model.mi_coef == 0 < tdpg.model.mi_coef
     assert pg.selection is None
     assert isinstance(tdpg.selection, SelectionCallback)
@@ -57,18 +57,17 @@ def test_a_baseline_block_differs_from_its_tdpg_block_by_no_penalty_and_no_selec
 
 
 def test_the_tables_reading_reaches_the_environment():
-    env = make_training("Lava-v0", load_hyperparams("Lava-v0-table")).model.env
-    assert env.get_attr("lava_terminal_cost")[0] == 300.0
+    assert lava("Lava-v0-table").model.env.get_attr("lava_terminal_cost")[0] == 300.0
 
 
 def test_a_learning_rate_may_fall_linearly_as_in_the_zoo():
-    model = make_training("Lava-v0", load_hyperparams("Lava-v0"), learning_rate="lin_1.0e-3").model
+    model = lava(learning_rate="lin_1.0e-3").model
     assert model.lr_schedule(0.0) < model.lr_schedule(0.5) < model.lr_schedule(1.0)
     assert [model.lr_schedule(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
 
 
 def test_beta_may_fall_linearly_too(tmp_path):
-    model = make_training("Lava-v0", load_hyperparams("Lava-v0"), beta="lin_0.5_0.1").model
+    model = lava(beta="lin_0.5_0.1").model
     model._current_progress_remaining = 0.75
     assert model.mi_coef == pytest.approx(1 / 0.4)
     model.save(tmp_path / "model.zip")
@@ -79,7 +78,7 @@ def test_beta_may_fall_linearly_too(tmp_path):
 
 def test_another_schedule_is_refused_with_the_mend():
     with pytest.raises(ValueError, match=r"'cos_1e-3' must be a number, a function, or a text such as 'lin_1e-3'"):
-        make_training("Lava-v0", load_hyperparams("Lava-v0"), learning_rate="cos_1e-3")
+        lava(learning_rate="cos_1e-3")
 
 
 def test_an_unknown_block_is_refused_with_the_list():

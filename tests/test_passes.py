@@ -10,8 +10,7 @@ import torch as th
 from gymnasium import spaces
 from small_problems import parameters, tiny_tdpg, toy_vec_env, train_epochs
 
-from sb3_tdpg import TDPG, BatchedVecEnv, TRVPolicy
-from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg import TDPG, TRVPolicy
 from sb3_tdpg.envs.scenarios import BALL_CATCH
 from sb3_tdpg.evaluation import evaluate_scenarios
 
@@ -116,14 +115,6 @@ def test_equal_costs_do_not_blow_up_the_penalty(costs, baseline):
     model.rollout_buffer.costs[:] = costs.T
     model.train()
     assert model.logger.name_to_value["train/grad_norm"] < 100
-
-
-def test_the_number_of_episodes_may_be_changed_when_a_model_is_loaded(tmp_path):
-    tiny_tdpg().save(tmp_path / "model")
-    for n in (10, 40):
-        model = TDPG.load(tmp_path / "model", env=BatchedVecEnv(LavaEnv(), 10), n_episodes=n, device="cpu")
-        train_epochs(model, 1)
-        assert model._minibatches(model.rollout_buffer.episode_batch()) == [slice(None)]
 
 
 # -- what is left out -------------------------------------------------------------------------------------------------

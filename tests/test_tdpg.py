@@ -17,6 +17,7 @@ from small_problems import (
     same_parameters,
     tiny_tdpg,
     train_epochs,
+    words,
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
@@ -234,18 +235,19 @@ def test_tdpg_fits_its_critics_without_being_asked():
     assert model.information.shape == (5,)
 
 
-def test_clipping_can_be_turned_off_when_a_model_is_loaded(tmp_path):
-    model = tiny_tdpg(max_grad_norm=0.5)
-    model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", env=lava_env(), max_grad_norm=None, device="cpu")
-    train_epochs(loaded, 1)
-    assert loaded.max_grad_norm == math.inf
-
-
-def test_objects_of_a_file_may_be_replaced_when_it_is_loaded(tmp_path):
-    tiny_tdpg(learning_rate=1e-3).save(tmp_path / "model.zip")
-    model = TDPG.load(tmp_path / "model.zip", custom_objects={"learning_rate": 3e-5})
-    assert model.learning_rate == 3e-5
+@pytest.mark.parametrize(("before", "change", "after"), [
+    (dict(max_grad_norm=0.5), dict(max_grad_norm=None), dict(max_grad_norm=math.inf)),  # no clipping
+    (dict(learning_rate=1e-3), dict(custom_objects={"learning_rate": 3e-5}), dict(learning_rate=3e-5)),
+    (dict(n_episodes=20), dict(n_episodes=40), dict(n_episodes=40, batch_size=None)),
+    (dict(n_episodes=20), dict(epoch_steps=100), dict(n_episodes=None, epoch_steps=100)),
+    (dict(n_episodes=None, epoch_steps=100), dict(n_episodes=20), dict(n_episodes=20, epoch_steps=None)),
+], ids=words)  # fmt: skip
+def test_a_setting_may_be_changed_when_a_model_is_loaded(before, change, after, tmp_path):
+    tiny_tdpg(**before).save(tmp_path / "model")
+    model = TDPG.load(tmp_path / "model", env=lava_env(), **change, device="cpu")
+    assert {name: getattr(model, name) for name in after} == after
+    assert model.learn(100).epoch == 1
+    assert model._minibatches(model.rollout_buffer.episode_batch()) == [slice(None)]  # the whole epoch
 
 
 def test_a_policy_gradient_model_warm_starts_tdpg(tmp_path):
@@ -303,11 +305,3 @@ def test_a_policy_that_hardly_looks_at_its_sensor_is_told_at_the_end(beta, told,
     said = capsys.readouterr().out
     assert ("nats kept, at a cost of" in said) == (told is not None)
     assert ("hardly looks at its sensor" in said) == bool(told)
-
-
-@pytest.mark.parametrize(("before", "after"), [(dict(n_episodes=20), dict(epoch_steps=100)),
-                                               (dict(epoch_steps=100), dict(n_episodes=20))])  # fmt: skip
-def test_a_loaded_model_takes_the_other_unit_of_an_epoch(before, after, tmp_path):
-    tiny_tdpg(**{"n_episodes": None, **before}).save(tmp_path / "model")
-    model = TDPG.load(tmp_path / "model", **after, device="cpu")
-    assert (model.n_episodes, model.epoch_steps) == (after.get("n_episodes"), after.get("epoch_steps"))
