@@ -116,21 +116,17 @@ def test_with_four_modes_the_interval_is_narrow_where_the_log_det_bound_is_loose
 
 def test_a_state_on_a_circle_and_a_noise_that_depends_on_the_state_are_held():
     rng = np.random.default_rng(0)
-    angle = rng.uniform(-math.pi, math.pi, (10, 300, 1))
-    means = 3 * np.concatenate([np.sin(angle), np.cos(angle)], axis=2)
-    stds = 0.3 + 0.2 * np.abs(angle) * np.ones(2)
+
+    def circle(n_steps, n):
+        angle = rng.uniform(-math.pi, math.pi, (n_steps, n, 1))
+        means = 3 * np.concatenate([np.sin(angle), np.cos(angle)], axis=2)
+        return channel(angle, means, 0.3 + 0.2 * np.abs(angle) * np.ones(2), rng)
+
     # The truth where the encoder sees the state, from many samples.
-    many = 3000
-    angles = rng.uniform(-math.pi, math.pi, (1, many, 1))
-    of_many = channel(
-        angles,
-        3 * np.concatenate([np.sin(angles), np.cos(angles)], axis=2),
-        0.3 + 0.2 * np.abs(angles) * np.ones(2),
-        rng,
-    )
+    of_many = circle(1, 3000)
     truth = LeaveOneOut(1, 1, 2)(of_many).item()
     assert own_sample_bound(of_many).item() == pytest.approx(truth, abs=0.02)
-    interval = information_interval(channel(angle, means, stds, rng))
+    interval = information_interval(circle(10, 300))
     assert ((interval.lower <= truth) & (truth <= interval.upper)).sum() >= 9
     assert interval.width.mean() < 0.8
 

@@ -24,6 +24,11 @@ def some_records(costs_by_model, **columns):
     return pd.concat(frames, ignore_index=True)
 
 
+def of_seeds(n, costs_of):
+    """Records of training seeds, of which ``costs_of(i)`` gives the costs."""
+    return pd.concat([some_records(costs_of(i), train_seed=i) for i in range(n)])
+
+
 def test_the_summary_has_the_statistics_of_the_costs_in_the_order_of_the_records():
     table = summary_table(
         some_records({"B": {"y": [1.0, 2.0, 6.0], "x": [4.0, 4.0, 4.0]}, "A": {"y": [0.0, 0.0, 3.0]}})
@@ -48,7 +53,7 @@ def test_the_ratio_is_to_the_same_models_row_of_the_same_seed():
 
 def test_the_aggregate_over_seeds_ignores_an_outlier_but_shows_it():
     means = [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 500.0]
-    records = pd.concat([some_records({"A": {"x": [m - 1, m + 1]}}, train_seed=i) for i, m in enumerate(means)])
+    records = of_seeds(8, lambda i: {"A": {"x": [means[i] - 1, means[i] + 1]}})
     (row,) = aggregate_seeds(records).to_dict("records")
     assert (row["n_seeds"], row["n"], row["min"], row["max"]) == (8, 2, 10.0, 500.0)
     assert row["iqm"] == 13.5
@@ -72,10 +77,7 @@ def test_the_probability_of_improvement_is_that_of_a_seed_of_one_against_a_seed_
     """By hand: of the 9 pairs of seeds, by their means over both scenarios, A wins 4."""
     costs = {"A": {"x": [1.0, 2.0, 5.0], "y": [3.0, 4.0, 9.0]}, "B": {"x": [4.0, 6.0, 1.0], "y": [8.0, 4.0, 2.0]}}
     # means: A 2, 3, 7; B 6, 5, 1.5
-    records = pd.concat(
-        some_records({m: {s: [c[i], c[i]] for s, c in rows.items()} for m, rows in costs.items()}, train_seed=i)
-        for i in range(3)
-    )
+    records = of_seeds(3, lambda i: {m: {s: [c[i], c[i]] for s, c in rows.items()} for m, rows in costs.items()})
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     value, low, high = probability_of_improvement(records, "A", "B")
     assert value == pytest.approx(4 / 9)
@@ -89,10 +91,7 @@ def test_a_paired_difference_is_taken_seed_by_seed():
     """What the seeds have in common, here from 0 to 100, does not widen the interval."""
     common = [0.0, 30.0, 60.0, 100.0]
     gains = [1.0, 2.0, 1.0, 2.0]
-    records = pd.concat(
-        some_records({"A": {"x": [c - g] * 2}, "B": {"x": [c] * 2}}, train_seed=i)
-        for i, (c, g) in enumerate(zip(common, gains, strict=True))
-    )
+    records = of_seeds(4, lambda i: {"A": {"x": [common[i] - gains[i]] * 2}, "B": {"x": [common[i]] * 2}})
     value, low, high = paired_difference(records, "A", "B")
     assert value == pytest.approx(-1.5)
     assert -2 <= low < -1.5 < high <= -1
@@ -107,10 +106,7 @@ def test_scenarios_of_the_same_seeds_do_not_narrow_the_interval():
     costs = {m: rng.normal(size=5) for m in ("A", "B")}
     widths = []
     for n in (1, 7):
-        records = pd.concat(
-            some_records({m: {f"s{j}": [c[i], c[i]] for j in range(n)} for m, c in costs.items()}, train_seed=i)
-            for i in range(5)
-        )
+        records = of_seeds(5, lambda i, n=n: {m: {f"s{j}": [c[i]] * 2 for j in range(n)} for m, c in costs.items()})
         _, low, high = probability_of_improvement(records, "A", "B")
         widths.append(high - low)
     assert widths[0] == pytest.approx(widths[1])
@@ -151,7 +147,7 @@ def test_a_paper_without_standard_deviations_is_shown_without_them():
 
 
 def test_the_markdown_table_over_seeds_shows_the_interval_and_says_so():
-    records = pd.concat([some_records({"ours": {"a|b": [float(i)] * 2}}, train_seed=i) for i in range(4)])
+    records = of_seeds(4, lambda i: {"ours": {"a|b": [float(i)] * 2}})
     text = comparison_markdown(aggregate_seeds(records), SCENARIOS[:1])
     assert r"| a\|b | 1.50 [" in text  # alone in its row: nothing to mark
     assert "over 4 training seeds [95% bootstrap interval over seeds]" in text
@@ -159,9 +155,7 @@ def test_the_markdown_table_over_seeds_shows_the_interval_and_says_so():
 
 
 def test_one_training_seed_has_no_interval():
-    text = comparison_markdown(
-        aggregate_seeds(some_records({"ours": {"a|b": [1.0, 2.0]}}, train_seed=0)), SCENARIOS[:1]
-    )
+    text = comparison_markdown(aggregate_seeds(of_seeds(1, lambda i: {"ours": {"a|b": [1.0, 2.0]}})), SCENARIOS[:1])
     assert r"| a\|b | 1.50 |" in text
     assert "Mean episode cost of one training seed, hence without an interval." in text
 
@@ -179,6 +173,6 @@ def test_a_table_that_cannot_be_made_is_an_error_that_says_why():
         summary_table(records.drop(columns="cost"))
     with pytest.raises(ValueError, match=r"no row for the scenarios \['second'\]"):
         comparison_markdown(summary_table(some_records({"A": {"a|b": [1.0]}})), SCENARIOS)
-    twice = pd.concat([some_records({"A": {"a|b": [1.0]}}, train_seed=i) for i in range(2)])
+    twice = of_seeds(2, lambda i: {"A": {"a|b": [1.0]}})
     with pytest.raises(ValueError, match="use aggregate_seeds"):
         comparison_markdown(summary_table(twice), SCENARIOS[:1])
