@@ -80,13 +80,7 @@ def test_the_page_has_a_table_for_each_question(tmp_path):
         setattr(records, name, pd.concat([table, hidden, limited], ignore_index=True))
     summary = records.write(tmp_path / "out", "sb3-tdpg reproduce public")
     assert (tmp_path / "out" / "summary.md").read_text() == summary
-    for part in (
-        "## Final returns",
-        "## Cost limit",
-        "| kept |",
-        "## CPU time",
-        "`sb3-tdpg reproduce public` at",
-    ):
+    for part in ("## Final returns", "## Cost limit", "| kept |", "## CPU time", "`sb3-tdpg reproduce public` at"):
         assert part in summary
     assert (tmp_path / "out" / "curves.png").stat().st_size > 10_000
 

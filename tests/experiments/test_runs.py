@@ -33,11 +33,13 @@ TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
 CHEAP = dict(n_timesteps=800, n_episodes=20, mi_kwargs=dict(gradient_steps=2, warmup_gradient_steps=2))
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
+@pytest.fixture(scope="module", autouse=True)
+def quick():
     """Small epochs, so that a run of a few hundred steps has several."""
     block = Run.settings.fget
-    monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 20}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 20}))
+        yield
 
 
 def tiny_run(seed=0, **overrides):
@@ -45,16 +47,15 @@ def tiny_run(seed=0, **overrides):
 
 
 def policy_of(folder):
-    return TDPG.load(folder / "model.zip", device="cpu").policy.state_dict()
+    return parameters(TDPG.load(folder / "model.zip", device="cpu").policy)
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     """Return the folder of a tiny demo, and what it printed."""
     pytest.importorskip("matplotlib")
-    folder, block, printed = tmp_path_factory.mktemp("demo"), Run.settings.fget, io.StringIO()
-    with pytest.MonkeyPatch.context() as monkeypatch, contextlib.redirect_stdout(printed):
-        monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 20}))
+    folder, printed = tmp_path_factory.mktemp("demo"), io.StringIO()
+    with contextlib.redirect_stdout(printed):
         assert main(["demo", "--out", str(folder), *TINY]) == 0
     return folder, printed.getvalue()
 
@@ -85,12 +86,17 @@ def test_demo_called_again_trains_nothing_and_prints_the_same(demo, capsys, monk
     assert capsys.readouterr().out.split("\n\n")[1] == first.split("\n\n")[1]
 
 
-def test_a_folder_with_another_run_is_refused_and_left_alone(tmp_path, capsys):
-    complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match=r"with other settings, seed: 0 there, 1 here: choose another folder"):
-        complete_run(tiny_run(seed=1), tmp_path, LAVA[:1], n_eval_episodes=4)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+def test_a_folder_with_another_run_is_refused_before_any_run_begins_and_left_alone(tmp_path):
+    old = tmp_path / "old"
+    complete_run(tiny_run(), old, LAVA[:1], n_eval_episodes=4)
+    before = {path: path.read_bytes() for path in old.iterdir()}
+    tasks = [(tiny_run(), tmp_path / "new", LAVA[:1]), (tiny_run(seed=1), old, LAVA[:1])]
+    for refused in (lambda: complete_run(*tasks[1], n_eval_episodes=4),
+                    lambda: complete_runs(tasks, n_eval_episodes=4, jobs=1)):  # fmt: skip
+        with pytest.raises(ValueError, match=r"with other settings, seed: 0 there, 1 here: choose another folder"):
+            refused()
+    assert {path: path.read_bytes() for path in old.iterdir()} == before
+    assert not (tmp_path / "new").exists()
 
 
 def test_the_command_line_tells_bad_input_in_one_line_with_exit_code_2(demo, capsys):
@@ -119,15 +125,13 @@ def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path, monkeypatch):
     complete_run(tiny_run(), tmp_path / "halved", LAVA, n_eval_episodes=4)
 
     whole, halved = policy_of(tmp_path / "whole"), policy_of(tmp_path / "halved")
-    assert all(bool((whole[name] == halved[name]).all()) for name in whole)
-    for name in ("episodes.csv",):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "halved" / name).read_bytes()
-    logs = [
-        read_progress(tmp_path / name).drop(columns=["time/fps", "time/time_elapsed"]) for name in ("whole", "halved")
-    ]
-    assert logs[0]["time/total_timesteps"].tolist() == logs[1]["time/total_timesteps"].tolist()
-    assert [log["time/iterations"].tolist() for log in logs] == [list(range(1, len(logs[0]) + 1))] * 2
-    pd.testing.assert_series_equal(logs[0]["rollout/ep_cost_mean"], logs[1]["rollout/ep_cost_mean"])
+    assert_same_parameters(whole, halved)
+    records, again = ((tmp_path / name / "episodes.csv").read_bytes() for name in ("whole", "halved"))
+    assert records == again
+    logs = [read_progress(tmp_path / name) for name in ("whole", "halved")]
+    assert logs[0]["time/iterations"].tolist() == list(range(1, len(logs[0]) + 1))
+    for column in ("time/iterations", "time/total_timesteps", "rollout/ep_cost_mean"):
+        pd.testing.assert_series_equal(logs[0][column], logs[1][column])
 
 
 def test_a_run_keeps_the_selected_policy_and_says_whether_an_epoch_met_the_limits(tmp_path):
@@ -153,7 +157,7 @@ def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
 
 
 def test_attempts_go_on_until_one_meets_the_limits(tmp_path):
-    run = replace(tiny_run(), max_attempts=3)
+    run, callback = replace(tiny_run(), max_attempts=3), "sb3_tdpg.callbacks.SelectionCallback"
     complete_run(run, tmp_path / "none", LAVA[:1], n_eval_episodes=4)
     records = pd.read_csv(tmp_path / "none" / "episodes.csv")
     assert set(records["attempts"]) == {3}
@@ -165,10 +169,9 @@ def test_attempts_go_on_until_one_meets_the_limits(tmp_path):
     # A limit between the attempts' best epochs: those before the one that meets it were in vain.
     best = [cost.min() for cost in costs]
     first = int(np.argmin(best[:2]))
-    limits = [{"sb3_tdpg.callbacks.SelectionCallback": {"cost_limit": float(np.mean(best[:2])), "mi_limit": 1e6}}]
-    complete_run(
-        replace(run, overrides={**run.overrides, "callback": limits}), tmp_path / "some", LAVA[:1], n_eval_episodes=4
-    )
+    limits = [{callback: {"cost_limit": float(np.mean(best[:2])), "mi_limit": 1e6}}]
+    limited = replace(run, overrides={**run.overrides, "callback": limits})
+    complete_run(limited, tmp_path / "some", LAVA[:1], n_eval_episodes=4)
     records = pd.read_csv(tmp_path / "some" / "episodes.csv")
     assert set(records["attempts"]) == {first + 1}
     assert records["selected"].all()
@@ -207,13 +210,10 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
         assert (tmp_path / f"trajectories_{reading}.png").exists()
     seeds = pd.read_csv(tmp_path / "seeds.csv")
     assert len(seeds) == 2 * len(METHODS) * 2 + len(paper_runs(1))
-    recomputed = (
-        pd.read_csv(tmp_path / "episodes_text.csv.gz")
-        .query("model == 'PG' and train_seed == 301 and scenario == 'Training'")["cost"]
-        .mean()
-    )
-    found = seeds.query("group == 'text' and model == 'PG' and train_seed == 301")["mean"].item()
-    assert found == pytest.approx(recomputed, abs=1e-4)
+    of_a_seed = "model == 'PG' and train_seed == 301 and "
+    records = pd.read_csv(tmp_path / "episodes_text.csv.gz").query(of_a_seed + "scenario == 'Training'")
+    found = seeds.query(of_a_seed + "group == 'text'")["mean"].item()
+    assert found == pytest.approx(records["cost"].mean(), abs=1e-4)
 
 
 def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
@@ -261,8 +261,7 @@ def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
     second = Run("more", "Lava-v0", "Lava-v0-pg", 0, {**overrides, "learning_rate": 0.0}, start=tmp_path / "first")
     tasks = [(second, tmp_path / "second", LAVA[:1]), (first, tmp_path / "first", LAVA[:1])]
     complete_runs(tasks, n_eval_episodes=4, jobs=2)
-    models = [TDPG.load(tmp_path / name / "model.zip", device="cpu") for name in ("first", "second")]
-    assert_same_parameters(*(parameters(model.policy) for model in models))
+    assert_same_parameters(policy_of(tmp_path / "first"), policy_of(tmp_path / "second"))
 
 
 def test_the_progress_bar_counts_runs_and_moves_with_their_epochs(tmp_path, capsys):
@@ -278,24 +277,12 @@ def test_the_progress_bar_counts_runs_and_moves_with_their_epochs(tmp_path, caps
 
 
 def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_path):
-    run = replace(tiny_run(), start=tmp_path / "nowhere")
     with pytest.raises(ValueError, match="nowhere, and there is none: train it first"):
-        complete_run(run, tmp_path / "run", LAVA[:1], n_eval_episodes=4)
-    assert not list(tmp_path.iterdir())
-
-
-def test_runs_that_wait_for_each_other_are_refused(tmp_path):
-    run = replace(tiny_run(), start=tmp_path / "run")
+        complete_run(replace(tiny_run(), start=tmp_path / "nowhere"), tmp_path / "run", LAVA[:1], n_eval_episodes=4)
+    waits_for_itself = replace(tiny_run(), start=tmp_path / "run")
     with pytest.raises(ValueError, match="wait for each other"):
-        complete_runs([(run, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
-
-
-def test_a_folder_with_another_run_is_told_before_any_run_begins(tmp_path):
-    complete_run(tiny_run(), tmp_path / "old", LAVA[:1], n_eval_episodes=4)
-    tasks = [(tiny_run(), tmp_path / "new", LAVA[:1]), (tiny_run(seed=1), tmp_path / "old", LAVA[:1])]
-    with pytest.raises(ValueError, match="seed: 0 there, 1 here"):
-        complete_runs(tasks, n_eval_episodes=4, jobs=1)
-    assert not (tmp_path / "new").exists()
+        complete_runs([(waits_for_itself, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -40,14 +40,19 @@ def workers(tmp_path, url):
         each.stop()
 
 
-def test_a_trial_whose_worker_is_killed_is_run_again_with_its_parameters(workers, url):
-    team = workers(8)
+def work_while_one_is_killed(team, *seconds):
+    """Let workers begin at once, and kill another one in its first trial; return it."""
     (victim,) = team.start(60)
     team.wait_for("begin", victim)  # the others might leave nothing to it
-    others = team.start(0.1, 0.1)
+    others = team.start(*seconds)
     team.send("SIGKILL", victim)
     team.join(others)
+    return victim
 
+
+def test_a_trial_whose_worker_is_killed_is_run_again_with_its_parameters(workers, url):
+    team = workers(8)
+    victim = work_while_one_is_killed(team, 0.1, 0.1)
     trials = open_quick(url).get_trials()
     finished = [t for t in trials if t.state in FINISHED]
     assert 8 <= len(finished) <= 8 + 2
@@ -62,12 +67,7 @@ def test_a_trial_whose_worker_is_killed_is_run_again_with_its_parameters(workers
 
 def test_every_job_is_done_once_by_workers_that_begin_at_once_while_one_is_killed(workers, url):
     team = workers(None)
-    (victim,) = team.start(60)
-    team.wait_for("begin", victim)  # the others might leave nothing to it
-    others = team.start(0.2, 0.2)
-    team.send("SIGKILL", victim)
-    team.join(others)
-
+    work_while_one_is_killed(team, 0.2, 0.2)
     trials = open_quick(url).get_trials()
     assert sorted(t.params["x"] for t in trials if t.state in FINISHED) == [-2, -1, 0, 1, 2, 3]
     assert len(team.lines("end")) - team.n_dropped == 6
@@ -256,18 +256,15 @@ def test_a_password_is_neither_shown_nor_an_obstacle(postgres):  # noqa: F811
     assert "rc%25nt" not in shown
 
 
-@pytest.mark.parametrize(
-    ("url", "message"),
-    [
-        ("postgresql://someone:secret@127.0.0.1:1/x", r"storage postgresql://someone:\*\*\*@127.0.0.1:1/x cannot"),
-        ("postgresql://someone:sec@secret@host/x", "write an @ in the password as %40"),
-        ("postgresql://::::", "is malformed or of an unknown kind, expected"),
-        ("nothing://host/x", "is malformed or of an unknown kind, expected"),
-        ("study.txt", "must be postgresql://"),
-        ("sqlite:///study.db", "SQLite is not meant for several workers"),
-        ("/proc/nowhere/study.log", "cannot be opened"),
-    ],
-)
+@pytest.mark.parametrize(("url", "message"), [
+    ("postgresql://someone:secret@127.0.0.1:1/x", r"storage postgresql://someone:\*\*\*@127.0.0.1:1/x cannot"),
+    ("postgresql://someone:sec@secret@host/x", "write an @ in the password as %40"),
+    ("postgresql://::::", "is malformed or of an unknown kind, expected"),
+    ("nothing://host/x", "is malformed or of an unknown kind, expected"),
+    ("study.txt", "must be postgresql://"),
+    ("sqlite:///study.db", "SQLite is not meant for several workers"),
+    ("/proc/nowhere/study.log", "cannot be opened"),
+])  # fmt: skip
 def test_a_storage_that_cannot_be_used_is_named_in_one_line(url, message):
     begin = time.monotonic()
     with pytest.raises(ValueError, match=message) as caught:
