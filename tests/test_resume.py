@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from small_problems import AtEveryStep, assert_same_parameters, parameters, tiny_tdpg
+from small_problems import TINY_CRITIC, AtEveryStep, assert_same_parameters, lava_env, parameters, tiny_tdpg
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback
-from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg import TDPG, SelectionCallback, TrainingCheckpointCallback
 
 SLOW = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -23,24 +22,14 @@ SAVE_FREQ = 2
 TOTAL = {"lava": 700, "lava_in_dummy_vec_env": 700, "cartpole": 3000}
 
 ENVIRONMENTS = {
-    "lava": lambda: BatchedVecEnv(LavaEnv(), 20),
+    "lava": lava_env,
     "lava_in_dummy_vec_env": lambda: make_vec_env("Lava-v0", n_envs=4),
     "cartpole": lambda: make_vec_env("CartPole-v1", n_envs=4),
 }
 KEEPS_ALL = "mine that keeps its moments and an average"
 SETTINGS = {
     "mine": dict(mi_estimator="mine"),
-    KEEPS_ALL: dict(
-        mi_estimator="mine",
-        mi_kwargs=dict(
-            hidden_sizes=(8,),
-            batch_size=5,
-            gradient_steps=2,
-            warmup_gradient_steps=4,
-            reset_moments=False,
-            ema_decay=0.9,
-        ),
-    ),
+    KEEPS_ALL: dict(mi_estimator="mine", mi_kwargs=dict(TINY_CRITIC, reset_moments=False, ema_decay=0.9)),
     "logdet and schedules": dict(
         beta=lambda progress: 0.1 + progress, learning_rate=lambda progress: 1e-2 * progress, max_grad_norm=1.0
     ),
@@ -103,14 +92,11 @@ def stop_in_epoch(epoch):
     return AtEveryStep(stop)
 
 
-@pytest.mark.parametrize(
-    ("env", "settings"),
-    [
-        pytest.param(env, settings, marks=SLOW if (env, settings) == ("cartpole", "passes under a cost limit") else ())
-        for env in ENVIRONMENTS
-        for settings in SETTINGS
-    ],
-)
+@pytest.mark.parametrize(("env", "settings"), [
+    pytest.param(env, settings, marks=SLOW if (env, settings) == ("cartpole", "passes under a cost limit") else ())
+    for env in ENVIRONMENTS
+    for settings in SETTINGS
+])  # fmt: skip
 def test_a_training_that_stopped_anywhere_goes_on_bit_for_bit(env, settings, tmp_path):
     total, stop = TOTAL[env], stop_in_epoch(3)
     if SETTINGS[settings].get("seed", 0) is None:  # two models differ then: both go on from the same file

@@ -53,5 +53,9 @@ def on_the_hub(card, monkeypatch):
         asked.append((repo_id, filename, kwargs))
         return str(card / filename)
 
+    names = [str(path.relative_to(card)) for path in card.rglob("*") if path.is_file()]
+    assert "pg-seed0/model.zip" in names
+    names.append("tdpg-seed7/model.zip")  # what a run started from may be called like a model
     monkeypatch.setattr("huggingface_hub.hf_hub_download", hf_hub_download)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda api, repo_id, revision: names)
     return asked

@@ -56,19 +56,13 @@ def http_error(status, text):
     return errors.HfHubHTTPError(text, response=response)
 
 
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (
-            errors.LocalTokenNotFoundError("Token is required"),
-            r"\(Token is required\): .*hf auth login",
-        ),
-        (http_error(401, "401 Unauthorized\nInvalid user token"), r"\(401 Unauthorized\): .*hf auth login"),
-        (http_error(503, "\n503 Service Unavailable"), r"\(503 Service Unavailable\): try again .* pushed again"),
-        (ConnectionError("no route"), r"\(no route\): try again when the Hub can be reached; .* pushed again"),
-        (errors.HTTPError("refused"), r"\(refused\): try again"),
-    ],
-)
+@pytest.mark.parametrize(("error", "message"), [
+    (errors.LocalTokenNotFoundError("Token is required"), r"\(Token is required\): .*hf auth login"),
+    (http_error(401, "401 Unauthorized\nInvalid user token"), r"\(401 Unauthorized\): .*hf auth login"),
+    (http_error(503, "\n503 Service Unavailable"), r"\(503 Service Unavailable\): try again .* pushed again"),
+    (ConnectionError("no route"), r"\(no route\): try again when the Hub can be reached; .* pushed again"),
+    (errors.HTTPError("refused"), r"\(refused\): try again"),
+])  # fmt: skip
 def test_errors_of_the_hub_are_reported_in_one_line(error, message, card, api):
     api.error = error
     with pytest.raises(ValueError, match="someone/tdpg-Lava-v0 cannot be written " + message) as told:
