@@ -50,8 +50,7 @@ def test_a_cost_limit_takes_information_out_and_keeps_the_return():
 
 
 def test_an_epoch_of_steps_has_whole_episodes_and_stops_as_soon_as_there_are_enough():
-    model = tiny(epoch_steps=300, n_envs=3)
-    model.learn(300)
+    model = tiny(epoch_steps=300, n_envs=3).learn(300)
     batch = model.rollout_buffer.episode_batch(whole_horizon=False)
     lengths = batch.alive.sum(0)
     assert 300 <= lengths.sum() == model.rollout_buffer.alive.sum()
@@ -83,20 +82,16 @@ def test_a_training_shorter_than_an_epoch_warns_with_the_number_to_change():
         tiny().learn(50)
 
 
-def test_a_time_limit_inside_the_function_behind_an_id_is_found():
+def test_a_time_limit_inside_the_function_behind_an_id_is_found(registry):
     gym.register("HiddenLimit-v0", lambda: gym.wrappers.TimeLimit(gym.make("Pendulum-v1").unwrapped, 70))
-    try:
-        assert TDPG("TRVPolicy", "HiddenLimit-v0").horizon == 70
-    finally:
-        del gym.registry["HiddenLimit-v0"]
+    assert TDPG("TRVPolicy", "HiddenLimit-v0").horizon == 70
 
 
 # -- segments --------------------------------------------------------------------------------------------------
 
 
 def test_segments_leave_out_what_comes_after_the_end():
-    model = tiny(epoch_steps=300)
-    model.learn(300)
+    model = tiny(epoch_steps=300).learn(300)
     batch = model.rollout_buffer.episode_batch(whole_horizon=False)
     parts = batch.segments(5)
     assert parts.alive.shape[0] == 5
@@ -120,8 +115,7 @@ def test_minibatches_count_steps(monkeypatch):
 
 def test_the_first_ratio_of_an_epoch_is_one():
     """Statistics of the observations must not change between the rollouts and their gradients."""
-    model = tiny(n_epochs=1, batch_size=400, normalize_advantage=False)
-    model.learn(800)
+    model = tiny(n_epochs=1, batch_size=400, normalize_advantage=False).learn(800)
     assert model.logger.name_to_value["train/approx_kl"] == pytest.approx(0.0, abs=1e-4)
     assert model.epoch >= 2
 
@@ -159,8 +153,7 @@ def test_a_new_scale_of_the_targets_does_not_move_the_values():
 
 
 def test_observations_are_standardised_by_what_the_training_has_seen():
-    model = tiny()
-    model.learn(400)
+    model = tiny().learn(400)
     norm = model.policy.norm.norms["observation"]
     seen = model.rollout_buffer.observations[model.rollout_buffer.alive > 0]
     np.testing.assert_allclose(norm.mean, seen.mean(0), atol=1e-3)
@@ -170,8 +163,7 @@ def test_observations_are_standardised_by_what_the_training_has_seen():
 
 
 def test_the_information_is_pooled_over_the_steps_of_all_times():
-    model = tiny(beta=1e6)
-    model.learn(400)
+    model = tiny(beta=1e6).learn(400)
     batch = model.rollout_buffer.episode_batch()
     pooled = batch.information_batch(pooled=True)
     assert pooled.trvs.shape[:2] == (1, int(batch.alive.sum()))
@@ -192,8 +184,7 @@ def test_the_interval_of_pooled_information_is_that_of_an_episode():
 
 @pytest.mark.parametrize("mi_estimator", ["mine", "infonce", "loo", "vib"])
 def test_every_estimator_penalises_pooled_steps(mi_estimator):
-    model = tiny(beta=100.0, mi_estimator=mi_estimator, encoder_gradient="score")
-    model.learn(400)
+    model = tiny(beta=100.0, mi_estimator=mi_estimator, encoder_gradient="score").learn(400)
     assert model.estimator.horizon == 1
     assert np.isfinite(model.logger.name_to_value["train/mi_loss"])
 
@@ -295,16 +286,14 @@ def test_the_variance_of_the_actions_is_one_parameter_unless_asked_for():
     assert stds[None].unique().numel() == 1
     assert stds[False].unique().numel() > 10
     before = stds[None][0].item()
-    model = tiny("Pendulum-v1")
-    model.learn(800)
+    model = tiny("Pendulum-v1").learn(800)
     after = model.policy.action_density(th.zeros(1, model.policy.trv_dim), np.zeros(1, int)).distribution.stddev
     assert after.item() != pytest.approx(before, rel=1e-4)  # it is learnt
     assert not hasattr(tiny("CartPole-v1").policy, "action_log_var")  # nothing to learn with discrete actions
 
 
 def test_a_saved_model_predicts_and_continues_the_same(tmp_path):
-    model = tiny()
-    model.learn(400)
+    model = tiny().learn(400)
     model.save(tmp_path / "model")
     loaded = TDPG.load(tmp_path / "model", env=gym.make("CartPole-v1"), device="cpu")
     assert_same_parameters(parameters(model.policy), parameters(loaded.policy))
@@ -323,8 +312,7 @@ CAMERA_AND_JOINTS = spaces.Dict(
 @pytest.mark.parametrize("horizon", [4, 60])
 def test_a_camera_beside_joints_is_learnt_from(horizon, tmp_path):
     env = ToyEnv(observation_space=CAMERA_AND_JOINTS, horizon=horizon)
-    model = TDPG("TRVPolicy", env, n_episodes=4, beta=10.0, seed=0)
-    model.learn(2 * 4 * horizon)
+    model = TDPG("TRVPolicy", env, n_episodes=4, beta=10.0, seed=0).learn(2 * 4 * horizon)
     assert model.epoch == 2
     assert model.state_dim == 1  # what the environment says, and not the joints
     model.save(tmp_path / "model")
@@ -336,8 +324,7 @@ def test_a_camera_beside_joints_is_learnt_from(horizon, tmp_path):
 def test_a_dict_of_vectors_is_its_own_state_and_one_with_an_image_is_not():
     joints = spaces.Dict(angles=spaces.Box(-1, 1, (2,), np.float32), speed=spaces.Box(-1, 1, (1,), np.float32))
     env = ToyEnv(observation_space=joints, gives_state=False, horizon=60)
-    model = tiny(env)
-    model.learn(400)
+    model = tiny(env).learn(400)
     assert model.state_dim == 3
     assert set(model.policy.norm.norms) == {"angles", "speed"}
     camera = ToyEnv(observation_space=CAMERA_AND_JOINTS, gives_state=False, horizon=60)

@@ -7,6 +7,8 @@ from unittest.mock import Mock
 import gymnasium as gym
 import numpy as np
 import pytest
+import sb3_contrib
+import stable_baselines3
 from gymnasium import spaces
 from PIL import Image
 from small_problems import ToyEnv, error_line, tiny_tdpg
@@ -57,15 +59,12 @@ def ball(tmp_path_factory):
 
 
 @pytest.fixture
-def registered(monkeypatch):
-    """Register an environment of the tests for one test only."""
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
-
-    def register(entry_point):
-        gym.register("Own-v0", entry_point)
-        return "Own-v0"
-
-    return register
+def own(registry, tmp_path):
+    """Register PictureEnv for one test; the file of a model for it."""
+    gym.register("Own-v0", PictureEnv)
+    path = tmp_path / "own.zip"
+    tiny_tdpg("Own-v0").save(path)
+    return path
 
 
 def frames_of(path):
@@ -175,10 +174,8 @@ def test_the_axes_do_not_move_while_the_lines_grow(lava, tmp_path):
         np.testing.assert_array_equal(frame[272:], frames[0][272:])  # and of the time
 
 
-def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(registered, tmp_path):
-    env_id = registered(PictureEnv)
-    tiny_tdpg(gym.make(env_id)).save(tmp_path / "model.zip")
-    episodes = enjoy(tmp_path / "model.zip", env_id, n_episodes=6, record=tmp_path / "film.gif")
+def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(own, tmp_path):
+    episodes = enjoy(own, "Own-v0", n_episodes=6, record=tmp_path / "film.gif")
     assert {len(episode.signals) for episode in episodes} == {1, 3}
     frames, _ = frames_of(tmp_path / "film.gif")
     assert len(frames) == sum(len(episode.signals) + 1 for episode in episodes)
@@ -309,12 +306,10 @@ def test_without_ffmpeg_an_mp4_is_refused_before_an_episode_is_run(lava, tmp_pat
     assert "episode 1" not in captured.out
 
 
-def test_an_environment_that_draws_nothing_cannot_be_recorded(registered, tmp_path, monkeypatch):
-    env_id = registered(PictureEnv)
-    tiny_tdpg(gym.make(env_id)).save(tmp_path / "model.zip")
+def test_an_environment_that_draws_nothing_cannot_be_recorded(own, tmp_path, monkeypatch):
     monkeypatch.setattr(PictureEnv, "render", lambda self: None)
     with pytest.raises(ValueError, match=r"must return an array \(height, width, 3\) of uint8"):
-        enjoy(tmp_path / "model.zip", env_id, record=tmp_path / "film.gif")
+        enjoy(own, "Own-v0", record=tmp_path / "film.gif")
 
 
 def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch, capsys):
@@ -324,14 +319,10 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_package_for_pictures_is_told_in_a_line(registered, tmp_path, monkeypatch, capsys):
-    def render(self):
-        raise gym.error.DependencyNotInstalled("pygame is not installed")
-
-    registered(PictureEnv)
-    monkeypatch.setattr(PictureEnv, "render", render)
-    tiny_tdpg("Own-v0").save(tmp_path / "own.zip")
-    line = error_line(capsys, "enjoy", tmp_path / "own.zip", "--env", "Own-v0", "--record", tmp_path / "film.gif")
+def test_a_missing_package_for_pictures_is_told_in_a_line(own, tmp_path, monkeypatch, capsys):
+    missing = gym.error.DependencyNotInstalled("pygame is not installed")
+    monkeypatch.setattr(PictureEnv, "render", Mock(side_effect=missing))
+    line = error_line(capsys, "enjoy", own, "--env", "Own-v0", "--record", tmp_path / "film.gif")
     assert "cannot be drawn: pygame is not installed" in line
     assert not (tmp_path / "film.gif").exists()
 
@@ -340,19 +331,14 @@ def test_a_missing_package_for_pictures_is_told_in_a_line(registered, tmp_path, 
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "RecurrentPPO", "DQN"])
-def test_models_of_other_algorithms_are_played(algorithm, registered, tmp_path, capsys):
-    import sb3_contrib
-    import stable_baselines3
-
-    registered(PictureEnv)
+def test_models_of_other_algorithms_are_played(algorithm, own, tmp_path, capsys):
     make = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
     policy = "MlpLstmPolicy" if algorithm == "RecurrentPPO" else "MlpPolicy"
-    make(policy, "Own-v0", seed=0, device="cpu").save(tmp_path / "own.zip")
+    make(policy, "Own-v0", seed=0, device="cpu").save(own)
     film = tmp_path / "film.gif"
-    episodes = enjoy(tmp_path / "own.zip", "Own-v0", n_episodes=3, record=film)
-    assert costs_printed(capsys.readouterr().out) == pytest.approx(
-        [episode.costs.sum() for episode in episodes], abs=0.01
-    )
+    episodes = enjoy(own, "Own-v0", n_episodes=3, record=film)
+    costs = [episode.costs.sum() for episode in episodes]
+    assert costs_printed(capsys.readouterr().out) == pytest.approx(costs, abs=0.01)
     for episode in episodes:
         assert episode.signals.shape == (len(episode.costs), 1)  # the actions
         assert set(episode.signals.ravel()) <= {0, 1}

@@ -20,12 +20,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.lava import GOAL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
-from sb3_tdpg.evaluation import (
-    evaluate_scenarios,
-    rollout_states,
-    summary_table,
-    training_curves,
-)
+from sb3_tdpg.evaluation import evaluate_scenarios, rollout_states, summary_table, training_curves
 
 TWO_ROWS = (LAVA[0], LAVA[-1])
 
@@ -207,9 +202,7 @@ class RaceEnv(gym.Env):
         return np.array([self.x], np.float32), -self.x if ended else 0.0, ended, False, {"start": self.x}
 
 
-def test_an_episode_has_the_same_number_whichever_ends_first(monkeypatch):
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
-    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
+def test_an_episode_has_the_same_number_whichever_ends_first(registry, monkeypatch):
     gym.register("Race-v0", RaceEnv)
     model = PPO("MlpPolicy", "Race-v0", n_steps=20, batch_size=20, seed=0, device="cpu")
     rows = [Scenario(str(high), "Race-v0", dict(high_first=high)) for high in (False, True)]
@@ -249,25 +242,22 @@ def test_the_last_infos_success_becomes_a_failure_column(tdpg, monkeypatch):
     assert summary_table(frame)["failure_share"].tolist() == [0.25]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(scenarios=[]), "scenarios is empty"),
-        (dict(scenarios=[LAVA[0], LAVA[0]]), "'Training'.*more than once"),
-        (dict(n_episodes=0), "n_episodes=0"),
-        (dict(n_episodes=2.5), "n_episodes=2.5"),
-        (dict(seed=-1), "seed=-1"),
-        (dict(model={}), "empty mapping"),
-        (dict(model=TDPG), "expected a Stable-Baselines3 model"),
-        (dict(model="model.zip"), "expected a Stable-Baselines3 model"),
-        (dict(labels=dict(cost=1)), "cost"),
-        (dict(env_kwargs=dict(typo=1)), "'Training'.*typo"),
-        (dict(scenarios=[*LAVA, Scenario("other", "NoSuch-v0")]), "'other'.*NoSuch"),
-        (dict(scenarios=[*LAVA, Scenario("pole", "CartPole-v1")]), "'TDPG'.*'pole'.*observation_space"),
-        (dict(scenarios=[*LAVA, Scenario("weak", "Lava-v0", dict(max_action=1.0))]), "'weak'.*action_space"),
-        (dict(scenarios=[*LAVA, Scenario("long", "Lava-v0", dict(horizon=6))]), "'long'.*horizon of 5.*has 6"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (dict(scenarios=[]), "scenarios is empty"),
+    (dict(scenarios=[LAVA[0], LAVA[0]]), "'Training'.*more than once"),
+    (dict(n_episodes=0), "n_episodes=0"),
+    (dict(n_episodes=2.5), "n_episodes=2.5"),
+    (dict(seed=-1), "seed=-1"),
+    (dict(model={}), "empty mapping"),
+    (dict(model=TDPG), "expected a Stable-Baselines3 model"),
+    (dict(model="model.zip"), "expected a Stable-Baselines3 model"),
+    (dict(labels=dict(cost=1)), "cost"),
+    (dict(env_kwargs=dict(typo=1)), "'Training'.*typo"),
+    (dict(scenarios=[*LAVA, Scenario("other", "NoSuch-v0")]), "'other'.*NoSuch"),
+    (dict(scenarios=[*LAVA, Scenario("pole", "CartPole-v1")]), "'TDPG'.*'pole'.*observation_space"),
+    (dict(scenarios=[*LAVA, Scenario("weak", "Lava-v0", dict(max_action=1.0))]), "'weak'.*action_space"),
+    (dict(scenarios=[*LAVA, Scenario("long", "Lava-v0", dict(horizon=6))]), "'long'.*horizon of 5.*has 6"),
+])  # fmt: skip
 def test_what_does_not_fit_is_an_error_before_any_episode_is_run(change, message, tdpg, monkeypatch):
     monkeypatch.setattr("sb3_tdpg.evaluation.records.rollout", lambda *args, **kwargs: pytest.fail("ran"))
     arguments = dict(model=tdpg, scenarios=LAVA, n_episodes=5) | change

@@ -21,6 +21,7 @@ from sb3_tdpg.report import load_model, parse_models, robustness_report
 from sb3_tdpg.report.models import label_of
 from sb3_tdpg.report.page import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
+from tests.report.test_report_time import report_of
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("rliable")
@@ -166,19 +167,14 @@ def test_processes_give_the_same_episodes(report, tmp_path):
 
 def test_all_methods_meet_the_same_episodes(tmp_path):
     model = tiny_tdpg()
-    robustness_report(
-        {"A": model, "B": [model]}, "Lava-v0", out=tmp_path, perturbations=["vector_bias"], severities=[1],
-        n_episodes=30, progress_bar=False,
-    )  # fmt: skip
+    report_of(tmp_path, {"A": model, "B": [model]}, n_episodes=30, progress_bar=False)
     records = pd.read_csv(tmp_path / "episodes.csv.xz").set_index(["model", "perturbation", "severity", "episode"])
     pd.testing.assert_series_equal(records.loc["A"]["cost"], records.loc["B"]["cost"])
 
 
 def test_one_model_is_not_taken_for_a_method(tmp_path):
-    text = robustness_report(
-        {"A": tiny_tdpg(), "B": tiny_tdpg(seed=1)}, "Lava-v0", out=tmp_path, perturbations=["vector_noise"],
-        severities=[3], n_episodes=30, scenarios=(), progress_bar=False,
-    )  # fmt: skip
+    models = {"A": tiny_tdpg(), "B": tiny_tdpg(seed=1)}
+    text = report_of(tmp_path, models, severities=[3], n_episodes=30, progress_bar=False)
     assert "about this model" in text
     assert "With 1 and 1 model no difference can be clear" in text
     assert "Which is more robust" not in text
@@ -235,10 +231,8 @@ def test_the_statistics_that_the_zoo_leaves_beside_a_model_are_used(name, tmp_pa
 
 def test_images_get_a_gallery_and_a_scene(tmp_path):
     model = tiny_tdpg("BallCatch-v0", n_episodes=4, cost_limit=20.0)
-    text = robustness_report(
-        {"A": model}, "BallCatch-v0", out=tmp_path, perturbations=["noise", "camera_pose"], severities=[5],
-        n_episodes=3, scenarios=(), progress_bar=False,
-    )  # fmt: skip
+    settings = dict(perturbations=["noise", "camera_pose"], severities=[5], progress_bar=False)
+    text = report_of(tmp_path, {"A": model}, "BallCatch-v0", **settings)
     assert "figures/examples.png" in text
     assert "| camera_pose | the environment changes | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
@@ -281,10 +275,7 @@ def test_a_training_seed_counts_once(folder, tmp_path, capsys):
 
 
 def test_a_folder_and_a_perturbation_may_be_texts(tmp_path):
-    text = robustness_report(
-        {"A": tiny_tdpg()}, "Lava-v0", out=str(tmp_path), perturbations="vector_bias", severities=[2], scenarios=(),
-        n_episodes=3, progress_bar=False,
-    )  # fmt: skip
+    text = report_of(str(tmp_path), perturbations="vector_bias", severities=[2], progress_bar=False)
     assert (tmp_path / "report.md").read_text() == text
 
 

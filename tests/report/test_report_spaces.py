@@ -22,8 +22,7 @@ pytest.importorskip("markdown_it")
 PARTS = spaces.Dict(place=spaces.Box(-1, 1, (2,), np.float32), camera=spaces.Box(0, 255, (3, 36, 36), np.uint8))
 
 
-def test_a_dict_and_a_plant_are_perturbed(tmp_path, monkeypatch):
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+def test_a_dict_and_a_plant_are_perturbed(tmp_path, registry):
     gym.register("Toy-v0", ToyEnv, kwargs=dict(observation_space=PARTS, horizon=6))
     model = PPO("MultiInputPolicy", gym.make("Toy-v0"), n_steps=6, batch_size=6, seed=0, device="cpu")
     names = ["noise", "vector_bias", "freeze", "group_failure", "actuator_gain", "actuator_delay"]

@@ -32,9 +32,9 @@ def test_long_episodes_are_fewer(kind, horizon, n_episodes):
     assert plan.default_episodes(kind, horizon, 10_000) == n_episodes
 
 
-def report_of(out, models=None, **settings):
+def report_of(out, models=None, env_id="Lava-v0", **settings):
     settings = dict(perturbations=["vector_bias"], severities=[1, 5], scenarios=(), n_episodes=3) | settings
-    return robustness_report({"A": tiny_tdpg()} if models is None else models, "Lava-v0", out=out, **settings)
+    return robustness_report({"A": tiny_tdpg()} if models is None else models, env_id, out=out, **settings)
 
 
 def test_a_budget_of_steps_sets_the_episodes(tmp_path):
@@ -139,12 +139,8 @@ class FirstEpisodeEnv(CountdownEnv):
         return super().reset(**kwargs)
 
 
-def test_there_is_a_page_where_the_information_cannot_be_measured(tmp_path, monkeypatch, few_information_episodes):
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+def test_there_is_a_page_where_the_information_cannot_be_measured(tmp_path, registry, few_information_episodes):
     gym.register("Countdown-v0", FirstEpisodeEnv, kwargs=dict(name=0, lengths=(2,)))
-    text = robustness_report(
-        {"A": tiny_tdpg("Countdown-v0")}, "Countdown-v0", out=tmp_path, perturbations=["vector_bias"],
-        severities=[2], n_episodes=3, information=True, progress_bar=False,
-    )  # fmt: skip
+    text = report_of(tmp_path, {"A": tiny_tdpg("Countdown-v0")}, "Countdown-v0", information=True, progress_bar=False)
     assert "not measured: the frame has no component" in text
     assert (tmp_path / "report.html").exists()
