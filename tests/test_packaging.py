@@ -102,16 +102,13 @@ def test_the_wheel_installs_nothing_but_sb3_tdpg_at_the_top(wheel: Path) -> None
     assert {name for name in top if not name.endswith(".dist-info")} == {"sb3_tdpg"}
 
 
-def test_the_installed_wheel_imports_from_its_own_environment(installed: Path, tmp_path: Path) -> None:
-    show = "print(sb3_tdpg.__file__, sb3_tdpg.envs.__file__, sb3_tdpg.hyperparams.__file__, sep='\\n')"
-    files = run(installed, "-c", IMPORT_ALL + show, cwd=tmp_path).splitlines()[-3:]
+def test_the_installed_wheel_has_its_own_files_and_the_version_that_it_reports(installed: Path, tmp_path: Path) -> None:
+    show = (
+        "import importlib.metadata; print(sb3_tdpg.__file__, sb3_tdpg.envs.__file__, sb3_tdpg.hyperparams.__file__, "
+        "importlib.metadata.version('sb3_tdpg'), sb3_tdpg.__version__, sep='\\n')"
+    )
+    *files, packaged, reported = run(installed, "-c", IMPORT_ALL + show, cwd=tmp_path).splitlines()[-5:]
     assert all(Path(file).is_relative_to(installed.parents[1]) for file in files), files
-
-
-def test_the_installed_wheel_has_the_version_that_it_reports(installed: Path, tmp_path: Path) -> None:
-    show = "print(importlib.metadata.version('sb3_tdpg'), sb3_tdpg.__version__)"
-    output = run(installed, "-c", "import importlib.metadata, sb3_tdpg; " + show, cwd=tmp_path)
-    packaged, reported = output.splitlines()[-1].split()
     assert packaged == reported
 
 
@@ -140,13 +137,10 @@ QUICKSTART_MAKES = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("page", "end", "makes"),
-    [
-        ("README.md", "## Install", ("tdpg_squeeze.zip", "results/report-CartPole-v1/report.html")),
-        ("docs/guide/quickstart.md", "## In a notebook", QUICKSTART_MAKES),
-    ],
-)
+@pytest.mark.parametrize(("page", "end", "makes"), [
+    ("README.md", "## Install", ("tdpg_squeeze.zip", "results/report-CartPole-v1/report.html")),
+    ("docs/guide/quickstart.md", "## In a notebook", QUICKSTART_MAKES),
+])  # fmt: skip
 def test_the_blocks_of_a_first_page_chain_word_for_word(
     page: str, end: str, makes: tuple[str, ...], installed: Path, tmp_path: Path
 ) -> None:
