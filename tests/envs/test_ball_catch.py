@@ -9,12 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 import sb3_tdpg  # noqa: F401  (registers the environments)
 from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.envs.scenarios import (
-    BALL_CATCH,
-    BALL_CATCH_VARYING_LAUNCH,
-    BALL_PUBLISHED_READING,
-    BALL_VARYING_LAUNCH,
-)
+from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_VARYING_LAUNCH, BALL_PUBLISHED_READING, BALL_VARYING_LAUNCH
 from sb3_tdpg.envs.textures import TEST_TEXTURES
 
 READINGS = {"text": {}, "published": BALL_PUBLISHED_READING}
@@ -198,10 +193,8 @@ def test_minmax_spreads_each_image_over_the_whole_range_and_clip_leaves_its_cont
 
 def test_noise_of_a_batch_differs_between_its_images_and_follows_the_seed():
     def images(seed):
-        env = make_episodes_env(
-            "BallCatch-v0", 3, env_kwargs=dict(renderer="fast", robot_range=(0, 0), pixel_noise_std=0.1), seed=seed
-        )
-        return env.reset()
+        keywords = dict(robot_range=(0, 0), pixel_noise_std=0.1)
+        return make_episodes_env("BallCatch-v0", 3, env_kwargs=keywords, seed=seed).reset()
 
     first = images(1)
     assert not np.array_equal(first[0], first[1])
@@ -315,7 +308,7 @@ def test_the_rows_of_the_varying_launch_differ_from_table_two_in_the_launch_alon
         assert not ours.paper
 
 
-# -- walls, and processes ----------------------------------------------------------------------------------
+# -- walls ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "P"])
@@ -342,21 +335,6 @@ def test_with_a_wall_at_rest_only_the_ball_tells_where_the_robot_is(renderer):
     np.testing.assert_array_equal(info["state"], ordinary.reset(seed=0)[1]["state"])
     env.close()
     ordinary.close()
-
-
-def test_processes_draw_the_same_images_and_end_with_the_environment():
-    alone, shared = (
-        make_episodes_env("BallCatch-v0", 5, env_kwargs=dict(renderer="pybullet", n_processes=n), seed=0)
-        for n in (1, 2)
-    )
-    np.testing.assert_array_equal(alone.reset(), shared.reset())
-    for _ in range(2):
-        np.testing.assert_array_equal(alone.step(np.ones((5, 1)))[0], shared.step(np.ones((5, 1)))[0])
-    for env in (alone, shared):
-        env.close()
-        env.close()
-        with pytest.raises(RuntimeError, match="closed"):
-            env.step(np.ones((5, 1)))
 
 
 def test_the_ray_caster_needs_no_processes():

@@ -12,13 +12,14 @@ from small_problems import words
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tdpg import BatchedVecEnv
+from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs import ENTRY_POINTS
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.peg_corner import PegCornerEnv
+from sb3_tdpg.envs.scenarios import PANDA_CAMERA
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 
 EVERY_ID = pytest.mark.parametrize("env_id", sorted(ENTRY_POINTS))
@@ -144,8 +145,11 @@ def test_a_perturbation_reaches_the_observation_in_every_episode_and_never_the_t
     assert ((observations != clean_observations).reshape(12, -1).mean(axis=1) > 0.3).all()
 
 
-@pytest.mark.parametrize("make", [lambda: BallCatchEnv(renderer="pybullet", render_mode="rgb_array"),
-                                  lambda: PandaGraspEnv(render_mode="rgb_array")], ids=["ball", "panda"])  # fmt: skip
+@pytest.mark.parametrize("make", [
+    lambda: BallCatchEnv(renderer="pybullet", render_mode="rgb_array"),
+    lambda: BallCatchEnv(renderer="pybullet", render_mode="rgb_array", n_processes=2),
+    lambda: PandaGraspEnv(render_mode="rgb_array"),
+], ids=["ball", "ball in processes", "panda"])  # fmt: skip
 @pytest.mark.parametrize("is_used", [True, False])
 def test_closing_twice_is_fine_and_a_closed_environment_says_so(make, is_used):
     env = make()
@@ -157,6 +161,29 @@ def test_closing_twice_is_fine_and_a_closed_environment_says_so(make, is_used):
     env.close()
     with pytest.raises(RuntimeError, match="has been closed: make a new one"):
         env.reset()
+
+
+@pytest.mark.parametrize(("env_id", "keywords"), [
+    ("BallCatch-v0", dict(renderer="pybullet", horizon=2)),
+    ("PandaGrasp-v0", PANDA_CAMERA),
+    ("PandaSqueeze-v0", dict(horizon=2)),
+], ids=words)  # fmt: skip
+def test_processes_give_the_same_episodes_and_end_with_the_environment(env_id, keywords):
+    alone, shared = (make_episodes_env(env_id, 5, env_kwargs=dict(keywords, n_processes=n), seed=0) for n in (1, 2))
+    np.testing.assert_array_equal(alone.reset(), shared.reset())
+    shape = (5, *alone.action_space.shape)
+    for actions in (np.ones(shape), np.linspace(-1, 1, np.prod(shape)).reshape(shape)):
+        steps = [env.step(actions) for env in (alone, shared)]
+        for info in (*steps[0][3], *steps[1][3]):
+            info.get("episode", {}).pop("t", None)  # the time that has passed
+        np.testing.assert_equal(*steps)
+    assert vars(alone.env).get("_pool") is None
+    assert vars(shared.env)["_pool"] is not None and "_simulation" not in vars(shared.env)
+    for env in (alone, shared):
+        env.close()
+        env.close()
+        with pytest.raises(RuntimeError):
+            env.step(np.ones(shape))
 
 
 # -- what the constructors refuse ------------------------------------------------------------------------------------

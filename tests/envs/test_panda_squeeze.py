@@ -222,20 +222,6 @@ def test_squeezes_do_not_depend_on_their_order(env):
         assert outcome.yaw == expected[k]
 
 
-def test_several_processes_give_the_same_results(env):
-    shared = PandaSqueezeEnv(n_processes=2)
-    steps = []
-    for each in (env, shared):
-        each.reset(seed=3)
-        state, _ = each.reset_batch(6)
-        steps.append(each.step_batch(state, np.linspace(-1.0, 1.0, 6)[:, None], is_last=True))
-    np.testing.assert_array_equal(steps[0].state, steps[1].state)
-    np.testing.assert_array_equal(steps[0].cost, steps[1].cost)
-    assert [more["height"] for more in steps[0].details] == [more["height"] for more in steps[1].details]
-    assert "_pool" in shared.__dict__ and "_simulation" not in shared.__dict__
-    shared.close()
-
-
 def test_half_a_turn_of_the_hand_changes_nothing_and_the_wrist_stays_within_its_range(env):
     simulation = env._simulation
     for yaw in np.linspace(-math.pi, math.pi, 25):

@@ -103,13 +103,6 @@ def test_the_oracle_lifts_every_mug_and_the_film_keeps_the_image_of_its_camera()
     env.close()
 
 
-def test_processes_give_the_same_images(env):
-    state = env.initial_state(6)
-    shared = PandaGraspEnv(**PANDA_CAMERA, n_processes=2)
-    np.testing.assert_array_equal(shared.sensor(state), env.sensor(state))
-    shared.close()
-
-
 @pytest.mark.parametrize("shift", [0.03, -0.02])
 def test_a_camera_that_is_higher_in_every_trial_sees_the_same_and_the_state_does_not_tell(env, shift):
     shifted, both = PandaGraspEnv(camera_shift=shift), PandaGraspEnv(**PANDA_CAMERA, camera_shift=shift)
