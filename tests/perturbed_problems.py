@@ -14,10 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.textures import random_texture
-from sb3_tdpg.robustness import (
-    PerturbedVecEnv,
-    applicable,
-)
+from sb3_tdpg.robustness import PerturbedVecEnv, applicable
 
 SEVERITIES = (1, 2, 3, 4, 5)
 HORIZON = 8

@@ -66,8 +66,7 @@ def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
     arguments = dict(n_episodes=200, encoder_gradient="pathwise", gae_lambda=0.95, **passes)
     costs, information = [], []
     for beta in ("auto", 1e6):
-        model = tiny_tdpg(beta=beta, cost_limit=40.0 if beta == "auto" else None, **arguments)
-        train_epochs(model, 150)
+        model = train_epochs(tiny_tdpg(beta=beta, cost_limit=40.0 if beta == "auto" else None, **arguments), 150)
         costs.append(model.rollout_buffer.episode_costs.mean())
         information.append(model.information.sum())
     assert costs[1] < 25 < costs[0] < 50
@@ -75,8 +74,7 @@ def test_training_keeps_the_cost_at_the_limit_and_takes_information_out():
 
 
 def test_the_weight_is_saved_and_goes_on_where_it_was(tmp_path):
-    model = tiny_tdpg(beta="auto", cost_limit=1e4)
-    train_epochs(model, 3)
+    model = train_epochs(tiny_tdpg(beta="auto", cost_limit=1e4), 3)
     assert model.mi_coef > 0
     model.save(tmp_path / "model")
     loaded = TDPG.load(tmp_path / "model", env=lava_env(), device="cpu")
@@ -212,8 +210,7 @@ def test_the_default_share_needs_no_number_and_is_logged():
 
 def test_the_share_goes_on_where_it_was_after_a_save(tmp_path):
     env = lava_env()
-    model = tiny_tdpg(cost_limit="80%")
-    train_epochs(model, 16)
+    model = train_epochs(tiny_tdpg(cost_limit="80%"), 16)
     model.save(tmp_path / "model")
     loaded = TDPG.load(tmp_path / "model", env=env, device="cpu")
     assert vars(loaded.auto_weight) == vars(model.auto_weight)

@@ -135,7 +135,9 @@ ARGUMENTS = {
     ),
     "horizon zero": (dict(env=toy_vec_env(horizon=0)), "finite horizon", "horizon=0"),
     "image without a state": (
-        dict(env=toy_vec_env(observation_space=IMAGE, gives_state=False)), r'info\["state"\]', "state_space", "reset"
+        dict(env=toy_vec_env(observation_space=IMAGE, gives_state=False)),
+        r"an image \(Box\(0, 255, \(3, 20, 16\), uint8\)\) cannot stand in for it",
+        r'info\["state"\]', "state_space", "reset",
     ),
     "too many names of the state": (
         dict(env=toy_vec_env(state_names=("d (m)", "v (m/s)"))), r"state_names=\('d \(m\)', 'v", "1 different", "x0"

@@ -227,8 +227,7 @@ def test_a_nan_in_an_observation_or_a_state_never_reaches_the_parameters(field, 
 
 
 def test_an_infinite_gradient_stops_the_training_before_the_step():
-    model = tiny_tdpg(beta=math.inf)
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(beta=math.inf), 1)
     good = parameters(model.policy)
     next(model.policy.parameters()).register_hook(lambda gradient: gradient * math.inf)
     with pytest.raises(TrainingDivergedError, match=r"gradient of epoch 1.*max_grad_norm"):

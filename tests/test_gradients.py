@@ -368,6 +368,5 @@ def test_the_actions_density_is_taken_at_the_unclipped_action():
     # A gradient taken at clipped actions would be biased wherever the bounds bind.
     env = LavaEnv(horizon=2)
     env.action_space = spaces.Box(-0.05, 0.05, (1,), np.float32)
-    model = TDPG("TRVPolicy", BatchedVecEnv(env, 50), n_episodes=50, beta=math.inf, seed=0, device="cpu")
-    model.learn(100)
+    model = TDPG("TRVPolicy", BatchedVecEnv(env, 50), n_episodes=50, beta=math.inf, seed=0, device="cpu").learn(100)
     assert np.abs(model.rollout_buffer.actions).max() > 0.5

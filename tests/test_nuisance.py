@@ -87,8 +87,7 @@ def test_where_the_observation_stands_in_for_the_state_it_is_the_unperturbed_one
 
 def test_the_nuisance_leaves_the_environment_alone_and_follows_the_seed():
     def train(nuisance, seed=0):
-        model = tiny_tdpg("Lava-v0", nuisance=nuisance, seed=seed)
-        train_epochs(model, 2)
+        model = train_epochs(tiny_tdpg("Lava-v0", nuisance=nuisance, seed=seed), 2)
         return parameters(model.policy)
 
     declared = {"vector_noise": (1, 5), "vector_dropout": 3}
@@ -100,8 +99,7 @@ def test_the_nuisance_leaves_the_environment_alone_and_follows_the_seed():
 
 
 def test_an_environment_that_comes_from_another_model_is_wrapped_once(tmp_path):
-    model = tiny_tdpg("Lava-v0", nuisance={"vector_noise": 3})
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg("Lava-v0", nuisance={"vector_noise": 3}), 1)
     model.save(tmp_path / "model")
     assert TDPG.load(tmp_path / "model").nuisance == {"vector_noise": 3}  # without an environment
     assert wrappers(TDPG.load(tmp_path / "model", env=model.env)) == [NuisanceVecEnv]

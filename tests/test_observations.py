@@ -4,11 +4,10 @@ import re
 
 import numpy as np
 import pytest
-from gymnasium import spaces
 from small_problems import ToyEnv, tiny_tdpg, train_epochs
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg import BatchedVecEnv
 from sb3_tdpg.envs.lava import LavaEnv
 
 
@@ -120,9 +119,3 @@ def test_too_few_episodes_for_the_critics_are_reported_with_the_number_needed(n_
 def test_without_a_penalty_no_number_of_episodes_is_too_few(recwarn):
     train_epochs(tiny_tdpg(n_episodes=4, mi_estimator="mine", beta=float("inf")), 1)
     assert not [w for w in recwarn if "too few" in str(w.message)]
-
-
-def test_images_cannot_stand_in_for_the_state():
-    space = spaces.Box(0, 255, (3, 16, 16), np.uint8)
-    with pytest.raises(ValueError, match=r"an image \(Box\(0, 255, \(3, 16, 16\), uint8\)\) cannot stand in for it"):
-        TDPG("TRVPolicy", DummyVecEnv([lambda: ToyEnv(observation_space=space, gives_state=False)]), n_episodes=4)

@@ -30,14 +30,12 @@ def test_an_epoch_makes_so_many_passes_over_minibatches_of_whole_episodes(encode
 
 
 def test_no_minibatch_is_left_with_a_single_episode():
-    model = tiny_tdpg(n_episodes=17, batch_size=8, clip_range=0.2)
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(n_episodes=17, batch_size=8, clip_range=0.2), 1)
     assert sorted(len(part) for part in model._minibatches(model.rollout_buffer.episode_batch())) == [5, 6, 6]
 
 
 def test_every_episode_is_in_one_minibatch_of_a_pass():
-    model = tiny_tdpg(**PASSES)
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(**PASSES), 1)
     columns = th.cat(list(model._minibatches(model.rollout_buffer.episode_batch())))
     assert sorted(columns.tolist()) == list(range(20))
     assert columns.tolist() != list(range(20))
@@ -47,8 +45,7 @@ def test_every_episode_is_in_one_minibatch_of_a_pass():
 def test_one_pass_without_clipping_and_one_with_it_are_the_same_step(beta):
     trained = []
     for clip_range in (math.inf, 0.2):
-        model = tiny_tdpg(beta=beta, clip_range=clip_range)
-        train_epochs(model, 1)
+        model = train_epochs(tiny_tdpg(beta=beta, clip_range=clip_range), 1)
         trained.append(parameters(model.policy))
     for name, value in trained[0].items():
         th.testing.assert_close(value, trained[1][name], msg=name)
@@ -59,8 +56,7 @@ def test_normalising_the_advantages_scales_the_gradient_of_the_whole_objective(b
     """The penalty is divided by what the advantages are divided by: beta keeps its meaning."""
     gradients = []
     for normalize in (False, True):
-        model = tiny_tdpg(beta=beta, normalize_advantage=normalize)
-        train_epochs(model, 1)
+        model = train_epochs(tiny_tdpg(beta=beta, normalize_advantage=normalize), 1)
         gradients.append(th.cat([p.grad.flatten() for p in model.policy.parameters()]))
     cosine = th.nn.functional.cosine_similarity(*gradients, dim=0)
     # Not 1: subtracting the mean of the advantages changes the noise of the gradient.
@@ -85,8 +81,7 @@ def test_passes_stop_where_the_clipping_says():
 
 
 def test_the_distance_from_the_rollouts_policy_is_logged():
-    model = tiny_tdpg(**PASSES)
-    train_epochs(model, 2)
+    model = train_epochs(tiny_tdpg(**PASSES), 2)
     logged = model.logger.name_to_value
     assert 0 < logged["train/approx_kl"] < 1
     assert 0 <= logged["train/clip_fraction"] < 1
@@ -207,6 +202,5 @@ def test_an_epoch_logs_what_it_did():
 
 
 def test_a_small_weight_is_a_penalty_too():
-    model = tiny_tdpg(n_episodes=40, beta=10.0, mi_estimator="logdet")
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(n_episodes=40, beta=10.0, mi_estimator="logdet"), 1)
     assert model.logger.name_to_value["train/mi_loss"] == pytest.approx(0.1 * model.information.sum(), rel=1e-4)

@@ -202,17 +202,13 @@ def test_batched_critics_equal_the_loop_after_the_fit() -> None:
     np.testing.assert_allclose(recorded.information, recorded.loop_information, rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        Case(beta=math.inf, baseline="mean"),
-        Case(beta=math.inf, baseline="regression"),
-        Case(baseline="mean"),
-        Case(baseline="regression"),
-        Case(gradient_steps=1),  # the critics know nothing, and some estimates are below zero
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("case", [
+    Case(beta=math.inf, baseline="mean"),
+    Case(beta=math.inf, baseline="regression"),
+    Case(baseline="mean"),
+    Case(baseline="regression"),
+    Case(gradient_steps=1),  # the critics know nothing, and some estimates are below zero
+], ids=str)  # fmt: skip
 def test_batched_update_of_the_policy_equals_the_loop(case: Case) -> None:
     recorded = run_both(case)
     policy, loop = recorded.model.policy, recorded.loop

@@ -31,10 +31,9 @@ from sb3_tdpg.callbacks import TDPGProgressBar
 from sb3_tdpg.envs.lava import LavaEnv
 
 
-def stochastic_predictions(model, observation=None, seed=1):
+def stochastic_predictions(model, observation):
     """Actions of one whole episode with the noise that follows from a seed."""
-    th.manual_seed(seed)
-    observation = np.tile(model.observation_space.sample()[None], (3, 1)) if observation is None else observation
+    th.manual_seed(1)
     actions, state = [], None
     for _ in range(model.horizon):
         action, state = model.predict(observation, state)
@@ -76,8 +75,7 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another():
 
 
 def test_learning_twice_starts_anew_or_goes_on_as_asked():
-    model = tiny_tdpg()
-    train_epochs(model, 2)
+    model = train_epochs(tiny_tdpg(), 2)
     train_epochs(model, 2)
     assert (model.epoch, model.num_timesteps) == (2, 200)
     train_epochs(model, 3, reset_num_timesteps=False)
@@ -175,8 +173,7 @@ def test_callbacks_are_given_as_one_or_a_list_or_a_function():
 
 
 def test_sb3s_callbacks_see_the_episodes():
-    model = tiny_tdpg()
-    train_epochs(model, 5, callback=StopTrainingOnMaxEpisodes(max_episodes=2))
+    model = train_epochs(tiny_tdpg(), 5, callback=StopTrainingOnMaxEpisodes(max_episodes=2))
     assert model.num_timesteps <= 2 * 100
 
 
@@ -204,8 +201,7 @@ def test_the_progress_bar_shows_the_share_of_failures_where_an_episode_can_succe
     shown = []
     draw = TDPGProgressBar._on_rollout_end
     monkeypatch.setattr(TDPGProgressBar, "_on_rollout_end", lambda bar: (draw(bar), shown.append(bar.pbar.desc)))
-    model = tiny_tdpg()
-    train_epochs(model, 1, progress_bar=True)
+    model = train_epochs(tiny_tdpg(), 1, progress_bar=True)
     model.ep_success_buffer.extend([True, True, True, False])
     train_epochs(model, 1, progress_bar=True, reset_num_timesteps=False)
     assert "failures" not in shown[0]
@@ -281,8 +277,7 @@ def test_an_estimator_of_ones_own_is_given_as_a_class_and_saved(tmp_path):
 def test_the_discount_reaches_the_advantages():
     gradients = []
     for gamma in (1.0, 0.5):
-        model = tiny_tdpg(beta=math.inf, gamma=gamma, policy_kwargs=dict(optimizer_class=th.optim.SGD))
-        train_epochs(model, 1)
+        model = train_epochs(tiny_tdpg(beta=math.inf, gamma=gamma, policy_kwargs=dict(optimizer_class=th.optim.SGD)), 1)
         gradients.append(next(iter(model.policy.parameters())).grad.clone())
     assert not th.allclose(*gradients)
 

@@ -127,8 +127,7 @@ def test_every_environment_runs_its_quota_of_episodes_however_short_they_are(bas
     # Environment 0 has short episodes; were the first N to finish taken, it would fill the epoch.
     lengths = [[1, 1, 1], [4, 3, 4], [2, 4, 1]]
     env = DummyVecEnv([lambda i=i: CountdownEnv(i, lengths[i]) for i in range(3)])
-    model = tiny_tdpg(env, n_episodes=9, baseline=baseline, beta=math.inf)
-    model.learn(1)
+    model = tiny_tdpg(env, n_episodes=9, baseline=baseline, beta=math.inf).learn(1)
     buffer = model.rollout_buffer
     first = int(buffer.states[0, 0, 1])  # episodes that the resets before learning used up
     for episode in range(9):
@@ -188,8 +187,7 @@ def test_cartpole_ends_early_and_trains_with_a_mask(mi_estimator):
 
 
 def test_more_episodes_than_environments_are_run_one_after_the_other():
-    model = tiny_tdpg(lava_env(5), n_episodes=20)
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(lava_env(5), n_episodes=20), 1)
     old_policy = parameters(model.policy)
     train_epochs(model, 1, reset_num_timesteps=False)
     assert model.rollout_buffer.alive.all()
@@ -251,8 +249,7 @@ def test_a_setting_may_be_changed_when_a_model_is_loaded(before, change, after, 
 
 
 def test_a_policy_gradient_model_warm_starts_tdpg(tmp_path):
-    model = tiny_tdpg(beta=math.inf, mi_estimator="mine")
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(beta=math.inf, mi_estimator="mine"), 1)
     model.save(tmp_path / "pg")
     loaded = TDPG.load(tmp_path / "pg", env=lava_env(), beta=1 / 75, device="cpu")
     assert_same_parameters(parameters(model.policy), parameters(loaded.policy))

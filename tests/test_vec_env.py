@@ -193,8 +193,7 @@ def test_any_other_environment_becomes_a_dummy_vec_env(env_id):
     assert make_episodes_env(env_id, 3, n_episodes=120).num_envs == 3
 
 
-def test_an_environment_without_pictures_is_not_asked_for_any(monkeypatch):
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+def test_an_environment_without_pictures_is_not_asked_for_any(registry):
     gym.register("Blind-v0", ToyEnv)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # Gymnasium's, once for each environment
@@ -209,7 +208,6 @@ def test_an_unknown_id_is_refused():
 
 
 def test_lava_trains_in_sb3s_own_vec_env_too():
-    model = tiny_tdpg(make_vec_env("Lava-v0", n_envs=4))
-    train_epochs(model, 2)
+    model = train_epochs(tiny_tdpg(make_vec_env("Lava-v0", n_envs=4)), 2)
     assert model.rollout_buffer.alive.all()
     assert (model.rollout_buffer.states[0, :, 1] == 0).all()

@@ -86,8 +86,7 @@ def test_without_the_past_it_says_what_is_missing():
 
 
 def test_training_charges_the_rebuilt_memory():
-    model = tiny_tdpg(lava_env(), mi_estimator="directed", mi_kwargs={}, beta=1.0)
-    model.learn(1)
+    model = tiny_tdpg(lava_env(), mi_estimator="directed", mi_kwargs={}, beta=1.0).learn(1)
     batch = model.rollout_buffer.episode_batch()
     information = batch.information_batch()
     th.testing.assert_close(information.prev_trvs[1:], batch.trvs[:-1])
