@@ -6,11 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_tdpg.evaluation.density_critic import Encoded
-from sb3_tdpg.information import (
-    ESTIMATORS,
-    CriticEstimator,
-    InformationBatch,
-)
+from sb3_tdpg.information import ESTIMATORS, CriticEstimator, InformationBatch
 
 CRITICS = sorted(name for name, cls in ESTIMATORS.items() if issubclass(cls, CriticEstimator))
 CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))
@@ -44,6 +40,18 @@ def gaussian_channels(nats, dim, n, n_channels, rng):
     means = states @ gains.transpose(0, 2, 1)
     trvs = means + rng.standard_normal(means.shape)
     return InformationBatch(*map(th.as_tensor, (states, trvs, means, np.ones_like(means))))
+
+
+def batch_of(means, stds):
+    """Samples of an encoder that sees what it tells: the states are the means."""
+    return InformationBatch(means, means + stds * th.randn_like(means), means, stds)
+
+
+def modes_batch(n=4000, distance=10.0):
+    """TRVs with four modes, which tell nothing but which: ln 4 nats."""
+    modes = distance * th.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    means = modes[th.randint(4, (n,))][None]
+    return batch_of(means, th.ones_like(means))
 
 
 def gaussian_information(gains, noise_std=1.0):

@@ -141,10 +141,9 @@ def score_objective(model, batch):
     total = 0.0
     for t in range(T):
         prev = batch.trvs[t - 1] if t > 0 else th.zeros(N, Z).double()
-        log_q = log_density(batch.trvs[t], *encode(model.policy, batch, t, prev))
-        total = (
-            total + (batch.alive[t] * advantages(batch) * (log_q + log_pi(model.policy, batch, t, batch.trvs[t]))).sum()
-        )
+        log_prob = log_density(batch.trvs[t], *encode(model.policy, batch, t, prev))
+        log_prob = log_prob + log_pi(model.policy, batch, t, batch.trvs[t])
+        total = total + (batch.alive[t] * advantages(batch) * log_prob).sum()
     return total / N
 
 

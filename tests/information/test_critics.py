@@ -19,22 +19,22 @@ from information_problems import (
 )
 from small_problems import TINY_CRITIC, assert_same_parameters, parameters
 
-from sb3_tdpg.information import (
-    ESTIMATORS,
-    InformationBatch,
-    Mine,
-)
+from sb3_tdpg.information import ESTIMATORS, InformationBatch, Mine
 from sb3_tdpg.information.critic import Scores
 
 # -- critics: derangements, warm-up, guards, moving average ---------------------------------------------------
 
 
+def numbered(n):
+    """Two steps of episodes whose states and TRVs are their number."""
+    numbers = th.arange(float(n)).expand(2, n)[..., None]
+    return InformationBatch(numbers, numbers, numbers, th.ones_like(numbers))
+
+
 @pytest.mark.parametrize("name", [name for name in CRITICS if name != "infonce"])
 @pytest.mark.parametrize("n", [10, 11])
 def test_no_state_is_ever_paired_with_its_own_trvs_as_a_marginal_sample(name, n, monkeypatch):
-    estimator = build(name, 2, 1, 1, **TINY_CRITIC)
-    numbers = th.arange(float(n)).expand(2, n)[..., None]  # states and TRVs carry the episode's number
-    batch = InformationBatch(numbers, numbers, numbers, th.ones_like(numbers))
+    estimator, batch = build(name, 2, 1, 1, **TINY_CRITIC), numbered(n)
     pairs = []
     original = estimator._pair
 
@@ -207,8 +207,7 @@ def test_on_held_out_episodes_the_information_of_correlated_gaussians_is_found(n
 @pytest.mark.parametrize("name", CRITICS)
 def test_the_critics_never_see_an_episode_that_is_held_out(name, monkeypatch):
     estimator = build(name, 2, 1, 1, **TINY_CRITIC, held_out=0.3, refit_above=-math.inf)  # and all are fitted again
-    numbers = th.arange(20.0).expand(2, 20)[..., None]  # states and TRVs carry the episode's number
-    batch = InformationBatch(numbers, numbers, numbers, th.ones_like(numbers))
+    batch = numbered(20)
     seen, ascend = [], estimator._ascend
 
     def spy(critic, optimizer, batch, *args):

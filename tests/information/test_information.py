@@ -19,6 +19,7 @@ from information_problems import (
     gaussian_batch,
     gaussian_information,
     half_dead,
+    modes_batch,
     random_batch,
 )
 from small_problems import TINY_CRITIC
@@ -177,10 +178,7 @@ def test_the_lower_bound_cannot_exceed_the_logarithm_of_the_number_of_samples():
 
 
 def test_with_several_modes_leave_one_out_is_tight_and_logdet_loose():
-    modes = 10.0 * th.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    states = modes[th.randint(4, (2000,))][None]
-    stds = th.ones_like(states)
-    batch = InformationBatch(states, states + th.randn_like(states), states, stds)
+    batch = modes_batch(2000)
     assert LeaveOneOut(1, 2, 2)(batch).item() == pytest.approx(math.log(4), abs=0.02)
     assert LogDet(1, 2, 2)(batch).item() > 3
 

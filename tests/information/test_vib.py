@@ -5,7 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch as th
-from information_problems import GAINS, gaussian_batch, gaussian_information, half_dead, random_batch
+from information_problems import (
+    GAINS,
+    batch_of,
+    gaussian_batch,
+    gaussian_information,
+    half_dead,
+    modes_batch,
+    random_batch,
+)
 from small_problems import tiny_tdpg, train_epochs
 
 from sb3_tdpg import TDPG
@@ -17,17 +25,6 @@ def fitted(batch, **kwargs):
     estimator = VariationalBottleneck(horizon, batch.states.shape[2], trv_dim, **kwargs)
     estimator.fit(batch)
     return estimator
-
-
-def batch_of(means, stds):
-    return InformationBatch(means, means + stds * th.randn_like(means), means, stds)
-
-
-def modes_batch(n=4000, distance=10.0):
-    """TRVs with four modes, which tell nothing but which: ln 4 nats."""
-    modes = distance * th.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    means = modes[th.randint(4, (n,))][None]
-    return batch_of(means, th.ones_like(means))
 
 
 def divergence(batch, estimator):
@@ -191,8 +188,7 @@ def test_it_draws_no_random_number():
 
 
 def test_a_policy_trains_under_it_with_a_prior_of_every_epoch_and_the_file_keeps_it(tmp_path):
-    model = tiny_tdpg(mi_estimator="vib", mi_kwargs=dict(n_components=2), beta=0.1)
-    train_epochs(model, 1)
+    model = train_epochs(tiny_tdpg(mi_estimator="vib", mi_kwargs=dict(n_components=2), beta=0.1), 1)
     first = model.estimator.prior_mean.clone()
     assert first.abs().sum() > 0
     train_epochs(model, 1, reset_num_timesteps=False)
