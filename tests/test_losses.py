@@ -15,18 +15,13 @@ from sb3_tdpg.losses import (
 )
 
 
-def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes():
+@pytest.mark.parametrize(("alive", "total"), [
+    ([[1.0, 1.0], [1.0, 1.0]], 10 + 40 + 90 + 160),
+    ([[1.0, 1.0], [0.0, 1.0]], 10 + 40 + 160),  # a dead step counts nothing, its episode counts
+])  # fmt: skip
+def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes(alive, total):
     log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]])
-    advantages = th.tensor([[10.0, 20.0], [30.0, 40.0]])
-    loss = policy_gradient_loss(log_prob, advantages, th.ones(2, 2))
-    assert loss.item() == (10 + 40 + 90 + 160) / 2
-
-
-def test_a_dead_step_counts_nothing_and_still_counts_as_an_episode():
-    log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]])
-    advantages = th.tensor([[10.0, 20.0], [30.0, 40.0]])
-    alive = th.tensor([[1.0, 1.0], [0.0, 1.0]])
-    assert policy_gradient_loss(log_prob, advantages, alive).item() == (10 + 40 + 160) / 2
+    assert policy_gradient_loss(log_prob, 10 * log_prob, th.tensor(alive)).item() == total / 2
 
 
 def test_the_loss_is_a_cost_that_falls_when_expensive_samples_become_less_likely():

@@ -34,6 +34,15 @@ def trained(root, method=PRESET, seed=200):
     return training, complete_training(training, root)
 
 
+def episodes_of(returns, *, deterministic):
+    """Episodes on CartPole: for each method, what each of its seeds returns."""
+    return pd.DataFrame(
+        dict(env_id="CartPole-v1", method=method, train_seed=seed, deterministic=deterministic, **{"return": value})
+        for method, values in returns.items()
+        for seed, value in enumerate(values)
+    )
+
+
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.env_id)
 def test_every_task_declares_its_horizon_and_has_settings_of_the_zoo(task):
     env = gym.make(task.env_id)
@@ -90,12 +99,8 @@ def test_a_return_is_judged_by_the_interval_of_the_rival(tmp_path):
     records = Records([training], tmp_path)
     verdicts = {}
     for ours in (10.0, 100.0, 300.0):
-        rows = [
-            dict(env_id="CartPole-v1", method=method, train_seed=seed, deterministic=True, **{"return": value})
-            for method, values in (("PPO", (80.0, 90.0, 100.0, 110.0, 120.0)), (PRESET, (ours,) * 5))
-            for seed, value in enumerate(values)
-        ]
-        records.episodes = pd.DataFrame(rows)
+        returns = {"PPO": (80.0, 90.0, 100.0, 110.0, 120.0), PRESET: (ours,) * 5}
+        records.episodes = episodes_of(returns, deterministic=True)
         table = records.returns_table(deterministic=True)
         verdicts[ours] = next(word for word in ("below", "within", "above") if word in table)
     assert verdicts == {10.0: "below", 100.0: "within", 300.0: "above"}
@@ -114,12 +119,7 @@ def test_the_limit_is_a_twentieth_below_what_the_seed_has_reached(reached, limit
 def test_a_seed_keeps_a_share_of_its_own_return(tmp_path):
     training, _ = trained(tmp_path)
     records = Records([training], tmp_path)
-    rows = [
-        dict(env_id="CartPole-v1", method=method, train_seed=seed, deterministic=False, **{"return": value})
-        for method, values in ((PRESET, (-100.0, -200.0)), (LIMIT, (-110.0, -204.0)))
-        for seed, value in enumerate(values)
-    ]
-    records.episodes = pd.DataFrame(rows)
+    records.episodes = episodes_of({PRESET: (-100.0, -200.0), LIMIT: (-110.0, -204.0)}, deterministic=False)
     records.times = pd.DataFrame([dict(env_id="CartPole-v1", method=method, nats=2.0) for method in (PRESET, LIMIT)])
     table = records.limit_table()
     assert "0.94 (0.90 to 0.98)" in table
