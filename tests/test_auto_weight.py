@@ -25,10 +25,6 @@ def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above(li
     larger = weight.value
     weight.update(cost=above, information=4.0)
     assert 0 < weight.value < larger
-    weight.update(cost=limit, information=4.0)
-    at_the_limit = weight.value
-    weight.update(cost=1e9, information=4.0)
-    assert weight.value > 0.3 * at_the_limit  # one bad epoch does not undo many good ones
 
 
 def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_one():
@@ -114,6 +110,7 @@ def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised()
 
 
 def test_the_weight_falls_at_most_by_twice_the_rate():
+    """One bad epoch does not undo many good ones."""
     weight = AutoWeight(cost_limit=10.0)
     weight.update(10.0, 1.0)
     before = weight.value

@@ -80,13 +80,6 @@ def test_passes_stop_where_the_clipping_says():
     assert distances[0] < 0.3 * distances[1]
 
 
-def test_the_distance_from_the_rollouts_policy_is_logged():
-    model = train_epochs(tiny_tdpg(**PASSES), 2)
-    logged = model.logger.name_to_value
-    assert 0 < logged["train/approx_kl"] < 1
-    assert 0 <= logged["train/clip_fraction"] < 1
-
-
 def test_the_clip_range_may_follow_the_progress():
     asked = []
     model = tiny_tdpg(clip_range=lambda progress: asked.append(progress) or 0.1 + 0.1 * progress)
@@ -194,9 +187,10 @@ def test_an_epoch_logs_what_it_did():
     assert logged["train/trv_std"] == pytest.approx(model.rollout_buffer.stds.mean(), rel=1e-5)
     # What was minimised is the sum of both parts, of which the penalty is divided as the advantages are.
     assert logged["train/loss"] > logged["train/policy_loss"]
-    assert {f"train/{name}" for name in ("mi_loss", "mi_coef", "grad_norm", "approx_kl", "clip_fraction")} <= set(
-        logged
-    )
+    assert {f"train/{name}" for name in ("mi_loss", "mi_coef", "grad_norm")} <= set(logged)
+    # How far the policy is from that of the rollouts.
+    assert 0 < logged["train/approx_kl"] < 1
+    assert 0 <= logged["train/clip_fraction"] < 1
     assert "tensorboard" in model.logger.name_to_excluded["train/n_updates"]
     assert modes == [True] * 4
 
