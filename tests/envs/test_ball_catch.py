@@ -239,14 +239,6 @@ def test_two_environments_in_one_process_do_not_disturb_each_other():
     np.testing.assert_array_equal(env.reset(seed=0)[0], alone[0])
 
 
-def test_bullet_clients_are_given_back():
-    first = BallCatchEnv(renderer="pybullet")._renderer.client.client_id  # collected at once
-    for _ in range(30):
-        env = BallCatchEnv(renderer="pybullet")
-        env.close()
-    assert BallCatchEnv(renderer="pybullet")._renderer.client.client_id == first
-
-
 def test_thousands_of_resets_leak_neither_memory_nor_clients():
     resource = pytest.importorskip("resource")
     env = BallCatchEnv(renderer="pybullet")

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs import ENTRY_POINTS
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
@@ -161,6 +162,25 @@ def test_closing_twice_is_fine_and_a_closed_environment_says_so(make, is_used):
     env.close()
     with pytest.raises(RuntimeError, match="has been closed: make a new one"):
         env.reset()
+
+
+@pytest.mark.parametrize("make", [lambda: BallCatchEnv(renderer="pybullet"), PandaGraspEnv, PandaSqueezeEnv],
+                         ids=["ball", "panda", "squeeze"])  # fmt: skip
+def test_bullet_clients_are_given_back(make):
+    def next_client():
+        client = BulletClient()
+        client.close()
+        return client.client_id
+
+    first = next_client()
+    for i in range(20):
+        env = make()
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape))
+        if i % 2:
+            env.close()
+        del env  # collected at once, also without a close
+    assert next_client() == first
 
 
 @pytest.mark.parametrize(("env_id", "keywords"), [

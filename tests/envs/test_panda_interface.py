@@ -290,22 +290,5 @@ def test_the_window_is_drawn_by_reset_and_by_each_step(env, monkeypatch):
         assert calls == expected
 
 
-# -- opening and closing ---------------------------------------------------------------------------------------------
-
-
-def test_bullet_clients_are_given_back():
-    def client_ids():
-        made = PandaGraspEnv()
-        made.reset(seed=0)
-        made.step(np.zeros(4))
-        ids = made._world.camera.client.client_id, made._world.simulation.client.client_id
-        made.close()
-        return ids
-
-    first = client_ids()
-    assert len(set(first)) == 2
-    assert all(client_ids() == first for _ in range(20))
-
-
 def test_the_registered_threshold_is_three_failures_in_a_hundred():
     assert gym.spec("PandaGrasp-v0").reward_threshold == -0.03
