@@ -45,7 +45,7 @@ def test_the_penalty_takes_the_information_out_of_the_trvs():
     information = []
     train_epochs(model, 150, callback=AtEveryEpoch(lambda m: information.append(m.information.sum())))
     assert information[0] > 0.1
-    assert np.mean(information[-3:]) < 0.3 * information[0]
+    assert np.median(information[-50:]) < 0.2 * information[0]  # a single epoch may jump
 
 
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
