@@ -196,6 +196,5 @@ class BallCatchEnv(POMDPEnv):
         self._renderer.close()
         if self._pool is not None:
             self._pool.close()
-            self.n_processes = 1  # the renderer says that it is closed
         if self._view is not None:
             self._view.close()

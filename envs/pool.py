@@ -36,9 +36,12 @@ class WorkPool:
         self._executor = ProcessPoolExecutor(
             n_processes, context, initializer=_begin, initargs=(os.getpid(), make_worker, *arguments)
         )
+        self._is_closed = False
 
     def call(self, method: str, *arrays: np.ndarray) -> Any:
         """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the arrays or lists."""
+        if self._is_closed:
+            raise RuntimeError("this environment has been closed: make a new one")
         n_parts = min(len(arrays[0]), SHARES * self._n_processes)
         parts = [np.array_split(array, n_parts) for array in arrays]
         with warnings.catch_warnings():
@@ -49,6 +52,7 @@ class WorkPool:
 
     def close(self) -> None:
         """End the processes."""
+        self._is_closed = True
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 

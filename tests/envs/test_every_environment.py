@@ -202,7 +202,7 @@ def test_processes_give_the_same_episodes_and_end_with_the_environment(env_id, k
     for env in (alone, shared):
         env.close()
         env.close()
-        with pytest.raises(RuntimeError):
+        with pytest.raises(RuntimeError, match="has been closed: make a new one"):
             env.step(np.ones(shape))
 
 
