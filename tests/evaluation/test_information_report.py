@@ -113,7 +113,7 @@ def test_a_component_is_never_known_better_than_the_whole_state(monkeypatch):
     (("place", "speed"), None, {"place", "speed"}),
     (None, None, {"x0", "x1"}),
     (LavaEnv.state_names, ("a", "b"), {"a", "b"}),
-], ids=str)  # fmt: skip
+], ids=["the environment's", "others of the environment's", "numbers", "those given"])  # fmt: skip
 def test_the_report_calls_the_components_as_it_is_told_or_as_the_environment_does(of_env, given, shown, monkeypatch):
     monkeypatch.setattr(LavaEnv, "state_names", of_env)
     report = information_report(tiny_tdpg(PROBLEM), lava_env(50), n_episodes=50, seed=0, names=given)
