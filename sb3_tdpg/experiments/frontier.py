@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from tqdm import tqdm
 
 from sb3_tdpg.auto_weight import WINDOW, share_of
 from sb3_tdpg.common.files import write_atomically
@@ -106,7 +107,8 @@ def frontier(
         check_folder(*task, n_eval_episodes)
     with threads(1):
         complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-        rows = [finished_row(task, n_eval_episodes, {"label": key[0]}) for task, key in zip(tasks, keys, strict=True)]
+        measured = tqdm(zip(tasks, keys, strict=True), "measuring the information", len(tasks), unit="run")
+        rows = [finished_row(task, n_eval_episodes, {"label": key[0]}) for task, key in measured]
     runs = pd.DataFrame(rows)
     first = np.mean([read_progress(folder)["rollout/ep_cost_mean"].iloc[0] for _, folder, _ in tasks[:n_seeds]])
     return _write(out, dict(env_id=env_id, block=block, settings=shared), runs, frontier_table(runs, float(first)))
