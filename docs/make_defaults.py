@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON
+from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON
 from sb3_tdpg.presets import DEFAULTS, LONG_HORIZON, POLICY_DEFAULTS, Defaults, PolicyDefaults
 
 PAGE = Path(__file__).parent / "guide" / "algorithm.md"

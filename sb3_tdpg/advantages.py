@@ -13,9 +13,9 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
+from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON
+from sb3_tdpg.common.running_norms import Changes, RunningNorm
 from sb3_tdpg.losses import cost_to_go
-from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON
-from sb3_tdpg.running_norms import Changes, RunningNorm
 
 N_CENTRES = 20
 # For a regression that all time steps share: it has more samples, and they are further apart.
@@ -100,7 +100,7 @@ class ValueFunction(nn.Module):
     :param n_epochs: Passes over the steps of an epoch.
     :param batch_size: Steps of a minibatch.
     :param with_changes: Whether the network also sees the changes of the state since the last step, as far as they are
-        news (:class:`~sb3_tdpg.running_norms.Changes`): for observations that stand in for the state.
+        news (:class:`~sb3_tdpg.common.running_norms.Changes`): for observations that stand in for the state.
     """
 
     def __init__(

@@ -1,9 +1,10 @@
-"""The kinds of observations and actions, and the CNN in front of the encoder."""
+"""The kinds of observations and actions, and what stands in front of the encoder: the CNN, running norms."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -12,6 +13,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 from torch.nn.functional import avg_pool2d
+
+from sb3_tdpg.common.running_norms import RunningNorm
 
 MIN_SIDE = 12  # pixels, the minimum for the two convolutions for depth images
 
@@ -138,3 +141,37 @@ def flat_steps(extractor: nn.Module, x: th.Tensor) -> th.Tensor:
     # Change the layout while the pixels are still bytes: it is cheaper.
     is_pooled = isinstance(extractor, TRVCnn) and extractor.pool > 1
     return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and not is_pooled else x
+
+
+class ObservationNorm(nn.Module):
+    """
+    A :class:`RunningNorm` for each vector of an observation; images and one-hot inputs pass through.
+
+    :param space: The observation space, which may be a ``Dict``.
+    """
+
+    def __init__(self, space: spaces.Space) -> None:
+        super().__init__()
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        vectors = {k: x for k, x in parts.items() if isinstance(x, spaces.Box) and observation_kind(x) == "vector"}
+        self.norms = nn.ModuleDict({key: RunningNorm(math.prod(x.shape)) for key, x in vectors.items()})
+
+    def forward(self, observation: Any) -> Any:
+        """``(n, *obs) -> (n, *obs)``, or a dict of such."""
+        if isinstance(observation, dict):
+            return {key: self._standardized(x, key) for key, x in observation.items()}
+        return self._standardized(observation, "observation")
+
+    def _standardized(self, x: th.Tensor, key: str) -> th.Tensor:
+        return self.norms[key](x.flatten(1).float()).view(x.shape) if key in self.norms else x
+
+    def update(self, observations: Any, alive: th.Tensor) -> None:
+        """
+        Include an epoch's observations.
+
+        :param observations: ``(T, N, *obs)``, or a dict of such
+        :param alive: ``(T, N)``
+        """
+        for key, norm in self.norms.items():
+            x = observations[key] if isinstance(observations, dict) else observations
+            cast(RunningNorm, norm).update(x[alive.bool()].flatten(1).float())

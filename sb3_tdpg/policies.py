@@ -26,10 +26,10 @@ from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
 from sb3_tdpg.checks import check_count, check_floors, check_memory, check_net_arch, check_single, check_time
-from sb3_tdpg.features import TRVCnn, flat_action_space, flat_steps, observation_kind
-from sb3_tdpg.networks import MAX_TIME_VARYING_HORIZON, TimeMLP, bounded_variance
+from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, TimeMLP, bounded_variance
+from sb3_tdpg.common.running_norms import Changes
+from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_extractor, fill_in_trvs
-from sb3_tdpg.running_norms import Changes, ObservationNorm
 
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
@@ -62,7 +62,7 @@ class TRVPolicy(BasePolicy):
     :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
         store an observation before the action head can use it.
     :param skip_changes: Whether the next TRVs get the change of the features since the last step, as far as it says
-        what the features do not (:class:`~sb3_tdpg.running_norms.Changes`): hidden velocities.
+        what the features do not (:class:`~sb3_tdpg.common.running_norms.Changes`): hidden velocities.
     :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all that
         were seen in training, as by SB3's ``VecNormalize``.
     :param scale_actions: Whether the head's outputs are in units of the bounds of the action space: 0 is their middle,

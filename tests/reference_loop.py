@@ -20,7 +20,7 @@ import torch as th
 from torch import nn
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.networks import BatchedMLP
+from sb3_tdpg.common.networks import BatchedMLP
 
 GOAL, WALL, LAVA = 3.0, 0.0, 5.0  # m
 

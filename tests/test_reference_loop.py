@@ -22,7 +22,7 @@ from gymnasium.utils import seeding
 from sb3_tdpg import TDPG
 from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.buffers import STORED, EpisodeBatch, EpisodeBuffer
-from sb3_tdpg.networks import BatchedMLP
+from sb3_tdpg.common.networks import BatchedMLP
 from tests.reference_loop import Episode, LoopTDPG, Minibatch, Randomness, mean_baseline, unbatch
 
 SEED = 7

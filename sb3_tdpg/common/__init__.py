@@ -1,1 +1,1 @@
-"""What every room uses: files that are never half-written, provenance, threads, processes."""
+"""What every room uses: networks with weights per step, running norms, files, provenance, threads, processes."""

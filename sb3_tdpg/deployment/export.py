@@ -23,8 +23,8 @@ from torch import nn
 
 import sb3_tdpg
 from sb3_tdpg.common.files import replaced_atomically
+from sb3_tdpg.common.networks import TimeMLP
 from sb3_tdpg.evaluation.loading import statistics_beside
-from sb3_tdpg.networks import TimeMLP
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.tdpg import TDPG
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
+from sb3_tdpg.common.networks import BatchedMLP, flatten_parameters
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
-from sb3_tdpg.networks import BatchedMLP, flatten_parameters
 
 MIN_EPISODES = 2  # for an estimate: a state is paired with the TRVs of another episode
 MOMENTS = ("exp_avg", "exp_avg_sq", "step")  # of Adam

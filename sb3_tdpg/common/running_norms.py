@@ -1,15 +1,9 @@
-"""Running statistics of what was seen in training, and what they standardise: observations and their changes."""
+"""Running statistics of what was seen in training, and what they standardise: vectors and their changes."""
 
 from __future__ import annotations
 
-import math
-from typing import Any, cast
-
 import torch as th
-from gymnasium import spaces
 from torch import nn
-
-from sb3_tdpg.features import observation_kind
 
 
 class RunningNorm(nn.Module):
@@ -112,37 +106,3 @@ def _unexplained(inputs: th.Tensor, targets: th.Tensor, half: int) -> th.Tensor:
     ridge = 0.1 * th.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
     coefficients = th.linalg.solve(fit.T @ fit + ridge, fit.T @ targets[:half])
     return (targets[half:] - test @ coefficients).square().mean(0)
-
-
-class ObservationNorm(nn.Module):
-    """
-    A :class:`RunningNorm` for each vector of an observation; images and one-hot inputs pass through.
-
-    :param space: The observation space, which may be a ``Dict``.
-    """
-
-    def __init__(self, space: spaces.Space) -> None:
-        super().__init__()
-        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-        vectors = {k: x for k, x in parts.items() if isinstance(x, spaces.Box) and observation_kind(x) == "vector"}
-        self.norms = nn.ModuleDict({key: RunningNorm(math.prod(x.shape)) for key, x in vectors.items()})
-
-    def forward(self, observation: Any) -> Any:
-        """``(n, *obs) -> (n, *obs)``, or a dict of such."""
-        if isinstance(observation, dict):
-            return {key: self._standardized(x, key) for key, x in observation.items()}
-        return self._standardized(observation, "observation")
-
-    def _standardized(self, x: th.Tensor, key: str) -> th.Tensor:
-        return self.norms[key](x.flatten(1).float()).view(x.shape) if key in self.norms else x
-
-    def update(self, observations: Any, alive: th.Tensor) -> None:
-        """
-        Include an epoch's observations.
-
-        :param observations: ``(T, N, *obs)``, or a dict of such
-        :param alive: ``(T, N)``
-        """
-        for key, norm in self.norms.items():
-            x = observations[key] if isinstance(observations, dict) else observations
-            cast(RunningNorm, norm).update(x[alive.bool()].flatten(1).float())

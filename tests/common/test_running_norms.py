@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_tdpg.running_norms import Changes, RunningNorm
+from sb3_tdpg.common.running_norms import Changes, RunningNorm
 
 
 def test_batches_of_different_means_have_the_mean_and_the_variance_of_all_together():

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_tdpg.networks import BatchedLinear, BatchedMLP, TimeMLP, flatten_parameters
+from sb3_tdpg.common.networks import BatchedLinear, BatchedMLP, TimeMLP, flatten_parameters
 
 T, N = 3, 5
 
