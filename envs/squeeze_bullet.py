@@ -129,9 +129,9 @@ class SqueezeSimulation(ArmSimulation):
         """
         Squeeze a part once.
 
-        :param yaw: Of the part, in rad.
+        :param yaw: Yaw of the part, in rad.
         :param jaws: Their yaw, in rad.
-        :param offset: Of the part from the middle of the hand, in m, in the table's axes.
+        :param offset: Vector from the middle of the hand to the part, in m, in the table's axes.
         :param watch: Called 30 times a second; it does not change the outcome.
         """
         self._watch = watch

@@ -96,11 +96,11 @@ class ValueFunction(nn.Module):
     :param state_dim: X
     :param horizon: T
     :param hidden_sizes: Hidden layers.
-    :param learning_rate: Of Adam.
+    :param learning_rate: Step size of Adam.
     :param n_epochs: Passes over the steps of an epoch.
     :param batch_size: Steps of a minibatch.
-    :param with_changes: Whether the network also sees the changes of the state since the last step, as far as they are
-        news (:class:`~sb3_tdpg.common.running_norms.Changes`): for observations that stand in for the state.
+    :param with_changes: Whether the network also sees the changes of the state since the last step, as far as they add
+        information (:class:`~sb3_tdpg.common.running_norms.Changes`): for observations that stand in for the state.
     """
 
     def __init__(

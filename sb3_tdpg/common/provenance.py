@@ -101,7 +101,7 @@ def differences(found: Any, wanted: Any) -> str:
     """
     Name the first few differences of two values of JSON's types in one line; return an empty text if they are equal.
 
-    :return: as in ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
+    :return: for example ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
     """
     lines = list(_differences(found, wanted))
     if len(lines) > MAX_DIFFERENCES:

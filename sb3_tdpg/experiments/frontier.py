@@ -178,9 +178,9 @@ def verdict(table: pd.DataFrame) -> str:
     Say in one sentence whether the bottleneck will pay.
 
     Two questions. *Is information to spare?* A limit keeps at least 90 % of the improvement and at most a tenth of the
-    information. *Is the open loop cheap?* The best open loop costs at most as much more as half of the cost without a
-    penalty (1.5 times the cost, if costs are positive). Two times yes: probably; once: perhaps; else: probably not. It
-    is also probably not, if the policy without a penalty carries no information.
+    information. *Is the open loop cheap?* The best open loop costs at most 1.5 times as much as the policy without a
+    penalty (for negative costs: at most half of their size more). Two times yes: probably; once: perhaps; else, and if
+    the policy without a penalty carries no information: probably not.
 
     :param table: From :func:`frontier_table`.
     """

@@ -60,15 +60,15 @@ class Problem:
     """
     A task with faults that nobody declares.
 
-    :param block: In the files of ``hyperparams/``, of all algorithms.
+    :param block: Name of its block, the same in each algorithm's file of ``hyperparams/``.
     :param scale: One unit of each component of the observation; 0: the component is never at fault.
-    :param faults: Of the sensor, and of the actuator.
+    :param faults: Faults of the sensor and of the actuator.
     :param plant: Keywords of the environment that change the plant, by name.
     :param goals: The largest interquartile mean of TDPG over seeds, by row.
     :param tested_in: Another environment, with its default keywords, into which the policies are carried.
     :param n_episodes: Number of episodes of each row, if it is not that of all problems.
     :param labels: The methods, by their labels; default: all.
-    :param first_seed: Of the trainings.
+    :param first_seed: First seed of the trainings.
     """
 
     title: str

@@ -41,7 +41,7 @@ class Family:
 
     :param declared: See above.
     :param env: The environment; it must be reset afterwards.
-    :param severity: Of a name alone; ``None``: any.
+    :param severity: Severity for a name without one; ``None``: each episode has any.
     :param scale: See :class:`~sb3_tdpg.robustness.PerturbedObservation`.
     :raises ValueError: if nothing of a name exists or applies.
     """

@@ -54,7 +54,7 @@ def automatic(declared: Any, space: spaces.Space, **keywords: Any) -> Any:
     """
     Replace ``"auto"``: random changes for images of bytes, ``None`` for vectors and depth images.
 
-    :param keywords: Of :func:`~sb3_tdpg.robustness.training.images`.
+    :param keywords: Keywords of :func:`~sb3_tdpg.robustness.training.images`.
     """
     if not (isinstance(declared, str) and declared == "auto"):
         return declared

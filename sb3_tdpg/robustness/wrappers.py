@@ -83,7 +83,7 @@ class PerturbedVecEnv(VecEnvWrapper):
     :param venv: The environments.
     :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, a dict of several, of which each episode
         has one, a function, ...: see :class:`~sb3_tdpg.robustness.families.Family`.
-    :param severity: Of a name: 1 (mild) to 5 (strong); ``None``: each episode has any.
+    :param severity: Severity for a name: 1 (mild) to 5 (strong); ``None``: each episode has any.
     :param seed: Seed of the perturbation.
     :param scale: See :class:`PerturbedObservation`.
     """
