@@ -13,7 +13,7 @@ from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
 from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE
 from sb3_tdpg.evaluation.animation import save_gif
-from sb3_tdpg.robustness import PerturbedObservation
+from sb3_tdpg.robustness.families import Family
 
 EVERY = 5  # of the 30 pictures a second
 
@@ -38,16 +38,20 @@ class Shot:
 def shoot(model: TDPG, seed: int, faulty: bool, film: bool = True) -> Shot:
     """Play an episode in PyBullet; without film, only its outcome and readings."""
     env = PandaSqueezeEnv(render_mode="rgb_array" if film else None)
-    seen = PerturbedObservation(env, **FAULT) if faulty else env
+    fault = Family(FAULT["perturbation"], env, FAULT["severity"], FAULT["scale"]).members(1, FAULT["seed"])
     set_random_seed(seed)  # of the policy's noise
-    observation, info = seen.reset(seed=seed)
+    observation, info = env.reset(seed=seed)
+    fault.reseed(seed)
+    fault.begin(np.arange(1))
     memory, start, steps, yaws, reports = None, np.ones(1, dtype=bool), [], [], []
     for _ in range(env.horizon):
+        if faulty:
+            (observation,) = fault(observation[None])
         yaws.append(float(yaw_of(info["state"])))
         reports.append(float(yaw_of(observation)))
         action, memory = model.predict(observation, memory, start, deterministic=False)
         start[:] = False
-        observation, _, _, _, info = seen.step(action)
+        observation, _, _, _, info = env.step(action)
         steps.append(list(env.film())[::EVERY] if film else [])
     env.close()
     return Shot(steps=steps, yaws=yaws, reports=reports, success=info["success"])

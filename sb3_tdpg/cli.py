@@ -301,9 +301,9 @@ def _make_parser() -> argparse.ArgumentParser:
     add("experiment", choices=tuple(EXPERIMENTS))
     add("--out", type=Path, help="folder for the results (default: one in results/ for each experiment)")
     add("--publish", type=Path, help="copy everything except the runs to this folder")
-    add("--n-seeds", type=_positive, help="training seeds of each method (default: lava and ball 10, others 5)")
+    add("--n-seeds", type=_positive, help="training seeds of each method (default: lava, ball and pays 10, others 5)")
     add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: 3)")
-    text = "ball: train TDPG, PG and RecurrentPPO only; a later call without this flag adds the others"
+    text = "ball: train TDPG, PG and RecurrentPPO only; pays: leave out PPO and RecurrentPPO; a later call may add them"
     add("--no-controls", action="store_false", dest="controls", default=None, help=text)
 
     for program, text in ZOO_PROGRAMS.items():

@@ -408,9 +408,10 @@ class TDPG(EpisodicAlgorithm):
 
         After Ctrl-C the model keeps the parameters of the last finished update: it can be used, saved or trained on.
 
-        :param total_timesteps: Environment steps; default: 400 policy epochs for vectors (a million steps on Lava),
-            75 for images, 100 for depth images. Epochs are made of whole episodes: with ``n_episodes`` there are up to
-            an epoch more steps, with ``epoch_steps`` up to an episode of each environment or a tenth of an epoch.
+        :param total_timesteps: Environment steps; default: 400 policy epochs for vectors of a short horizon (a million
+            steps on Lava), 75 for images, 100 for depth images and from a horizon of 50 on. Epochs are made of whole
+            episodes: with ``n_episodes`` there are up to an epoch more steps, with ``epoch_steps`` up to an episode of
+            each environment or a tenth of an epoch.
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:
