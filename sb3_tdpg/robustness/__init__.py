@@ -16,13 +16,12 @@ from sb3_tdpg.robustness.registry import (
     severity_table,
 )
 from sb3_tdpg.robustness.scale import observation_scale
-from sb3_tdpg.robustness.wrappers import PerturbedObservation, PerturbedVecEnv
+from sb3_tdpg.robustness.wrappers import PerturbedVecEnv
 
 __all__ = [
     "PERTURBATIONS",
     "SCENES",
     "Perturbation",
-    "PerturbedObservation",
     "PerturbedVecEnv",
     "applicable",
     "observation_scale",

@@ -42,7 +42,7 @@ class Family:
     :param declared: See above.
     :param env: The environment; it must be reset afterwards.
     :param severity: Severity for a name without one; ``None``: each episode has any.
-    :param scale: See :class:`~sb3_tdpg.robustness.PerturbedObservation`.
+    :param scale: See :class:`~sb3_tdpg.robustness.PerturbedVecEnv`.
     :raises ValueError: if nothing of a name exists or applies.
     """
 
@@ -233,7 +233,7 @@ class SceneMembers(Members):
 
     def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
         if states is None:
-            raise ValueError("other scenes need the true state of each episode: wrap the VecEnv instead")
+            raise ValueError("other scenes need the true state of each episode: pass it with the observations")
         seen = np.array(states, dtype=np.float64)
         seen[:, self.redraw] = episode["redrawn"]
         changed = observations.copy()

@@ -1,5 +1,5 @@
 """
-The wrappers that perturb observations or actions: one for a Gymnasium environment, one for an SB3 ``VecEnv``.
+The wrapper that perturbs the observations or the actions of an SB3 ``VecEnv``.
 
 Dimension key: N environments side by side.
 """
@@ -7,10 +7,8 @@ Dimension key: N environments side by side.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
@@ -18,56 +16,6 @@ from sb3_tdpg.robustness.core import each_part, put, take
 from sb3_tdpg.robustness.families import Family
 
 Scale = float | np.ndarray | Mapping[str, Any] | None
-
-
-class PerturbedObservation(gym.ObservationWrapper, RecordConstructorArgs):
-    """
-    Perturb the observations of one environment, or its actions.
-
-    A perturbation of observations does not change state, reward, info and the environment's random numbers.
-    ``reset(seed=...)`` also seeds the perturbation.
-
-    :param env: Any environment with a suitable observation space. Its attribute ``observation_groups`` may name the
-        components that fail together: ``{"imu": [0, 1, 2]}``, or ``{"imu": ["gyroscope"]}`` in a ``Dict``.
-    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`.
-    :param severity: 1 (mild) to 5 (strong).
-    :param seed: Seed of the perturbation, combined with the seed of ``reset``. Without both it is random.
-    :param scale: Scale of the components of a vector (in a ``Dict`` also by key); default: from the bounds of the
-        space, and where they are infinite, measured in a short rollout
-        (:func:`~sb3_tdpg.robustness.observation_scale`).
-    :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
-    """
-
-    def __init__(
-        self, env: gym.Env, perturbation: str, severity: int = 3, *, seed: int | None = None, scale: Scale = None
-    ) -> None:
-        if isinstance(env, VecEnv):
-            raise ValueError(f"{type(env).__name__} holds several environments: use PerturbedVecEnv")
-        RecordConstructorArgs.__init__(self, perturbation=perturbation, severity=severity, seed=seed, scale=scale)
-        gym.ObservationWrapper.__init__(self, env)
-        family = Family(perturbation, env, severity, scale)
-        self._is_plant, self._perturber = family.is_plant, family.members(1, seed)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, and perturb its first observation."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        if seed is not None:
-            self._perturber.reseed(seed)
-        self._perturber.begin(np.arange(1))
-        return self.observation(observation), info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, with a perturbed action or observation."""
-        if self._is_plant:
-            (action,) = self._perturber(np.asarray(action)[None])
-        return super().step(action)
-
-    def observation(self, observation: Any) -> Any:
-        """Perturb the next observation of the episode."""
-        if self._is_plant:
-            return observation
-        batch = each_part(lambda part: np.asarray(part)[None], observation)
-        return take(self._perturber(batch), 0)
 
 
 class PerturbedVecEnv(VecEnvWrapper):
@@ -80,12 +28,16 @@ class PerturbedVecEnv(VecEnvWrapper):
     without ``seed`` every reset takes a seed from torch's generator, so that the seed of a training and a checkpoint
     cover it. Put this wrapper inside a ``VecNormalize`` or a ``VecFrameStack``.
 
-    :param venv: The environments.
+    :param venv: The environments. Their attribute ``observation_groups`` may name the components that fail together:
+        ``{"imu": [0, 1, 2]}``, or ``{"imu": ["gyroscope"]}`` in a ``Dict``.
     :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, a dict of several, of which each episode
         has one, a function, ...: see :class:`~sb3_tdpg.robustness.families.Family`.
     :param severity: Severity for a name: 1 (mild) to 5 (strong); ``None``: each episode has any.
     :param seed: Seed of the perturbation.
-    :param scale: See :class:`PerturbedObservation`.
+    :param scale: Scale of the components of a vector (in a ``Dict`` also by key); default: from the bounds of the
+        space, and where they are infinite, measured in a short rollout
+        (:func:`~sb3_tdpg.robustness.observation_scale`).
+    :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
     """
 
     def __init__(
@@ -93,7 +45,7 @@ class PerturbedVecEnv(VecEnvWrapper):
     ) -> None:
         if not isinstance(venv, VecEnv):
             name = type(venv).__name__
-            raise ValueError(f"{name} is not a VecEnv of Stable-Baselines3: use make_vec_env, or PerturbedObservation")
+            raise ValueError(f"{name} is not a VecEnv of Stable-Baselines3: use make_vec_env, or DummyVecEnv")
         if isinstance(venv, VecNormalize) and venv.norm_obs:
             raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)

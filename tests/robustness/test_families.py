@@ -10,7 +10,7 @@ from small_problems import toy_vec_env
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.base import POMDPEnv
-from sb3_tdpg.robustness import Perturbation, PerturbedObservation, PerturbedVecEnv
+from sb3_tdpg.robustness import Perturbation, PerturbedVecEnv
 from sb3_tdpg.robustness.core import Members, take
 from sb3_tdpg.robustness.families import Family, FunctionMembers, OneOf, SceneMembers
 
@@ -267,8 +267,8 @@ def test_a_scene_may_redraw_components_of_the_state():
     np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast").sensor(states))
     with pytest.raises(ValueError, match=r"redraw=\['e'\] must be .* of the state, some of \['d \(m\)'"):
         PerturbedVecEnv(env, {**declared, "redraw": ["e"]})
-    with pytest.raises(ValueError, match="wrap the VecEnv instead"):
-        PerturbedObservation(env.env, declared).reset()
+    with pytest.raises(ValueError, match="need the true state"):
+        Family(declared, env).members(1)(seen[:1])
 
 
 def test_without_any_seed_the_wrapper_follows_torch():

@@ -5,14 +5,11 @@ import functools
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env as gymnasium_check
 from perturbed_problems import (
     APPLYING,
-    DICT,
     HORIZON,
     PROBLEMS,
     SEVERITIES,
-    ClockEnv,
     PictureEnv,
     countdown,
     differs,
@@ -23,12 +20,10 @@ from perturbed_problems import (
     run,
 )
 from small_problems import lava_env
-from stable_baselines3.common.env_checker import check_env as sb3_check
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.robustness import PERTURBATIONS, Perturbation, PerturbedObservation, PerturbedVecEnv, applicable, register
-from sb3_tdpg.robustness.core import take
+from sb3_tdpg.robustness import PERTURBATIONS, Perturbation, PerturbedVecEnv, applicable, register
 
 
 @pytest.fixture(scope="module")
@@ -122,64 +117,6 @@ def test_a_higher_severity_changes_more(problem, name, smooth):
     ]
     assert distances[0] > 0
     assert (np.diff(distances) > 0).all(), distances
-
-
-def single(problem):
-    return {
-        "channels last": PictureEnv,
-        "Dict": ClockEnv,
-        "colour": lambda: gym.make("sb3_tdpg:BallCatch-v0", renderer="fast", horizon=HORIZON),
-        "bounded vector": pendulum,
-        "unbounded vector": lambda: gym.make("sb3_tdpg:Lava-v0", horizon=HORIZON),
-    }[problem]()
-
-
-SINGLE = [p for p in APPLYING if p.values[0] in ("channels last", "bounded vector", "unbounded vector")]
-
-
-ALIKE = [
-    *SINGLE,
-    *(("bounded vector", name) for name in ("actuator_gain", "actuator_delay")),
-    *(("Dict", name) for name in applicable(DICT, ClockEnv.horizon, ClockEnv.action_space)),
-]
-
-
-@pytest.mark.parametrize(("problem", "name"), ALIKE)
-def test_the_wrapper_of_one_environment_shows_what_the_one_of_many_shows(problem, name):
-    many = PerturbedVecEnv(DummyVecEnv([lambda: single(problem)]), name, 4, seed=2)
-    one = PerturbedObservation(single(problem), name, 4, seed=2)
-
-    def assert_same(seen, expected):
-        for key in one.observation_space if problem == "Dict" else [()]:
-            np.testing.assert_array_equal(seen[key], expected[key])
-
-    many.seed(7)
-    assert_same(one.reset(seed=7)[0], take(many.reset(), 0))
-    for action in np.random.default_rng(0).uniform(-0.3, 0.3, (20, *one.action_space.shape)).astype(np.float32):
-        observation, reward, terminated, truncated, info = one.step(action)
-        seen, (expected_reward,), (done,), (expected_info,) = many.step(action[None])
-        assert terminated or truncated if done else not (terminated or truncated)
-        assert reward == pytest.approx(expected_reward)
-        if done:
-            assert_same(observation, expected_info["terminal_observation"])
-            observation, _ = one.reset()
-        assert_same(observation, take(seen, 0))
-        if "state" in info and not done:
-            np.testing.assert_array_equal(info["state"], expected_info["state"])
-
-
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")
-@pytest.mark.parametrize(("problem", "name"), SINGLE)
-def test_both_checkers_accept_the_wrapped_environment(problem, name):
-    sb3_check(PerturbedObservation(single(problem), name, 5))
-    gymnasium_check(PerturbedObservation(single(problem), name, 5), skip_render_check=True)
-
-
-def test_a_wrapped_environment_can_be_made_anew_from_its_spec():
-    env = PerturbedObservation(single("bounded vector"), "vector_bias", 2, seed=3)
-    again = gym.make(env.spec)
-    assert isinstance(again, PerturbedObservation)
-    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
 
 
 def test_environments_in_processes_show_the_same_as_in_this_one():
@@ -282,17 +219,20 @@ def test_what_does_not_fit_is_refused(problem, arguments, fragment):
         PerturbedVecEnv(PROBLEMS[problem](2), **arguments)
 
 
-@pytest.mark.parametrize(("wrapper", "make", "fragment"), [
-    (PerturbedObservation, lambda: gym.make("FrozenLake-v1"), "is not a Box"),
-    (PerturbedObservation, lambda: gym.make("CartPole-v1"), "changes the actions of a Box, and the action space is Di"),
-    (PerturbedObservation, lambda: countdown(), "DummyVecEnv holds several environments: use PerturbedVecEnv"),
-    (PerturbedVecEnv, pendulum, "is not a VecEnv of Stable-Baselines3.*PerturbedObservation"),
-    (PerturbedVecEnv, lambda: gym.make_vec("Pendulum-v1", 2), "is not a VecEnv of Stable-Baselines3"),
-    (PerturbedVecEnv, lambda: VecNormalize(lava_env()), r"VecNormalize\(PerturbedVecEnv"),
+def one(env_id):
+    return DummyVecEnv([lambda: gym.make(env_id)])
+
+
+@pytest.mark.parametrize(("make", "fragment"), [
+    (lambda: one("FrozenLake-v1"), "is not a Box"),
+    (lambda: one("CartPole-v1"), "changes the actions of a Box, and the action space is Di"),
+    (pendulum, "is not a VecEnv of Stable-Baselines3.*DummyVecEnv"),
+    (lambda: gym.make_vec("Pendulum-v1", 2), "is not a VecEnv of Stable-Baselines3"),
+    (lambda: VecNormalize(lava_env()), r"VecNormalize\(PerturbedVecEnv"),
 ])  # fmt: skip
-def test_an_environment_that_cannot_be_wrapped_is_refused(wrapper, make, fragment):
+def test_an_environment_that_cannot_be_wrapped_is_refused(make, fragment):
     with pytest.raises(ValueError, match=fragment):
-        wrapper(make(), "actuator_gain" if "actions" in fragment else "vector_noise")
+        PerturbedVecEnv(make(), "actuator_gain" if "actions" in fragment else "vector_noise")
 
 
 def test_actuators_are_perturbed_only_where_actions_are_a_box():
