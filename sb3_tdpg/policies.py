@@ -182,6 +182,12 @@ class TRVPolicy(BasePolicy):
             **self.optimizer_kwargs,
         )
 
+    @property
+    def device(self) -> th.device:
+        """The device of the parameters."""
+        # SB3 looks for the first parameter among all modules, in each step.
+        return self.action_head.mlp.layers[0].bias.device
+
     def _n_action_parameters(self) -> int:
         """Return the number of outputs of the action head."""
         distribution: Any = self.action_dist
@@ -424,9 +430,8 @@ class TRVPolicy(BasePolicy):
         if self.training:
             self.set_training_mode(False)
         observation_tensor, is_vectorized = self.obs_to_tensor(observation)
-        n_envs = len(
-            next(iter(observation_tensor.values())) if isinstance(observation_tensor, dict) else observation_tensor
-        )
+        first = next(iter(observation_tensor.values())) if isinstance(observation_tensor, dict) else observation_tensor
+        n_envs = len(first)
         if state is None:
             prev_trv, t = np.zeros((n_envs, self.trv_dim), np.float32), np.zeros(n_envs, np.int64)
         else:
@@ -439,7 +444,7 @@ class TRVPolicy(BasePolicy):
         if self.time_varying:
             check_time(t, self.horizon)
         with th.inference_mode():
-            step = self.step(observation_tensor, th.as_tensor(prev_trv, device=self.device), t, deterministic)
+            step = self.step(observation_tensor, th.as_tensor(prev_trv, device=first.device), t, deterministic)
         actions = step.actions.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
