@@ -27,8 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command(**options)
     except KeyboardInterrupt:
-        # Commands with a results folder can be resumed.
-        out = options.get("out")
+        out = options.get("out") if command in (_demo, _reproduce, _sweep, _frontier, _report) else None
         advice = "" if out is None else f"; the results so far are in {out}, and the same command continues from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
@@ -184,7 +183,7 @@ def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_epi
     if not dry_run:
         print(f"{folder} is now at {push_to_hub(folder, repo_id)}")
         return
-    print(f"{folder} is ready; without --dry-run it goes to https://huggingface.co/{repo_id}:")
+    print(f"{folder} is ready; sb3-tdpg push {folder} --repo-id {repo_id} uploads it:")
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         print(f"{path.stat().st_size:>12,}  {path.relative_to(folder)}")
 

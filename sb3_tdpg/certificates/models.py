@@ -14,6 +14,7 @@ from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import how_made, provenance, write_run_config
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_models_fit
+from sb3_tdpg.evaluation.loading import statistics_beside
 from sb3_tdpg.tdpg import TDPG
 
 
@@ -23,6 +24,8 @@ def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
     if twice := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
         raise ValueError(f"{twice[0]} is given twice")
     for path in paths:
+        if found := statistics_beside(path):
+            raise ValueError(f"{path} acts on normalised observations ({found}): train one without VecNormalize")
         try:
             model = TDPG.load(path, device="cpu")
         except OSError as e:

@@ -20,7 +20,7 @@ SECONDS_UNTIL_LOCKED = 10.0  # a folder is locked a moment after it was made
 def write_atomically(path: Path, text: str) -> None:
     """Write a text file atomically: readers never see a partial file."""
     with replaced_atomically(path) as partial:
-        partial.write_text(text)
+        partial.write_text(text, encoding="utf-8")
 
 
 @contextmanager

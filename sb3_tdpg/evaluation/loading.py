@@ -35,8 +35,8 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     """
     Load a model of TDPG, Stable-Baselines3 or sb3-contrib, and recognise its algorithm from the file.
 
-    If rl-zoo3 has saved a ``vecnormalize.pkl`` beside it, observations are normalised as in training. Loading unpickles
-    the file, which can run any code: load only files that you trust.
+    If statistics lie beside it (see :func:`statistics_beside`), observations are normalised as in training. Loading
+    unpickles the file, which can run any code: load only files that you trust.
 
     :param path: The file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
@@ -71,10 +71,13 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
 
 def statistics_beside(path: Path) -> Path | None:
     """
-    Return the ``vecnormalize.pkl`` that rl-zoo3 has saved for a model, if there is one.
+    Return the statistics of observations that are saved for a model, if there are any.
+
+    The file is called ``vecnormalize.pkl`` by rl-zoo3, ``vec_normalize.pkl`` on the Hub.
 
     It lies beside the model or in a folder with its name; of ``<id>_1/best_model.zip``, in ``<id>_1/<id>/``.
     """
     folder = path.parent
     folders = [folder, path.with_suffix(""), folder / folder.resolve().name.rpartition("_")[0]]
-    return next((found for each in folders if (found := each / "vecnormalize.pkl").is_file()), None)
+    candidates = [each / name for each in folders for name in ("vecnormalize.pkl", "vec_normalize.pkl")]
+    return next((path for path in candidates if path.is_file()), None)

@@ -72,8 +72,8 @@ class Run:
 
     @property
     def folder_name(self) -> str:
-        """A name made from the method and the seed."""
-        return "-".join([*re.findall(r"[^\W_]+", self.method.lower()), f"seed{self.seed}"])
+        """A name made from the method and the seed; "1.25" keeps its point and is not "1/25"."""
+        return "-".join([*re.findall(r"[^\W_]+(?:\.\d+)*", self.method.lower()), f"seed{self.seed}"])
 
     @property
     def config(self) -> dict[str, Any]:
@@ -222,6 +222,11 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
 
     :raises ValueError: if the folder holds a run with other settings.
     """
+    if (normalize := run.settings.get("normalize")) is not None and normalize.get("norm_obs", True):
+        raise ValueError(
+            f"normalize={normalize}: a run does not keep the statistics of observations. Give norm_obs=False (TDPG's "
+            "policy has normalize_observations of its own), or train with sb3-tdpg train"
+        )
     rows = [{k: v for k, v in vars(row).items() if k != "paper" and v is not None} for row in scenarios]
     config = {**run.config, "n_eval_episodes": n_eval_episodes, "scenarios": rows}
     check_same_config(folder / "config.json", config, "run")
@@ -246,6 +251,8 @@ def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: i
     :raises ValueError: if a folder holds a run with other settings; nothing has been run then.
     """
     jobs = jobs or usable_cores()
+    if len({folder for _, folder, _ in tasks}) < len(tasks):
+        raise ValueError(f"two of these runs have the same folder: {sorted(str(folder) for _, folder, _ in tasks)}")
     for run, folder, scenarios in tasks:  # an error here comes before anything has been run
         folder.parent.mkdir(parents=True, exist_ok=True)
         if run.start is None or (run.start / "model.zip").exists():

@@ -132,7 +132,7 @@ def read_run(folder: Path) -> Publication:
 
 def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
     """Read the episodes of a run; a file that was cut is refused."""
-    expected = config["n_eval_episodes"] * len(config["scenarios"])
+    expected = sum(row.get("n_episodes") or config["n_eval_episodes"] for row in config["scenarios"])
     try:
         records = pd.read_csv(path)
     except EmptyDataError:

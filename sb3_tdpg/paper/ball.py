@@ -180,7 +180,8 @@ def reproduce_ball(
     write_frame_atomically(by_seed, out / "seeds.csv")
 
     folders, labels = common.folders_of(tasks), [method.label for method in chosen]
-    first = {m.label: read_progress(folders[m.label, FIRST_SEED]) for m in chosen if m.algo == "tdpg"}
+    first_seed = {m.label: seed for m, seed in reversed(everything)}
+    first = {m.label: read_progress(folders[m.label, first_seed[m.label]]) for m in chosen if m.algo == "tdpg"}
     save_figure(robustness_curves(records[is_row], NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
     save_figure(sorted_walls(by_seed[by_seed["scenario"].isin(WALL_ROWS)]), out / "walls.png")
     save_figure(diagnosis_bars(records[~is_row & ~is_shift]), out / "diagnosis.png")

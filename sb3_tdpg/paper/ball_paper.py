@@ -77,7 +77,7 @@ def select(runs: pd.DataFrame, records: pd.DataFrame) -> pd.DataFrame:
     :param records: Episodes of all runs.
     :return: the records of policy gradient and of the selected policies, which are called ``TDPG from <level>``
     """
-    kept = [records[records["model"].str.startswith("PG")]]
+    kept = [records[records["model"].str.startswith("PG")].assign(price=None)]
     level = runs["model"].str.split(" from ").str[1]
     met = runs.assign(level=level).dropna(subset="information")
     for (of_level, seed), candidates in met.groupby(["level", "train_seed"], sort=False):

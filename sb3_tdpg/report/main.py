@@ -165,6 +165,8 @@ class _Writer:
 
     def write(self, rows: Sequence[Row], records: pd.DataFrame, knowledge: Sequence[Knowledge] = ()) -> str:
         """Write the page of some rows, and return it as Markdown."""
+        # The first method is the one that the others are compared with; finished rows may have another order.
+        records = pd.concat([records[records["model"] == label] for label in self.names], ignore_index=True)
         out, numbers = self.out, make_numbers(records, seed=self.plan.seed)
         is_finished = len(rows) == len(self.rows)
         figures = _draw(numbers, self.plan, rows if is_finished else (), self.models, self.space, out)

@@ -91,5 +91,7 @@ def fingerprint(model: Any) -> str:
         digest.update(name.encode())
         digest.update(values.detach().cpu().numpy().tobytes())
     if (normalize := model.get_vec_normalize_env()) is not None and normalize.norm_obs:
-        digest.update(normalize.obs_rms.mean.tobytes() + normalize.obs_rms.var.tobytes())
+        of_parts = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
+        for key, rms in sorted(of_parts.items()):
+            digest.update(key.encode() + rms.mean.tobytes() + rms.var.tobytes())
     return digest.hexdigest()[:12]

@@ -18,6 +18,7 @@ from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 CLEAR = 0.05
 """A difference is clear up to this p-value."""
 LEVEL = 0.95  # of the intervals
+MAX_EXACT = 8  # models: up to here the test is exact, as SciPy does without equal costs
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,9 @@ def p_value(costs: np.ndarray, of_others: np.ndarray) -> float:
     """Return the p-value of a difference between the models of two methods."""
     from scipy.stats import mannwhitneyu
 
-    return float(mannwhitneyu(costs, of_others).pvalue)
+    # With equal costs "auto" is a normal approximation, which is far too sure of a few models.
+    method = "exact" if min(len(costs), len(of_others)) <= MAX_EXACT else "auto"
+    return float(mannwhitneyu(costs, of_others, method=method).pvalue)
 
 
 def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:

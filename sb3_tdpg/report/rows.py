@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from gymnasium import spaces
@@ -39,6 +39,8 @@ class Row:
         """The file name of its records, which changes with the environment and with the value of the severity."""
         slug = "".join(c if c.isalnum() else "-" for c in self.title.lower())
         env = [self.scenario.env_id, self.scenario.env_kwargs]
+        if self.scenario.sensor is not None:
+            env.append(self.scenario.sensor)
         content = json.dumps(jsonable([self.title, self.kind, *env, self.value]), sort_keys=True)
         return f"{slug}-{hashlib.sha256(content.encode()).hexdigest()[:8]}.csv.xz"
 
@@ -81,7 +83,8 @@ def make_rows(
                 rows.append(Row(name, severity, kind, plain, found.value(severity)))
     # The first row of a table of the paper is the training row.
     for own in PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:] if scenarios is None else scenarios:
-        rows.append(Row(own.name, 0, "own", Scenario(own.name, own.env_id, {**env_kwargs, **own.env_kwargs})))
+        kept = replace(own, env_kwargs={**env_kwargs, **own.env_kwargs}, n_episodes=None)
+        rows.append(Row(own.name, 0, "own", kept))
     # In the tables the name of a perturbation stands for all its severities, and ALL for all perturbations.
     titles = [row.title for row in rows]
     groups = {ALL, *(row.perturbation for row in rows if row.kind != "own")}

@@ -18,7 +18,7 @@ import yaml
 from rl_zoo3.utils import get_callback_list
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
@@ -174,6 +174,9 @@ class _Measuring(BaseCallback):
     def measure(self) -> tuple[float, float]:
         """Return the expected cost and the information in nats of the current policy."""
         assert isinstance(self.model, TDPG)
+        trained_in, fresh = unwrap_vec_normalize(self.training_env), unwrap_vec_normalize(self.env)
+        if trained_in is not None and fresh is not None and trained_in.norm_obs:
+            fresh.obs_rms = trained_in.obs_rms
         episodes = encode_episodes(self.model, self.env, seed=self.trial.number)
         self.last = (float(episodes.costs.mean()), max(0.0, information_bounds(episodes.batch).upper))
         for name, value in zip((COST, INFORMATION), self.last, strict=True):

@@ -286,6 +286,14 @@ def test_bad_input_to_the_command_is_told_in_a_line(arguments, message, model, c
     assert message in line
 
 
+def test_a_model_of_normalised_observations_is_refused(tmp_path):
+    env = VecNormalize(DummyVecEnv([LavaEnv]), norm_reward=False)
+    tiny_tdpg(env, n_episodes=2).save(tmp_path / "model.zip")
+    env.save(tmp_path / "vecnormalize.pkl")
+    with pytest.raises(ValueError, match="acts on normalised observations"):
+        load_models([tmp_path / "model.zip"], TRAINING)
+
+
 def test_models_from_folders_of_one_name_are_all_certified(tmp_path):
     paths = [tmp_path / name / "model.zip" for name in ("a", "b", "c/a")]
     for path in paths:

@@ -21,6 +21,14 @@ def test_two_workers_may_write_the_same_file_at_once(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_text_is_written_in_utf_8_wherever_it_is_written(tmp_path):
+    script = "import sys; from pathlib import Path; from sb3_tdpg.common.files import write_atomically\n"
+    script += "write_atomically(Path(sys.argv[1]), '\\u03b2 = 1')"
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    subprocess.run([sys.executable, "-c", script, tmp_path / "page.html"], env=environment, check=True)
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == "β = 1"
+
+
 def test_what_could_not_be_written_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "summary.md"
     write_atomically(path, "old")

@@ -156,6 +156,17 @@ def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
         complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
 
 
+def test_runs_that_would_be_mixed_up_are_refused(tmp_path):
+    names = [replace(tiny_run(), method=method).folder_name for method in ("beta 1.25", "beta 1/25")]
+    assert names == ["beta-1.25-seed0", "beta-1-25-seed0"]
+    tasks = [(tiny_run(seed), tmp_path / "one", LAVA[:1]) for seed in (0, 1)]
+    with pytest.raises(ValueError, match="the same folder"):
+        complete_runs(tasks)
+    with pytest.raises(ValueError, match="does not keep the statistics"):
+        complete_run(tiny_run(normalize={}), tmp_path / "two", LAVA[:1])
+    assert not list(tmp_path.iterdir())
+
+
 def test_attempts_go_on_until_one_meets_the_limits(tmp_path):
     run, callback = replace(tiny_run(), max_attempts=3), "sb3_tdpg.callbacks.SelectionCallback"
     complete_run(run, tmp_path / "none", LAVA[:1], n_eval_episodes=4)

@@ -16,9 +16,11 @@ from published_cards import REPO_ID, blocks, costs_of, text_of
 from small_problems import assert_same_parameters, error_line, parameters, tiny_tdpg, train_epochs
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.common.provenance import with_numbers
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.rerun import rerun
+from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hub import pull_from_hub, push_to_hub, write_model_card
 from sb3_tdpg.hub.model_card import model_card, results_with_intervals
 from sb3_tdpg.hub.publication import Publication, read_run
@@ -177,6 +179,13 @@ def test_a_run_that_is_not_whole_is_refused_in_a_line_and_nothing_is_written(
     line = error_line(capsys, "push", copy, "--repo-id", REPO_ID, "--dry-run", "--card", tmp_path / "card")
     assert re.search(message, line)
     assert not (tmp_path / "card").exists()
+
+
+def test_rows_may_have_their_own_number_of_episodes(runs, tmp_path):
+    rows = [Scenario("Training", "Lava-v0"), Scenario("few", "Lava-v0", n_episodes=2)]
+    config = json.loads((runs / "pg-seed0" / "config.json").read_text())
+    run = Run("PG", "Lava-v0", None, 0, with_numbers(config["settings"]))
+    assert len(read_run(complete_run(run, tmp_path / "run", rows, n_eval_episodes=4)).records) == 6
 
 
 def test_records_that_are_not_of_one_policy_or_a_damaged_model_are_refused(runs, tmp_path):

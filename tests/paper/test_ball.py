@@ -43,8 +43,9 @@ def tiny(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_seeds", [1, 2])
-def test_from_nothing_to_tables_figures_and_records(n_seeds, tmp_path, tiny):
+@pytest.mark.parametrize(("n_seeds", "n_controls"), [(1, 5), (2, 1)])
+def test_from_nothing_to_tables_figures_and_records(n_seeds, n_controls, tmp_path, tiny, monkeypatch):
+    monkeypatch.setattr(ball, "N_CONTROLS", n_controls)
     out, published = tmp_path / "out", tmp_path / "docs"
     summary = ball.reproduce_ball(out, n_seeds=n_seeds, n_eval_episodes=2, n_timesteps=100, publish=published)
 
@@ -59,7 +60,7 @@ def test_from_nothing_to_tables_figures_and_records(n_seeds, tmp_path, tiny):
     for title in ("Table II", "Goals", "Unseen walls", "TDPG compared with", "TRVs know"):
         assert title in summary
     records, shifts = (pd.read_csv(out / name) for name in ("episodes.csv.xz", "shifts.csv.xz"))
-    n_policies = n_seeds * len(ball.methods("fixed"))  # fewer than the controls' largest number
+    n_policies = n_seeds * 3 + min(n_seeds, n_controls) * (len(ball.methods("fixed")) - 3)
     assert len(records) == n_policies * (len(BALL_CATCH) + len(BALL_CATCH_DIAGNOSIS)) * 2
     assert len(shifts) == n_policies * len(ball.SHIFTS) * 2
     # A terminal cost of 100 for each metre, and a little for driving.

@@ -59,6 +59,9 @@ def test_the_policy_of_the_lowest_information_is_selected_for_each_level_and_see
     assert found.loc[("TDPG from 8.7", 0), ["cost", "price"]].tolist() == [1, "40"]
     assert found.loc[("TDPG from 8.7", 1), ["cost", "price"]].tolist() == [2, "16"]
     assert set(chosen["model"]) == {"PG to 8.7", "TDPG from 8.7"}, "no epoch of the other level met the limit"
+    chosen = ball_paper.select(runs.assign(information=np.nan), records)
+    assert set(chosen["model"]) == {"PG to 8.7"}
+    assert "price" in chosen, "also if no run met its limit"
 
 
 def test_a_training_stops_once_five_epochs_cost_little_enough():

@@ -7,7 +7,7 @@ from scipy.stats import binomtest
 
 from sb3_tdpg.common.provenance import how_made, provenance
 from sb3_tdpg.report.charts import comparison_figure, degradation_curves, own_rows_figure
-from sb3_tdpg.report.numbers import make_numbers
+from sb3_tdpg.report.numbers import make_numbers, p_value
 from sb3_tdpg.report.page import Page, write_page
 from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import ALL, UNPERTURBED
@@ -78,6 +78,13 @@ def test_what_overlaps_is_not_bold():
     assert of_b["iqm"] < of_a["low"] < of_b["high"]
     assert not numbers.groups["lowest"].any()
     assert make_numbers(made_up(5), n_bootstrap=50).groups["lowest"].tolist() == [False] * 3 + [True] * 3
+
+
+@pytest.mark.parametrize(("ours", "theirs", "least"), [
+    ([1, 1, 1], [2, 2, 2], 0.1), ([1, 1, 1, 1], [2, 3, 4], 0.05), ([1] * 5, [2, 2], 0.09),
+])  # fmt: skip
+def test_models_of_equal_cost_are_not_more_certain(ours, theirs, least):
+    assert p_value(np.array(ours, dtype=float), np.array(theirs, dtype=float)) >= least
 
 
 def test_equal_costs_are_no_difference():

@@ -2,25 +2,28 @@
 
 import re
 import shutil
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 from gymnasium import spaces
+from perturbed_problems import ClockEnv
 from scipy.stats import mannwhitneyu, trim_mean
 from small_problems import error_line, tiny_tdpg
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.report import load_model, parse_models, robustness_report
-from sb3_tdpg.report.models import label_of
+from sb3_tdpg.report.models import fingerprint, label_of
 from sb3_tdpg.report.page import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
+from sb3_tdpg.robustness import PerturbedVecEnv
 from tests.report.test_report_time import report_of
 
 pytest.importorskip("matplotlib")
@@ -217,14 +220,18 @@ def test_models_of_other_algorithms_are_recognised(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:You are trying to run PPO")
-@pytest.mark.parametrize("name", ["Lava-v0", "best_model"])
-def test_the_statistics_that_the_zoo_leaves_beside_a_model_are_used(name, tmp_path):
+@pytest.mark.parametrize(("name", "statistics"), [
+    ("Lava-v0", "Lava-v0/vecnormalize.pkl"),
+    ("best_model", "Lava-v0/vecnormalize.pkl"),
+    ("tdpg-Lava-v0", "vec_normalize.pkl"),  # on the Hub
+])  # fmt: skip
+def test_the_statistics_that_lie_beside_a_model_are_used(name, statistics, tmp_path):
     env = VecNormalize(make_vec_env("Lava-v0", 2, seed=0), norm_reward=False)
     model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu").learn(100)
     folder = tmp_path / "Lava-v0_1"
     model.save(folder / name)
     (folder / "Lava-v0").mkdir()
-    env.save(folder / "Lava-v0" / "vecnormalize.pkl")
+    env.save(folder / statistics)
     loaded = load_model(folder / f"{name}.zip", "Lava-v0", {}).get_vec_normalize_env()
     np.testing.assert_array_equal(loaded.obs_rms.mean, env.obs_rms.mean)
 
@@ -317,9 +324,33 @@ def test_scenarios_must_not_be_called_as_another_row_of_a_table(name):
     assert len(rows_of(Scenario("once", "Lava-v0"))) == 1 + 5 + 1
 
 
-def test_records_of_another_environment_are_no_records_of_this_one():
-    here, there = (rows_of(Scenario("x", env_id, {}))[-1] for env_id in ("Lava-v0", "Other-v0"))
-    assert here.file_name != there.file_name
+def test_records_of_another_environment_or_sensor_are_no_records_of_this_one():
+    sensor = partial(PerturbedVecEnv, perturbation="vector_noise")
+    here, there, changed = (
+        rows_of(Scenario("x", env_id, sensor=wrapper))[-1]
+        for env_id, wrapper in (("Lava-v0", None), ("Other-v0", None), ("Lava-v0", sensor))
+    )
+    assert len({here.file_name, there.file_name, changed.file_name}) == 3
+    assert changed.scenario.sensor is sensor
+
+
+def test_another_order_of_the_methods_compares_with_another_one(report, tmp_path):
+    arguments, out = report
+    labels = arguments[1 : arguments.index("--env")]
+    again = shutil.copytree(out, tmp_path / "again")
+    arguments = [arguments[0], *labels[::-1], *arguments[1 + len(labels) :], "--out", str(again)]
+    assert main(arguments) == 0
+    before, after = (pd.read_csv(folder / "comparisons.csv") for folder in (out, again))
+    assert set(before["model"]) == {"tdpg"} and set(after["model"]) == {"PG"}
+
+
+def test_a_model_of_a_dict_is_known_by_its_statistics():
+    space = spaces.Dict(gyro=spaces.Box(-10, 1000, (2,), np.float32))
+    env = VecNormalize(DummyVecEnv([lambda: ClockEnv(space)]))
+    model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, device="cpu")
+    before = fingerprint(model)
+    env.obs_rms["gyro"].mean += 1.0
+    assert fingerprint(model) != before
 
 
 @pytest.mark.parametrize(("change", "difference"), [

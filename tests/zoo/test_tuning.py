@@ -6,11 +6,13 @@ import re
 import sys
 import tempfile
 
+import numpy as np
 import optuna
 import pytest
 import yaml
 from small_problems import error_line, tiny_tdpg
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
@@ -101,6 +103,16 @@ def test_what_is_measured_is_on_fresh_episodes_and_leaves_the_training_alone():
     assert trial.user_attrs == dict(cost=cost, information=information)
     assert len(measured.costs) == 50
     assert len(trial.study.get_trials()[trial.number].intermediate_values) == 5
+
+
+def test_a_policy_is_measured_with_the_statistics_of_its_training():
+    seen = VecNormalize(BatchedVecEnv(LavaEnv(), 20), norm_reward=False)
+    model = tiny_tdpg(seen, seed=3, n_episodes=20, beta=1.0).learn(600)
+    fresh = VecNormalize(BatchedVecEnv(LavaEnv(), 20), norm_reward=False, training=False)
+    measuring = _Measuring(optuna.create_study().ask(), fresh, 1e9, 100)
+    measuring.init_callback(model)
+    measuring.measure()
+    np.testing.assert_array_equal(fresh.obs_rms.mean, seen.obs_rms.mean)
 
 
 def test_episodes_that_end_early_count_until_then():
