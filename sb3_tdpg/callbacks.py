@@ -63,6 +63,8 @@ class MINECallback(TDPGCallback):
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
+        # As before train(): a schedule of beta may turn the penalty on with this epoch.
+        model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
         if not model.needs_information:
             model.information = None
             return
@@ -85,7 +87,23 @@ class Candidate(NamedTuple):
 
     epoch: int
     cost: float  # empirical expected cost
-    information: float  # sum over t, nats
+    information: float  # sum over t, nats; infinite where it was not estimated
+
+    def __str__(self) -> str:
+        known = f"information {self.information:.3g} nat" if np.isfinite(self.information) else "information unknown"
+        return f"epoch {self.epoch}: cost {self.cost:.4g}, {known}"
+
+    def to_json(self) -> str:
+        """Return it as JSON, which has no infinite numbers: ``null`` stands for unknown information."""
+        return json.dumps(
+            {**self._asdict(), "information": self.information if np.isfinite(self.information) else None}
+        )
+
+    @classmethod
+    def from_json(cls, text: str) -> Candidate:
+        """Read what :meth:`to_json` wrote."""
+        record = json.loads(text)
+        return cls(**{**record, "information": math.inf if record["information"] is None else record["information"]})
 
 
 class SelectionCallback(TDPGCallback):
@@ -142,7 +160,7 @@ class SelectionCallback(TDPGCallback):
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
-            self.best = Candidate(**json.loads(_record_path(self.save_path).read_text()))
+            self.best = Candidate.from_json(_record_path(self.save_path).read_text())
             # Loading the whole model would seed all random number generators.
             _, parameters, _ = load_from_zip_file(self.save_path, device=self.model.device, load_data=False)
             self._best_policy = cast("dict[str, th.Tensor]", parameters["policy"])
@@ -152,22 +170,23 @@ class SelectionCallback(TDPGCallback):
     def _on_rollout_end(self) -> None:
         model = self.tdpg
         cost = float(model.rollout_buffer.episode_costs.mean())
-        information = 0.0 if model.information is None else float(model.information.clip(min=0).sum())
+        # Unknown is no better than anything that is known.
+        information = math.inf if model.information is None else float(model.information.clip(min=0).sum())
         candidate = Candidate(model.epoch, cost, information)
         if not self._is_eligible(candidate) or (self.best is not None and not self._is_better(candidate, self.best)):
             return
         self.best = candidate
         self._best_policy = {name: value.detach().clone() for name, value in model.policy.state_dict().items()}
         if self.verbose >= 1:
-            print(f"epoch {candidate.epoch}: cost {cost:.2f}, information {information:.3f} nat: new {self.criterion}")
+            print(f"{candidate}: new {self.criterion}")
         if self.save_path is not None:
             model.save(self.save_path)
-            write_atomically(_record_path(self.save_path), json.dumps(candidate._asdict()))
+            write_atomically(_record_path(self.save_path), candidate.to_json())
 
     def _is_eligible(self, candidate: Candidate) -> bool:
         under_cost = self.cost_limit is None or candidate.cost < self.cost_limit
         under_mi = self.mi_limit is None or candidate.information < self.mi_limit
-        return np.isfinite(candidate.cost) and np.isfinite(candidate.information) and under_cost and under_mi
+        return np.isfinite(candidate.cost) and not np.isnan(candidate.information) and under_cost and under_mi
 
     def _is_better(self, candidate: Candidate, best: Candidate) -> bool:
         if self.mi_limit is None:

@@ -248,6 +248,8 @@ def check_action_space(space: spaces.Space) -> None:
     if not isinstance(space, SUPPORTED_ACTION_SPACES):
         names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
         raise ValueError(f"the action space {space} is not supported: use one of {names}")
+    if isinstance(space, spaces.Discrete) and space.start != 0:
+        raise ValueError(f"the action space {space} must begin with 0: policies of SB3 return 0 to n - 1")
     if isinstance(space, spaces.Box) and not np.isfinite([space.low, space.high]).all():
         raise ValueError(
             f"the action space {space} has infinite bounds: give it finite ones, for instance with "

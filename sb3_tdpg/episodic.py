@@ -271,7 +271,10 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         size = self.epoch_size
         if self.epoch == 0:
             return size
-        return min(size, max(self.remaining_timesteps, size // 10))  # fewer would make an update of noise
+        least = size // 10  # fewer would make an update of noise
+        if self.policy.time_varying:  # an estimate at each time step needs two episodes
+            least = max(least, self.horizon + 1)
+        return min(size, max(self.remaining_timesteps, least))
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Write the log; the mean cost comes from all episodes of the epoch."""
@@ -302,6 +305,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         if self.env is None:
             raise ValueError("the model has no environment to learn in: set_env(...) first, or load(path, env=...)")
+        self._last_obs = None  # somebody may have stepped the environments since the last epoch
         if reset_num_timesteps:
             self.epoch = 0
             self._current_progress_remaining = 1.0
@@ -380,6 +384,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
             if kwargs.get(one) is not None:
                 kwargs.setdefault(other, None)
+        if "batch_size" in kwargs:
+            kwargs.setdefault("_has_default_batch_size", kwargs["batch_size"] is None)
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except Exception as e:

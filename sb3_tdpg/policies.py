@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from inspect import signature
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -26,7 +26,7 @@ from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
 from sb3_tdpg.checks import check_count, check_floors, check_memory, check_net_arch, check_single, check_time
-from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, TimeMLP, bounded_variance
+from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, BatchedLinear, TimeMLP, bounded_variance
 from sb3_tdpg.common.running_norms import Changes
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_extractor, fill_in_trvs
@@ -186,7 +186,7 @@ class TRVPolicy(BasePolicy):
     def device(self) -> th.device:
         """The device of the parameters."""
         # SB3 looks for the first parameter among all modules, in each step.
-        return self.action_head.mlp.layers[0].bias.device
+        return cast(BatchedLinear, self.action_head.mlp.layers[0]).bias.device
 
     def _n_action_parameters(self) -> int:
         """Return the number of outputs of the action head."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
@@ -175,8 +175,6 @@ class TDPG(EpisodicAlgorithm):
         self.preset = None if env is None or not _init_setup_model else preset_of(env.observation_space, horizon)
         settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1), horizon or 1)
         self._has_default_batch_size = batch_size is None
-        # The defaults of the paper's problems count episodes always.
-        self._counts_episodes = batch_size is None and self.preset != "long"
         check_policy(policy, self.policy_aliases)
         check_arguments({**settings, "seed": seed})
         super().__init__(
@@ -242,14 +240,13 @@ class TDPG(EpisodicAlgorithm):
             unit, size = "episodes", self.epoch_size // self.horizon
         else:
             unit, size = "steps", self.epoch_size
-            if self._counts_episodes and self.batch_size is not None:
-                self.batch_size *= self.horizon
-        self._counts_episodes = False
-        if self._has_default_batch_size and self.batch_size is not None:
-            self.batch_size = min(self.batch_size, size)  # a default must fit any number of episodes
+        if self._has_default_batch_size and (batch_size := self._defaults.batch_size) is not None:
+            # The defaults of the paper's problems count episodes always, and a default must fit any number of them.
+            in_steps = unit == "steps" and self.preset != "long"
+            self.batch_size = min(batch_size * (self.horizon if in_steps else 1), size)
         check_batch_size(vars(self), size, unit)
         if self.baseline == "value":
-            if self.env is not None:
+            if self.env is not None and "values_see_changes" not in vars(self):  # a loaded model keeps its network
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
             value_function = ValueFunction(self.state_dim, self.horizon, with_changes=self.values_see_changes)
             self.value_function = value_function.to(self.device)
@@ -389,8 +386,10 @@ class TDPG(EpisodicAlgorithm):
 
     def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
         """Return the columns of each minibatch."""
-        size = batch.costs.shape[1] if self.policy.time_varying else batch.alive.sum().item()
-        return batch.partition(1 if self.batch_size is None else math.ceil(size / self.batch_size))
+        n_columns = batch.costs.shape[1]
+        size = n_columns if self.policy.time_varying else batch.alive.sum().item()
+        n_parts = 1 if self.batch_size is None else math.ceil(size / self.batch_size)
+        return batch.partition(min(n_parts, max(1, n_columns // 2)))  # the information needs two columns
 
     # -- learn and load ---------------------------------------------------------------------------------------
 
@@ -432,7 +431,7 @@ class TDPG(EpisodicAlgorithm):
         """Say what the last epoch has of the information, if it was penalised, and whether that is hardly any."""
         if self.auto_weight is not None:
             return self.auto_weight.kept()
-        if self.information is None:
+        if self.information is None or not self.rollout_buffer.full:  # a callback has stopped within an epoch
             return None
         nats = float(self.information.sum())
         text = f"{nats:.3g} nats kept, at a cost of {self.rollout_buffer.episode_costs.mean():.3g}"
@@ -458,8 +457,9 @@ class TDPG(EpisodicAlgorithm):
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]
         callbacks = [c if isinstance(c, BaseCallback) else ConvertCallback(c) for c in given]
-        if not any(isinstance(c, MINECallback) for c in callbacks):
-            callbacks.insert(0, MINECallback())
+        callbacks = [c for each in callbacks for c in (each.callbacks if isinstance(each, CallbackList) else [each])]
+        first = [c for c in callbacks if isinstance(c, MINECallback)] or [MINECallback()]
+        callbacks = [*first, *(c for c in callbacks if c not in first)]  # the others see the information
         if progress_bar:
             callbacks.append(TDPGProgressBar())
         return super()._init_callback(callbacks)

@@ -147,6 +147,9 @@ ARGUMENTS = {
     "action bounds that are not finite": (
         dict(env=toy_vec_env(action_space=spaces.Box(-np.inf, np.inf, (1,), np.float32))), "action", "bound", "finite"
     ),
+    "actions that do not begin with 0": (
+        dict(env=toy_vec_env(action_space=spaces.Discrete(3, start=5))), "action space", "begin with 0"
+    ),
     "action space that is not supported": (
         dict(env=toy_vec_env(action_space=spaces.Dict(a=spaces.Discrete(2)))), "action space", "Box", "Discrete"
     ),

@@ -16,8 +16,17 @@ from small_problems import (
     toy_vec_env,
     train_epochs,
 )
+from stable_baselines3.common.callbacks import CallbackList
 
-from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback, TrainingDivergedError
+from sb3_tdpg import (
+    TDPG,
+    BatchedVecEnv,
+    MINECallback,
+    SelectionCallback,
+    TrainingCheckpointCallback,
+    TrainingDivergedError,
+)
+from sb3_tdpg.callbacks import Candidate
 from sb3_tdpg.envs.lava import LavaEnv
 
 
@@ -56,6 +65,41 @@ def test_the_epoch_that_the_rule_asks_for_is_kept_and_restored(limits, chosen):
     assert (best.cost, best.information) == pytest.approx(MEASURED[chosen], rel=1e-5)
     # The policy is the one that made these rollouts, not the one after their update.
     assert_same_parameters(parameters(model.policy), script.policies[chosen])
+
+
+def test_unknown_information_does_not_win(tmp_path):
+    later = tiny_tdpg(beta=lambda progress: math.inf if progress > 0.5 else 1 / 75)
+    selection = SelectionCallback(cost_limit=1e9, save_path=tmp_path / "best")
+    train_epochs(later, 6, callback=selection)
+    assert math.isfinite(selection.best.information)
+    never = SelectionCallback(mi_limit=0.001)
+    train_epochs(tiny_tdpg(beta=math.inf), 2, callback=never)
+    assert never.best is None
+    unknown = Candidate(3, 17.0, math.inf)
+    assert Candidate.from_json(unknown.to_json()) == unknown
+    assert str(unknown) == "epoch 3: cost 17, information unknown"
+
+
+@pytest.mark.parametrize("wrap", [list, CallbackList])
+def test_the_users_own_mine_callback_replaces_the_default_and_comes_first(wrap):
+    model, fits = tiny_tdpg(beta=1.0), []
+    fit = model.estimator.fit
+    model.estimator.fit = lambda batch: fits.append(1) or fit(batch)
+    selection = SelectionCallback(cost_limit=1e9)
+    train_epochs(model, 3, callback=wrap([selection, MINECallback()]))
+    assert len(fits) == 3
+    assert math.isfinite(selection.best.information)
+
+
+def test_the_first_epoch_with_a_penalty_has_critics_that_were_fitted_to_it():
+    model, calls = tiny_tdpg(beta=lambda progress: math.inf if progress > 0.5 else 1 / 75), []
+    fit, train = model.estimator.fit, model.train
+    model.estimator.fit = lambda batch: calls.append("fit") or fit(batch)
+    model.train = lambda: calls.append("penalised" if model.mi_coef > 0 else "plain") or train()
+    train_epochs(model, 6)
+    penalised = [i for i, call in enumerate(calls) if call == "penalised"]
+    assert penalised and all(calls[i - 1] == "fit" for i in penalised)
+    assert calls.count("fit") == len(penalised)
 
 
 def test_a_negative_or_broken_estimate_does_not_win():

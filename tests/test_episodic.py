@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env
+from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env, train_epochs
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import TDPG, TrainingDivergedError
@@ -27,6 +27,20 @@ def test_no_episode_begins_once_an_epoch_has_its_steps(epoch_steps, n_episodes):
     model.learn(epoch_steps)
     assert model.num_timesteps == 4 * n_episodes
     assert model.rollout_buffer.alive.sum() == 4 * n_episodes
+
+
+def test_the_last_epoch_has_enough_episodes_for_an_estimate():
+    model = TDPG(env=toy_vec_env(1, horizon=20), epoch_steps=100, device="cpu", seed=0)
+    assert model.learn(410).epoch == 5
+
+
+def test_an_episode_that_somebody_else_has_begun_is_not_gone_on_with():
+    model = tiny_tdpg(toy_vec_env(2, horizon=3), n_episodes=2)
+    train_epochs(model, 1)
+    model.get_env().step(np.zeros((2, *model.action_space.shape), np.float32))
+    train_epochs(model, 1, reset_num_timesteps=False)
+    assert model.rollout_buffer.alive.all()
+    np.testing.assert_allclose(model.rollout_buffer.observations[..., :1], model.rollout_buffer.states, rtol=1e-6)
 
 
 def test_after_an_error_the_next_training_begins_with_new_episodes():

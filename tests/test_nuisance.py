@@ -24,6 +24,14 @@ from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.robustness.nuisance import NuisanceVecEnv
 
+
+def test_for_images_beside_a_vector_nothing_is_measured_and_the_environment_takes_no_step(monkeypatch):
+    parts = dict(image=spaces.Box(0, 255, (3, 36, 36), np.uint8), goal=spaces.Box(-np.inf, np.inf, (2,), np.float32))
+    env = toy_vec_env(2, observation_space=spaces.Dict(parts))
+    monkeypatch.setattr(env, "step_wait", None)
+    assert isinstance(TDPG(env=env, n_episodes=4, device="cpu").env, NuisanceVecEnv)
+
+
 DEPTH = spaces.Box(0.2, 0.7, (1, 16, 16), np.float32)
 IMAGES_AND_VECTOR = spaces.Dict(camera=spaces.Box(0, 255, (3, 64, 64), np.uint8), arm=spaces.Box(-1, 1, (2,)))
 

@@ -34,6 +34,16 @@ def test_no_minibatch_is_left_with_a_single_episode():
     assert sorted(len(part) for part in model._minibatches(model.rollout_buffer.episode_batch())) == [5, 6, 6]
 
 
+@pytest.mark.parametrize(("env", "settings"), [
+    (dict(n_envs=2, horizon=100), dict(epoch_steps=200, bptt_steps=100)),
+    (dict(n_envs=2, horizon=40, observation_space=IMAGE), dict(n_episodes=4, batch_size=32)),
+    (dict(n_envs=1, horizon=3), dict(n_episodes=5, batch_size=2, clip_range=0.2)),
+])  # fmt: skip
+def test_a_minibatch_has_two_columns_at_least(env, settings):
+    model = TDPG(env=toy_vec_env(**env), device="cpu", seed=0, **settings)
+    assert model.learn(model.epoch_size).epoch == 1
+
+
 def test_every_episode_is_in_one_minibatch_of_a_pass():
     model = train_epochs(tiny_tdpg(**PASSES), 1)
     columns = th.cat(list(model._minibatches(model.rollout_buffer.episode_batch())))

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from small_problems import (
     AtEveryEpoch,
+    AtEveryStep,
     CountdownEnv,
     ToyEnv,
     assert_same_parameters,
@@ -16,6 +17,7 @@ from small_problems import (
     parameters,
     same_parameters,
     tiny_tdpg,
+    toy_vec_env,
     train_epochs,
     words,
 )
@@ -248,6 +250,16 @@ def test_a_setting_may_be_changed_when_a_model_is_loaded(before, change, after, 
     assert model._minibatches(model.rollout_buffer.episode_batch()) == [slice(None)]  # the whole epoch
 
 
+def test_a_default_size_of_a_minibatch_follows_the_epoch_and_a_given_one_is_checked(tmp_path):
+    env = toy_vec_env(4, horizon=3, observation_space=spaces.Box(0, 255, (3, 16, 16), np.uint8))
+    small = TDPG(env=env, n_episodes=4, device="cpu")
+    small.save(tmp_path / "small")
+    assert small.batch_size == 4 * 3
+    assert TDPG.load(tmp_path / "small", env=env, n_episodes=160, device="cpu").batch_size == 40 * 3
+    with pytest.raises(ValueError, match="batch_size=5000 must be between"):
+        TDPG.load(tmp_path / "small", env=env, batch_size=5000, device="cpu")
+
+
 def test_a_policy_gradient_model_warm_starts_tdpg(tmp_path):
     model = train_epochs(tiny_tdpg(beta=math.inf, mi_estimator="mine"), 1)
     model.save(tmp_path / "pg")
@@ -262,14 +274,14 @@ def test_beta_may_follow_the_progress():
     model = tiny_tdpg(beta=lambda progress: 1 / (75 * (1.0001 - progress)))
     coefficients = []
     train_epochs(model, 4, callback=AtEveryEpoch(lambda m: coefficients.append(m.mi_coef)))
-    np.testing.assert_allclose(coefficients, 75 * (np.arange(4) / 4 + 0.0001), rtol=1e-6)
+    np.testing.assert_allclose(coefficients, 75 * (np.arange(1, 5) / 4 + 0.0001), rtol=1e-6)  # as in train()
 
 
 def test_a_schedule_may_begin_with_policy_gradient():
     model = tiny_tdpg(beta=lambda progress: math.inf if progress > 0.5 else 0.1)
     information = []
     train_epochs(model, 4, callback=AtEveryEpoch(lambda m: information.append(m.information)))
-    assert [x is None for x in information] == [True, True, False, False]
+    assert [x is None for x in information] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("schedule", ["beta", "learning_rate"])
@@ -302,3 +314,9 @@ def test_a_policy_that_hardly_looks_at_its_sensor_is_told_at_the_end(beta, told,
     said = capsys.readouterr().out
     assert ("nats kept, at a cost of" in said) == (told is not None)
     assert ("hardly looks at its sensor" in said) == bool(told)
+
+
+def test_nothing_is_told_of_an_epoch_that_a_callback_has_stopped(capsys):
+    model = tiny_tdpg(verbose=1, beta=1.0)
+    train_epochs(model, 4, callback=AtEveryStep(lambda callback: callback.n_calls < 13))
+    assert "nats kept" not in capsys.readouterr().out

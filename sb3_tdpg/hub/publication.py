@@ -15,6 +15,7 @@ import yaml
 from pandas.errors import EmptyDataError
 from stable_baselines3.common.monitor import get_monitor_files, load_results
 
+from sb3_tdpg.callbacks import Candidate
 from sb3_tdpg.common.provenance import as_typed, jsonable, with_numbers
 from sb3_tdpg.common.trust import PlainLoader, plain_name, refuse_links, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
@@ -232,11 +233,8 @@ def _saved_versions(model_path: Path) -> dict[str, Any]:
 def _selection_note(folder: Path, settings: Mapping[str, Any]) -> str:
     """Say which epoch the policy is from."""
     if (folder / "selected.json").exists():
-        best = json.loads((folder / "selected.json").read_text())
-        return (
-            f"The selection chose the policy of epoch {best['epoch']}: mean cost {best['cost']:.4g}, information "
-            f"{best['information']:.3g} nat, both measured on the episodes of that epoch."
-        )
+        best = Candidate.from_json((folder / "selected.json").read_text())
+        return f"The selection chose the policy of {best}, measured on the episodes of that epoch."
     if "SelectionCallback" in str(settings.get("callback")):
         return "No epoch met the limits of the selection, so the policy is the last one."
     return "The policy is the last one."

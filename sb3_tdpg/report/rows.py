@@ -38,7 +38,7 @@ class Row:
     def file_name(self) -> str:
         """The file name of its records, which changes with the environment and with the value of the severity."""
         slug = "".join(c if c.isalnum() else "-" for c in self.title.lower())
-        env = [self.scenario.env_id, self.scenario.env_kwargs]
+        env: list[Any] = [self.scenario.env_id, self.scenario.env_kwargs]
         if self.scenario.sensor is not None:
             env.append(self.scenario.sensor)
         content = json.dumps(jsonable([self.title, self.kind, *env, self.value]), sort_keys=True)

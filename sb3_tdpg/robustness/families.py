@@ -122,8 +122,9 @@ class Family:
         space, scale = env.observation_space, None
         if found.kind == "action":
             space, scale = env.action_space, np.ones(env.action_space.shape or ())
-        elif not found.timing and self._measured_scale is not None:
-            scale = each_part(lambda part: factor * part, self._measured_scale)
+        elif not found.timing and (found.kind != "image" or self._given_scale is not None):
+            of_parts = self._measured_scale  # never for images alone: it takes steps of the environment
+            scale = None if of_parts is None else each_part(lambda part: factor * part, of_parts)
         sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, attribute_of(env, "observation_groups"))
         return [partial(Perturber, found, severity, sensor) for severity in range(low, high + 1)]
 

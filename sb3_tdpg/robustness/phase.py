@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from torch.distributions import Distribution, kl_divergence
 
 from sb3_tdpg.callbacks import TDPGCallback
@@ -22,16 +23,14 @@ from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, held_family
 BATCH_STEPS = 400  # of a gradient step: 16 episodes of 25 steps
 
 
-def actions(policy: Any, batch: Any, observations: Any) -> list[Distribution]:
+def actions(policy: Any, batch: Any) -> list[Distribution]:
     """
-    Unroll a policy over recorded episodes with the recorded noise of the TRVs, but with these observations.
+    Unroll a policy over episodes, or segments of them, with the recorded noise of the TRVs.
 
     :param policy: A :class:`~sb3_tdpg.TRVPolicy`.
     :param batch: An :class:`~sb3_tdpg.buffers.EpisodeBatch`.
-    :param observations: ``(T, N, *obs)``, or a dict of such
     :return: pi(. | x~_t), ``(T * N, ...)``; several for a ``MultiDiscrete`` space
     """
-    batch = batch._replace(observations=observations)
     trvs, *_ = policy.rebuild_trvs(policy.episode_features(batch), batch)
     densities = policy.episode_action_density(trvs).distribution
     return densities if isinstance(densities, list) else [densities]
@@ -77,6 +76,11 @@ class NuisancePhase(TDPGCallback):
         assert env is not None
         if isinstance(env, NuisanceVecEnv):
             raise ValueError("NuisancePhase needs plain rollouts: give TDPG nuisance=None")
+        if (normalize := unwrap_vec_normalize(env)) is not None and normalize.norm_obs:
+            raise ValueError(
+                "NuisancePhase perturbs the observations of the rollouts, which VecNormalize has normalised: give "
+                "norm_obs=False and policy_kwargs=dict(normalize_observations=True)"
+            )
         self.family = held_family(self.nuisance, env)
         self.tdpg._last_obs = None  # the environment is reset once more: a scale may have been measured in it
         self.optimizer = th.optim.Adam(self.tdpg.policy.parameters(), lr=1e-3, fused=True)
@@ -94,10 +98,7 @@ class NuisancePhase(TDPGCallback):
 
     def _remove_from_rollouts(self) -> None:
         model: Any = self.tdpg
-        in_segments = not model.policy.time_varying
-        batch = model.rollout_buffer.episode_batch(whole_horizon=not in_segments)
-        if in_segments:
-            batch = batch.segments(model.bptt_steps or len(batch.costs))
+        batch = model.rollout_buffer.episode_batch(whole_horizon=model.policy.time_varying)
         update_learning_rate(self.optimizer, model.lr_schedule(model._current_progress_remaining))
         model.policy.set_training_mode(True)
         self.logger.record("nuisance/action_kl", self.remove(batch))
@@ -111,22 +112,28 @@ class NuisancePhase(TDPGCallback):
         steps = [members(take(plain, t), None, states[t]) for t in range(len(states))]
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
+    def _cut(self, batch: Any, observations: Any) -> Any:
+        """Cut whole episodes with these observations into the segments that the policy learns from, if any."""
+        model: Any = self.tdpg
+        batch = batch._replace(observations=observations)
+        return batch if model.policy.time_varying else batch.segments(model.bptt_steps or len(batch.costs))
+
     def remove(self, batch: Any) -> float:
         """
         Take the gradient steps of an epoch.
 
-        :param batch: The rollouts: whole episodes, or segments of them.
+        :param batch: The rollouts: whole episodes, since a member of the nuisance lasts for one.
         :return: the divergence of the new policy's actions on fresh perturbations, in nats a step
         """
         policy, check_finite = self.tdpg.policy, self.tdpg._check_finite
         minibatches = self._minibatches(batch)
         with th.no_grad():  # the policy as it is now, for all steps
-            parts = map(batch.select, minibatches)  # one at a time: images need room
-            teachers = [actions(policy, part, part.observations) for part in parts]
+            whole = map(batch.select, minibatches)  # one at a time: images need room
+            teachers = [actions(policy, self._cut(part, part.observations)) for part in whole]
         for columns, teacher in zip(minibatches, teachers, strict=True):
             part = batch.select(columns)
-            seen = (self.perturbed(part), part.observations)
-            loss = th.stack([divergence(actions(policy, part, each), teacher, part) for each in seen]).sum()
+            seen = [self._cut(part, each) for each in (self.perturbed(part), part.observations)]
+            loss = th.stack([divergence(actions(policy, each), teacher, each) for each in seen]).sum()
             check_finite("nuisance loss", loss)
             self.optimizer.zero_grad()
             loss.backward()
@@ -134,8 +141,8 @@ class NuisancePhase(TDPGCallback):
             self.optimizer.step()
         fresh = batch.select(self._minibatches(batch)[0])
         with th.no_grad():
-            now, plain = (actions(policy, fresh, each) for each in (self.perturbed(fresh), fresh.observations))
-            return divergence(now, plain, fresh).item()
+            perturbed, plain = (self._cut(fresh, each) for each in (self.perturbed(fresh), fresh.observations))
+            return divergence(actions(policy, perturbed), actions(policy, plain), plain).item()
 
     def _minibatches(self, batch: Any) -> list[th.Tensor]:
         """Draw the columns of each gradient step: about ``BATCH_STEPS`` steps, in as few passes as possible."""

@@ -51,6 +51,10 @@ class PerturbedVecEnv(VecEnvWrapper):
         super().__init__(venv)
         family, self._seed = Family(perturbation, venv, severity, scale), seed
         self._is_plant, self._perturber = family.is_plant, family.members(venv.num_envs, seed)
+        self._depth, inner = 0, venv
+        while isinstance(inner, VecEnvWrapper):
+            self._depth += isinstance(inner, PerturbedVecEnv)
+            inner = inner.venv
         self.unperturbed: Any = None
         """The observations of the last reset or step, as they came."""
 
@@ -61,7 +65,8 @@ class PerturbedVecEnv(VecEnvWrapper):
         if env_seed is None and self._seed is None:
             env_seed = int(th.randint(2**31, ()))
         if env_seed is not None:
-            self._perturber.reseed(env_seed)
+            # A perturbation around another one must not draw the same numbers.
+            self._perturber.reseed(env_seed + (self._depth << 32))
         self._perturber.begin(np.arange(self.num_envs))
         self.reset_infos = self.unwrapped.reset_infos
         return observations if self._is_plant else self._perturber(observations, None, self._states(self.reset_infos))

@@ -219,9 +219,7 @@ class TDPGExperimentManager(ExperimentManager):
             assert isinstance(model, TDPG)
             try:
                 best = selection.restore(model)
-                print(
-                    f"the policy of epoch {best.epoch} was selected: cost {best.cost:.3g}, {best.information:.3g} nat"
-                )
+                print(f"selected the policy of {best}")
             except ValueError as e:
                 print(f"no policy was selected: {e}")
         super().save_trained_model(model)

@@ -271,6 +271,17 @@ def test_a_scene_may_redraw_components_of_the_state():
         Family(declared, env).members(1)(seen[:1])
 
 
+def test_a_perturbation_around_another_one_draws_its_own_numbers():
+    def noise(depth):
+        env = toy_vec_env(8, horizon=50, observation_space=spaces.Box(-1e6, 1e6, (20,), np.float32))
+        for _ in range(depth):
+            env = PerturbedVecEnv(env, "vector_noise", 1, scale=1.0)
+        env.seed(0)
+        return env.reset() - env.unwrapped.buf_obs[None]
+
+    assert noise(2).std() == pytest.approx(2**0.5 * noise(1).std(), rel=0.2)
+
+
 def test_without_any_seed_the_wrapper_follows_torch():
     def observations(seed):
         th.manual_seed(seed)

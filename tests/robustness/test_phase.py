@@ -7,6 +7,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_problems import assert_same_parameters, parameters, rollouts, tiny_tdpg, toy_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.robustness import Perturbation
@@ -38,7 +39,7 @@ def react_more(module):
 def known(model, batch, seen):
     """How far the actions are from those on plain observations, in nats a step."""
     with th.no_grad():
-        now, plain = (actions(model.policy, batch, each) for each in (seen, batch.observations))
+        now, plain = (actions(model.policy, batch._replace(observations=each)) for each in (seen, batch.observations))
         return divergence(now, plain, batch).item()
 
 
@@ -54,8 +55,6 @@ def test_the_phase_lowers_what_the_actions_know_of_the_nuisance(env, settings):
     env = "Lava-v0" if space is None else toy_vec_env(2, action_space=space)
     model = tiny_tdpg(env, **settings)
     batch = rollouts(model)
-    if not model.policy.time_varying:
-        batch = batch.segments(2)
     phase = phase_of(model, shifted(-1.0, 1.0), 40)
     phase.optimizer.param_groups[0]["lr"] = 1e-2
     react_more(model.policy.encoder)
@@ -67,16 +66,41 @@ def test_the_phase_lowers_what_the_actions_know_of_the_nuisance(env, settings):
     assert left < 0.7 * before
 
 
+def test_a_member_lasts_for_an_episode_also_where_the_policy_learns_from_segments():
+    env = toy_vec_env(2, horizon=60, observation_space=spaces.Box(-1, 1, (2,), np.float32))
+    model = TDPG(env=env, seed=0, device="cpu", nuisance=None, epoch_steps=240)
+    assert model.bptt_steps == 5
+    phase = phase_of(model, {"group_failure": 3}, 1)
+    shares, perturbed = [], phase.perturbed
+
+    def observed(batch):
+        seen = perturbed(batch)
+        shares.append((seen != batch.observations).any(-1).float().mean().item())
+        return seen
+
+    phase.perturbed = observed
+    model.learn(240)
+    phase.remove(model.rollout_buffer.episode_batch(whole_horizon=False))
+    assert np.mean(shares) > 0.3  # a failure begins at any step and lasts to the end
+
+
+def test_normalised_observations_are_refused():
+    space = spaces.Box(-1000, 1000, (2,), np.float32)
+    model = tiny_tdpg(VecNormalize(toy_vec_env(2, observation_space=space), norm_reward=False), nuisance=None)
+    with pytest.raises(ValueError, match="which VecNormalize has normalised"):
+        phase_of(model, {"vector_noise": 1})
+
+
 def test_on_plain_observations_the_policy_stays_as_it_was():
     model = tiny_tdpg("Lava-v0")
     batch, phase = rollouts(model), phase_of(model, shifted(2.0), 40)
     react_more(model.policy.encoder)
     with th.no_grad():
-        before, shift = actions(model.policy, batch, batch.observations), known(model, batch, batch.observations + 2.0)
+        before, shift = actions(model.policy, batch), known(model, batch, batch.observations + 2.0)
     phase.optimizer.param_groups[0]["lr"] = 1e-2
     phase.remove(batch)
     with th.no_grad():
-        moved = divergence(actions(model.policy, batch, batch.observations), before, batch)
+        moved = divergence(actions(model.policy, batch), before, batch)
     assert moved < 0.2 * shift
 
 
