@@ -225,8 +225,11 @@ def export_model(
     :param out: The file; default: beside the model, with its name.
     :param format: See :func:`export_policy`; default: by the suffix of ``out``, or ONNX.
     :return: the file
+    :raises ValueError: if there is no such model.
     """
     model = Path(model)
+    if not model.is_file():
+        raise ValueError(f"{model} is not there: give the .zip file that model.save() wrote")
     path = model.with_suffix("") if out is None else Path(out)
     statistics = statistics_beside(model)
     return export_policy(

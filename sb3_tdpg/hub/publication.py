@@ -112,8 +112,9 @@ def read_run(folder: Path) -> Publication:
         refuse_links(folder.parent / start)
         notes.append(f"The training started from the policy of another run, {start}.")
         files[f"{start}/model.zip"] = folder.parent / start / "model.zip"
-    # The policy that the run started from may be gone.
-    is_repeatable = start is None or files[f"{start}/model.zip"].exists()
+    # The policy that the run started from may be gone, and a class among the settings is a text in the file.
+    has_class = "<class '" in json.dumps(config["settings"])
+    is_repeatable = (start is None or files[f"{start}/model.zip"].exists()) and not has_class
     return Publication(
         model=folder / "model.zip",
         **{name: config[name] for name in ("env_id", "method", "seed")},

@@ -231,7 +231,7 @@ def test_bad_requests_are_told_in_one_line(tmp_path, monkeypatch, capsys):
         model.export(tmp_path / "policy.onnx")
     assert (tmp_path / "policy.onnx").read_text() == "old"
     assert main(["export", str(tmp_path / "nothing.zip")]) == 2
-    assert "nothing.zip" in capsys.readouterr().err.strip().splitlines()[-1]
+    assert "nothing.zip is not there" in capsys.readouterr().err.strip().splitlines()[-1]
 
 
 @pytest.mark.parametrize(

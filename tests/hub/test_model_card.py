@@ -185,7 +185,13 @@ def test_rows_may_have_their_own_number_of_episodes(runs, tmp_path):
     rows = [Scenario("Training", "Lava-v0"), Scenario("few", "Lava-v0", n_episodes=2)]
     config = json.loads((runs / "pg-seed0" / "config.json").read_text())
     run = Run("PG", "Lava-v0", None, 0, with_numbers(config["settings"]))
-    assert len(read_run(complete_run(run, tmp_path / "run", rows, n_eval_episodes=4)).records) == 6
+    folder = complete_run(run, tmp_path / "run", rows, n_eval_episodes=4)
+    assert len(read_run(folder).records) == 6
+    assert read_run(folder).again is not None
+    config = json.loads((folder / "config.json").read_text())
+    config["settings"]["policy_kwargs"] = dict(activation_fn="<class 'torch.nn.modules.activation.ELU'>")
+    (folder / "config.json").write_text(json.dumps(config))
+    assert read_run(folder).again is None, "a class cannot be read from the file"
 
 
 def test_records_that_are_not_of_one_policy_or_a_damaged_model_are_refused(runs, tmp_path):
