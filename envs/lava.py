@@ -74,7 +74,7 @@ class LavaEnv(POMDPEnv):
                 checks.finite(name, value)
         self.sensor_bias = None if sensor_bias is None else np.array(sensor_bias, dtype=np.float64)
         self.start_beta = None if start_beta is None else (float(start_beta[0]), float(start_beta[1]))
-        self.action_cost = checks.finite("action_cost", action_cost)
+        self.action_cost = checks.not_negative("action_cost", action_cost)
         self.lava_stage_cost = lava_stage_cost
         self.lava_terminal_cost = lava_terminal_cost
         self.state_space = spaces.Box(np.array([WALL, -np.inf]), np.array([LAVA, np.inf]), dtype=np.float64)

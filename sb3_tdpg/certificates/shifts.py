@@ -368,6 +368,8 @@ def _pomdp(model: Any, scenario: Scenario) -> POMDPEnv:
     """Make the unwrapped environment of a scenario, whose sensor can observe any state."""
     if model.get_vec_normalize_env() is not None:
         raise ValueError("the model's environment normalises observations (VecNormalize), which is not supported here")
+    if scenario.sensor is not None:
+        raise ValueError(f"scenario {scenario.name!r} changes its sensor, which a certificate cannot: declare a Shift")
     env = scenario_env(scenario, model, n_episodes=1, n_envs=1).unwrapped
     if not isinstance(env, BatchedVecEnv):
         raise ValueError(f"{scenario.env_id} is not an environment of this plugin: a certificate needs a POMDPEnv")

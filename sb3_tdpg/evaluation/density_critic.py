@@ -154,13 +154,15 @@ class Regression:
         self._coefficients = vt.T @ (shrinkage * (u.T @ centred) / s[:, None])
 
         linear = centred - self._inputs @ self._coefficients
+        # The residuals of the fit are smaller than those of episodes that it has not seen.
+        spare = np.maximum(1 - 1 / n - np.square(u) @ shrinkage, 1e-12)  # (n, Y)
         square = self._distances(self._inputs)
         self._widths = np.square(LENGTHS) * (np.median(square) or 1.0)
         self._weights = np.zeros((len(LENGTHS), *targets.shape))  # at most one kernel for each target
         for i, width in enumerate(self._widths):
             values, vectors = np.linalg.eigh(np.exp(-square / width))
             values = np.maximum(values, 1e-12)
-            shrinkage, residuals = _choose_ridge(vectors, values, linear, otherwise=left)
+            shrinkage, residuals = _choose_ridge(vectors, values, linear, otherwise=left, spare_before=spare)
             better = np.any(shrinkage > 0, axis=0)
             self._weights[:, :, better] = 0
             self._weights[i] += vectors @ (shrinkage * (vectors.T @ linear) / values[:, None])
@@ -186,14 +188,21 @@ class Regression:
 
 
 def _choose_ridge(
-    basis: np.ndarray, values: np.ndarray, targets: np.ndarray, otherwise: np.ndarray, leverage: float = 0.0
+    basis: np.ndarray,
+    values: np.ndarray,
+    targets: np.ndarray,
+    otherwise: np.ndarray,
+    leverage: float = 0.0,
+    spare_before: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     Choose a ridge for each target by the leave-one-out error, which has a closed form.
 
     :param basis: Orthonormal columns ``(n, R)``, with their squared singular values ``values``, ``(R,)``.
     :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
-    :param leverage: Leverage of each episode in the regression whose residuals the targets are.
+    :param leverage: Leverage of each episode in the fit of the mean that the targets are distances from.
+    :param spare_before: 1 less the leverage of each episode in the regression whose residuals are the targets, as
+        ``(n, Y)``.
     :return: the shrinkage factors of the projections, ``(R, Y)``, and the leave-one-out residuals, ``(n, Y)``
     """
     n = len(targets)
@@ -205,7 +214,7 @@ def _choose_ridge(
         complement = ridge * n / (values + ridge * n)  # (R,)
         left = beyond + basis @ (complement[:, None] * projections)
         choices.append(1 - complement)
-        residuals.append(left / (spare + leverages @ complement)[:, None])
+        residuals.append(left / (spare + leverages @ complement)[:, None] / spare_before)
     best = np.argmin([np.square(r).sum(axis=0) for r in residuals], axis=0)  # (Y,)
     columns = np.arange(targets.shape[1])
     return np.stack(choices)[best].T, np.stack(residuals)[best, :, columns].T

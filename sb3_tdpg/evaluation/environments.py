@@ -8,7 +8,13 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecNormalize,
+    VecTransposeImage,
+    is_vecenv_wrapped,
+)
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
@@ -45,6 +51,8 @@ def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
 
 def stacked_for(model: Any, env: VecEnv) -> VecEnv:
     """Stack as many observations as a model was trained on at once (``VecFrameStack``)."""
+    if (trained := model.get_env()) is not None and not is_vecenv_wrapped(trained, VecFrameStack):
+        return env
     own, single = model.observation_space, env.observation_space
     if type(own) is type(single) and isinstance(own, (spaces.Box, spaces.Dict)):
         n_stack, rest = divmod(spaces.flatdim(own), spaces.flatdim(single))

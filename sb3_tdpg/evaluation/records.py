@@ -152,7 +152,10 @@ def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:
     """Flatten the numbers of the last info of an episode."""
     columns: dict[str, Any] = {}
     for name, value in info.items():
-        array = np.asarray(value)
+        try:
+            array = np.asarray(value)
+        except ValueError:  # a list of lists of different lengths
+            continue
         if name in _BOOKKEEPING or array.dtype.kind not in "biuf" or array.size > MAX_FINAL_COMPONENTS:
             continue
         names = [f"final_{name}_{i}" for i in range(array.size)] if array.ndim else [f"final_{name}"]

@@ -76,6 +76,8 @@ def rollout(
     with contextlib.nullcontext() if seeds is None else isolated_randomness(seeds.policy, model):
         if seeds is not None:
             env.seed(seeds.env)
+            if getattr(model, "use_sde", False):  # SB3 draws it at the start of a training only
+                model.policy.reset_noise(n_envs)
         observations: Any = env.reset()
         if problem is not None:
             states = problem.initial_states(env, observations)

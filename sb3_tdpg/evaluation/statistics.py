@@ -4,7 +4,7 @@ Statistics over training seeds for few runs, computed by rliable.
 They follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ def aggregate_seeds(
         (point,), (low,), (high,) = interquartile_means(means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed)
         seeds = dict(n_seeds=len(means), iqm=point, low=low, high=high, min=means.min(), max=means.max())
         how = {name: one_or_all(group[name]) for name in ("seed", "deterministic")}
-        more = dict(episode_std=_interquartile_mean(stds), level=level, n=group["n"].iloc[0])
+        more = dict(episode_std=_interquartile_mean(stds), level=level, n=one_or_all(group["n"]))
         rows.append(dict(model=model, scenario=scenario, **seeds, **more, **how))
     return pd.DataFrame(rows)
 
@@ -57,7 +57,7 @@ def probability_of_improvement(
     :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the probability, 0.5 for no difference, and the ends of its interval
     """
-    means = _seed_means(records_by_seed)
+    means = _seed_means(records_by_seed, (model, control))
     costs, of_control = (means[label].to_numpy()[:, None] for label in (model, control))
     return tuple(estimate.item() for estimate in probabilities_of_improvement(costs, of_control, **bootstrap))
 
@@ -72,7 +72,7 @@ def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, *
     :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
     """
-    means = _seed_means(records_by_seed)
+    means = _seed_means(records_by_seed, (model, control))
     seeds, of_control = (sorted(means[label].index) for label in (model, control))
     if seeds != of_control:
         raise ValueError(f"the seeds of {model!r} are {seeds}, those of {control!r} {of_control}: they must match")
@@ -116,8 +116,14 @@ def probabilities_of_improvement(
     return _bootstrap(share, costs, of_control, **bootstrap)
 
 
-def _seed_means(records_by_seed: pd.DataFrame) -> pd.Series:
-    return records_by_seed.groupby(["model", "train_seed"])["cost"].mean()
+def _seed_means(records_by_seed: pd.DataFrame, models: Sequence[str]) -> pd.Series:
+    """Average the mean costs of the scenarios, which must be the same for all seeds of the methods."""
+    shown = records_by_seed[records_by_seed["model"].isin(models)]
+    means = shown.groupby(["model", "train_seed", "scenario"])["cost"].mean().unstack()
+    if means.isna().any(axis=None):
+        missing = [index for index, row in means.iterrows() if row.isna().any()]
+        raise ValueError(f"these methods and seeds lack a scenario that others have: {missing}")
+    return means.mean(axis=1)
 
 
 def _bootstrap(

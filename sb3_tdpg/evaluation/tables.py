@@ -20,7 +20,9 @@ def summary_table(records: pd.DataFrame) -> pd.DataFrame:
     """
     keys = [*(["train_seed"] if "train_seed" in records.columns else []), "model", "scenario"]
     require_columns(records, [*keys, "cost", "seed", "deterministic"])
-    groups = records.groupby(keys, sort=False)
+    if n_missing := int(records["cost"].isna().sum()):
+        raise ValueError(f"{n_missing} of {len(records)} episodes cost NaN, and a mean over the others would hide them")
+    groups = records.groupby(keys, sort=False, dropna=False)
     cost = groups["cost"]
     columns = dict(n=cost.size(), mean=cost.mean(), std=cost.std(), sem=cost.sem(), median=cost.median())
     if "failure" in records.columns:

@@ -7,6 +7,7 @@ Dimension key: T time steps, N episodes, Z TRVs.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.threads import threads
@@ -100,7 +101,7 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
     checks = (
         _shuffled_pairs(batch, steps, normal_quantile(miss / len(LOWER_BOUNDS)), seed),
         _data_processing(batch, interval, steps, normal_quantile(miss), seed),
-        _encoder_density(batch, steps, normal_quantile(miss / 2)),  # either sign counts
+        _encoder_density(batch, steps, miss / 2),  # either sign counts
     )
     lower = np.maximum(*(interval.estimates[name][steps] for name in LOWER_BOUNDS))
     capped = steps[lower >= NEAR_THE_CAP * np.log(interval.n_episodes[steps])]
@@ -137,11 +138,13 @@ def _data_processing(
     return _worst("data processing", excess[steps], quantile * errors[steps], meaning)
 
 
-def _encoder_density(batch: InformationBatch, steps: np.ndarray, quantile: float) -> TrustCheck:
+def _encoder_density(batch: InformationBatch, steps: np.ndarray, miss: float) -> TrustCheck:
     noises = [((at_t.trvs - at_t.means) / at_t.stds).double() for at_t in map(batch.at, steps.tolist())]
-    excess = np.array([abs(noise.square().mean().item() - 1) for noise in noises])
-    threshold = quantile * np.sqrt(2 / np.array([noise.numel() for noise in noises]))  # squares have variance 2
-    return _worst("encoder density", excess, threshold, "distance of the mean square of the noise from 1")
+    excess = np.array([noise.square().mean().item() - 1 for noise in noises])
+    sizes = np.array([noise.numel() for noise in noises])
+    too_small, too_large = 1 - chi2.ppf(miss, sizes) / sizes, chi2.isf(miss, sizes) / sizes - 1
+    threshold = np.where(excess > 0, too_large, too_small)
+    return _worst("encoder density", np.abs(excess), threshold, "distance of the mean square of the noise from 1")
 
 
 def _worst(name: str, values: np.ndarray, thresholds: np.ndarray, meaning: str) -> TrustCheck:

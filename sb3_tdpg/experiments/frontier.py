@@ -119,7 +119,7 @@ def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str,
     own: dict[str, Any] = dict(beta=math.inf, cost_limit=None)
     if label == OPEN_LOOP:
         wrappers = {**(load_hyperparams(block) if block else {}), **shared}.get("vec_env_wrapper", [])
-        own.update(nuisance=None, vec_env_wrapper=[f"{BlindVecEnv.__module__}.{BlindVecEnv.__name__}", *wrappers])
+        own.update(nuisance=None, vec_env_wrapper=[*wrappers, f"{BlindVecEnv.__module__}.{BlindVecEnv.__name__}"])
     elif label != NO_PENALTY:
         own.update(beta="auto", cost_limit=label.replace(" ", ""))
     run = Run(label.replace("%", "per cent"), env_id, block, seed, {**shared, **own})
@@ -141,7 +141,7 @@ def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
     runs = runs.assign(nats=runs["information"].where(runs["label"] != OPEN_LOOP, 0.0))
     of_seed = runs[runs["label"] == NO_PENALTY].set_index("seed")
     runs["kept"] = runs["nats"] / of_seed["nats"].clip(lower=TIE).loc[runs["seed"]].to_numpy()
-    lowest = of_seed["cost"].mean()
+    lowest = interquartile_means(of_seed[["cost"]].to_numpy())[0].item()
     rows = []
     for label, group in runs.groupby("label", sort=False):
         names = ("cost", "nats", "kept")

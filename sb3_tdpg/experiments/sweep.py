@@ -121,7 +121,7 @@ def finished_row(task: Task, n_eval_episodes: int, labels: Mapping[str, Any]) ->
     records = pd.read_csv(folder / "episodes.csv")
     costs = records.groupby("scenario", sort=False)["cost"].agg(["mean", "std"])
     model = TDPG.load(folder / "model.zip", device="cpu")
-    training = scenarios[0].with_kwargs(**run.settings.get("env_kwargs", {}))
+    training = scenarios[0].with_kwargs(**(run.settings.get("env_kwargs") or {}))
     n_episodes = min(N_INFORMATION, max(n_eval_episodes, model.policy.trv_dim + 2))
     upper, lower = information_bounds(rollout_information(model, training, n_episodes))
     row: dict[str, Any] = dict(

@@ -40,8 +40,13 @@ class StopAtCost(TDPGCallback):
         self.cost = cost
         self._costs: list[float] = []
 
+    def _on_training_start(self) -> None:
+        resumes = self.tdpg.num_timesteps > 0
+        self._costs = vars(self.tdpg).get("recent_costs", []) if resumes else []
+
     def _on_rollout_end(self) -> None:
         self._costs = [*self._costs, float(self.tdpg.rollout_buffer.episode_costs.mean())][-self.WINDOW :]
+        vars(self.tdpg)["recent_costs"] = self._costs  # saved with a checkpoint
 
     def _on_step(self) -> bool:
         return len(self._costs) < self.WINDOW or sum(self._costs) / self.WINDOW > self.cost

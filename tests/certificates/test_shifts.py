@@ -234,6 +234,8 @@ def test_bad_input_is_told(model):
     normalized = tiny_tdpg(VecNormalize(DummyVecEnv([LavaEnv]), norm_reward=False), n_episodes=2)
     with pytest.raises(ValueError, match="VecNormalize"):
         TrainingEpisodes(normalized, TRAINING, **SMALL)
+    with pytest.raises(ValueError, match="changes its sensor"):
+        TrainingEpisodes(model, Scenario("x", "Lava-v0", sensor=lambda env: env), **SMALL)
     toy = tiny_tdpg(ToyEnv(), n_episodes=2)
     with pytest.raises(ValueError, match="CartPole-v1 is not an environment of this plugin"):
         TrainingEpisodes(toy, Scenario("x", "CartPole-v1"), **SMALL)

@@ -14,6 +14,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
@@ -21,6 +22,7 @@ from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.lava import GOAL
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios, rollout_states, summary_table, training_curves
+from sb3_tdpg.evaluation.records import _final_columns
 
 TWO_ROWS = (LAVA[0], LAVA[-1])
 
@@ -169,6 +171,28 @@ def test_a_recurrent_ppo_keeps_its_memory_and_is_evaluated_reproducibly():
     model = RecurrentPPO("MlpLstmPolicy", env, n_steps=5, batch_size=20, seed=0, device="cpu")
     frames = [evaluate_scenarios(model, LAVA[:1], 6) for _ in range(2)]
     pd.testing.assert_frame_equal(*frames, check_exact=True)
+
+
+@pytest.mark.filterwarnings("ignore:You are trying to run PPO")
+def test_the_noise_of_gsde_belongs_to_the_seed(tmp_path):
+    PPO("MlpPolicy", "Pendulum-v1", use_sde=True, n_steps=20, batch_size=20, seed=0, device="cpu").save(tmp_path / "m")
+    frames = [
+        evaluate_scenarios(PPO.load(tmp_path / "m", device="cpu"), [Scenario("swing", "Pendulum-v1")], 3, seed=seed)
+        for seed in (0, 0, 1)
+    ]
+    pd.testing.assert_frame_equal(*frames[:2], check_exact=True)
+    assert (frames[0]["cost"] != frames[2]["cost"]).all()
+
+
+def test_a_model_that_was_never_stacked_is_not_stacked_for_a_smaller_space():
+    env = make_vec_env("CartPole-v1", 2)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, device="cpu")
+    with pytest.raises(ValueError, match="observation_space"):
+        evaluate_scenarios(model, LAVA[:1], 2)
+
+
+def test_what_is_no_array_in_the_last_info_is_left_out():
+    assert _final_columns({"contacts": [[1, 2], [3]], "x": 2.0}) == {"final_x": 2.0}
 
 
 def test_any_environment_works_also_where_episodes_differ_in_length_and_the_model_explores():

@@ -124,6 +124,18 @@ def test_the_leave_one_out_residuals_are_those_of_fits_without_the_episode(ridge
         assert residuals[i] == pytest.approx(targets[i] - kernel[i, others] @ weights, rel=1e-4)
 
 
+def test_the_residuals_of_many_inputs_are_those_of_episodes_that_the_fit_has_not_seen():
+    rng = np.random.default_rng(0)
+    shares, fresh = [], []
+    for _ in range(20):
+        inputs, new = rng.standard_normal((2, 40, 16))
+        targets, wanted = (x[:, :1] + rng.standard_normal((40, 1)) for x in (inputs, new))
+        fit = Regression(inputs, targets)
+        shares.append(np.square(fit.residuals).mean())
+        fresh.append(np.square(wanted - fit.predict(new)).mean())
+    assert np.mean(shares) == pytest.approx(np.mean(fresh), rel=0.1)
+
+
 def test_the_regression_finds_no_more_in_noise_than_there_is():
     rng = np.random.default_rng(0)
     inputs, noise = rng.standard_normal((200, 3)), rng.standard_normal((200, 4))

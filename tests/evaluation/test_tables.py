@@ -100,6 +100,19 @@ def test_a_paired_difference_is_taken_seed_by_seed():
         paired_difference(records[(records["model"] == "A") | (records["train_seed"] < 2)], "A", "B")
 
 
+def test_what_is_missing_does_not_change_a_comparison_in_silence():
+    by_model = {"A": {"x": [1.0], "y": [10.0]}, "B": {"x": [2.0], "y": [11.0]}}
+    records = of_seeds(2, lambda i: by_model)
+    is_left = (records["model"] == "B") & (records["scenario"] == "y") & (records["train_seed"] == 1)
+    for compare in (paired_difference, probability_of_improvement):
+        with pytest.raises(ValueError, match=r"lack a scenario that others have: \[\('B', 1\)\]"):
+            compare(records[~is_left], "B", "A")
+    with pytest.raises(ValueError, match="1 of 8 episodes cost NaN"):
+        summary_table(records.assign(cost=records["cost"].where(~is_left)))
+    untrained = some_records({"C": {"x": [1.0]}})
+    assert set(summary_table(pd.concat([records, untrained]))["model"]) == {"A", "B", "C"}
+
+
 def test_scenarios_of_the_same_seeds_do_not_narrow_the_interval():
     """Seven copies of a scenario tell no more than one."""
     rng = np.random.default_rng(0)

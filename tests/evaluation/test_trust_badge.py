@@ -9,7 +9,8 @@ from information_problems import channel, gaussian_batch, generator, random_batc
 
 from sb3_tdpg.evaluation import information_interval
 from sb3_tdpg.evaluation import interval as interval_module
-from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
+from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, _encoder_density, trust_checks
+from sb3_tdpg.information.base import InformationBatch
 
 
 def test_a_sound_batch_passes_every_check():
@@ -26,6 +27,17 @@ def test_trvs_without_noise_fail_the_check_of_the_density():
     badge = trust_checks(batch._replace(trvs=batch.means))
     assert not badge.passed
     assert "encoder density FAILED" in str(badge)
+
+
+def test_few_episodes_of_sound_noise_raise_no_false_alarm():
+    rng = np.random.default_rng(0)
+    alarms = 0
+    for _ in range(100):
+        noise = th.as_tensor(rng.standard_normal((100, 20, 1)), dtype=th.float32)
+        means, stds = th.zeros_like(noise), th.ones_like(noise)
+        batch = InformationBatch(means, noise, means, stds, None)
+        alarms += not _encoder_density(batch, np.arange(100), 0.01 / 200).passed
+    assert alarms <= 5  # 1 is expected; with a Gaussian quantile 10
 
 
 def test_a_lower_bound_that_finds_information_where_there_is_none_fails(monkeypatch):

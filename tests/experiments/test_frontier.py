@@ -19,7 +19,8 @@ pytest.importorskip("rliable")
 from sb3_tdpg import TDPG
 from sb3_tdpg.cli import main
 from sb3_tdpg.experiments.blind import BlindVecEnv
-from sb3_tdpg.experiments.frontier import NO_PENALTY, OPEN_LOOP, frontier, frontier_table, knee, verdict
+from sb3_tdpg.experiments.frontier import NO_PENALTY, OPEN_LOOP, _task, frontier, frontier_table, knee, verdict
+from sb3_tdpg.experiments.training import take_env
 from sb3_tdpg.vec_env import make_episodes_env
 
 COMMAND = ["frontier", "--env", "Lava-v0", "--shares", "90", "--seeds", "2", "--jobs", "1"]
@@ -158,6 +159,20 @@ def table_of(first_cost=110.0, **seeds):
 
 
 FREE, BLIND = [(10.0, 4.0), (10.0, 8.0)], [(14.0, 0.5), (12.0, 0.1)]
+
+
+def test_without_a_penalty_all_of_the_improvement_is_kept_however_the_seeds_scatter():
+    free = [(cost, 4.0) for cost in (1.0, 1.0, 1.0, 1.0, 9.0)]
+    table = table_of(10.0, no_penalty=free, s95=[(2.5, 2.0)] * 5, open_loop=free).set_index("label")
+    assert table["improvement"].tolist()[:2] == pytest.approx([1.0, 7.5 / 9.0])
+
+
+def test_the_open_loop_sees_an_unchanged_clock(tmp_path):
+    noisy = {"sb3_tdpg.robustness.PerturbedVecEnv": dict(perturbation="vector_noise", scale=[1.0, 1.0])}
+    shared = dict(policy="TRVPolicy", vec_env_wrapper=[noisy], n_episodes=4)
+    run, *_ = _task("Lava-v0", None, shared, OPEN_LOOP, 0, tmp_path)
+    settings = dict(run.settings)
+    np.testing.assert_array_equal(take_env("Lava-v0", settings).reset(), np.ones((4, 8)))
 
 
 def test_the_table_pairs_the_seeds_and_a_blind_policy_has_no_information():

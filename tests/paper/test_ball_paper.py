@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from small_problems import complete_runs_here, tiny_tdpg
+from small_problems import complete_runs_here, tiny_tdpg, train_epochs
 
 from sb3_tdpg.cli import main
 from sb3_tdpg.experiments.runs import Run
@@ -71,6 +71,14 @@ def test_a_training_stops_once_five_epochs_cost_little_enough():
     model = tiny_tdpg(beta=np.inf)
     model.learn(7 * 20 * 5, ball_paper.StopAtCost(-1.0))
     assert model.epoch == 7
+
+
+def test_a_resumed_training_remembers_the_costs_of_its_last_epochs():
+    model = tiny_tdpg(beta=np.inf)
+    train_epochs(model, 4, callback=ball_paper.StopAtCost(1e9))
+    again = ball_paper.StopAtCost(1e9)
+    train_epochs(model, 4, callback=again, reset_num_timesteps=False)
+    assert model.epoch == 5
 
 
 def test_the_methods_have_the_papers_settings():
