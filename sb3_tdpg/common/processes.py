@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
@@ -46,8 +47,11 @@ def process_pool(
     with _Pool(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
         try:
             yield pool
-        except BaseException:
+        except BaseException as e:
             writing.close()
+            if isinstance(e, BrokenProcessPool):
+                advice = "the same command goes on; with fewer --jobs it needs less memory"
+                raise OSError(f"a worker process was killed, perhaps because memory was short: {advice}") from e
             raise
         pool.shutdown()
         writing.close()

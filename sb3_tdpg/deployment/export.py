@@ -55,6 +55,11 @@ class ExportedStep(nn.Module):
         if normalization is not None and normalization.norm_obs:
             statistics = cast(Any, normalization.obs_rms)
             for key, rms in statistics.items() if isinstance(statistics, dict) else [("", statistics)]:
+                if rms.mean.shape != (shape := cast(Any, space)[key].shape if self.keys else space.shape):
+                    raise ValueError(
+                        f"observations {rms.mean.shape} were normalised before they were stacked to {shape}, which a "
+                        "file cannot repeat: train with VecNormalize around VecFrameStack"
+                    )
                 std = np.sqrt(rms.var + normalization.epsilon)
                 self.scales[key] = th.as_tensor(rms.mean), th.as_tensor(std)
         action_space = policy.action_space

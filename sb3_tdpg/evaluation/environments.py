@@ -38,13 +38,16 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
 def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
     """Wrap a new environment as an SB3 model needs it; see :func:`scenario_env`."""
     if (normalize := model.get_vec_normalize_env()) is not None:
+        if spaces.flatdim(normalize.observation_space) == spaces.flatdim(model.observation_space):
+            env = stacked_for(model, env)  # below the normalisation
         normalize = copy.copy(normalize)  # without an environment
         normalize.set_venv(env)
         normalize.training = normalize.norm_reward = False
         env = normalize
     env = stacked_for(model, env)
     space = env.observation_space
-    if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
+    parts = space.values() if isinstance(space, spaces.Dict) else [space]
+    if any(is_image_space(p) and not is_image_space_channels_first(p) for p in parts if isinstance(p, spaces.Box)):
         env = VecTransposeImage(env)  # as SB3 wraps the environment that it trains on
     return env
 

@@ -64,7 +64,10 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
             raise ValueError(reason) from e
         raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
     if found := statistics_beside(path):
-        env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
+        try:
+            env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
+        except Exception as e:
+            raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
         model.set_env(stacked_for(model, load_statistics(found, env)))
     return model
 

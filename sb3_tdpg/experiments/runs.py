@@ -5,7 +5,7 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,13 +96,19 @@ class Run:
         """
         path = folder / "time.json"
         before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
-        wall, cpu = time.perf_counter(), time.process_time()
-        trained = self._train(attempt, folder, progress_bar)
-        wall, cpu = before["wall_s"] + time.perf_counter() - wall, before["cpu_s"] + time.process_time() - cpu
-        write_atomically(path, json.dumps(dict(wall_s=round(wall, 3), cpu_s=round(cpu, 3))))
+        wall, cpu = before["wall_s"] - time.perf_counter(), before["cpu_s"] - time.process_time()
+
+        def keep_times() -> None:
+            times = dict(wall_s=round(wall + time.perf_counter(), 3), cpu_s=round(cpu + time.process_time(), 3))
+            write_atomically(path, json.dumps(times))
+
+        trained = self._train(attempt, folder, progress_bar, keep_times)
+        keep_times()
         return trained
 
-    def _train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+    def _train(
+        self, attempt: int, folder: Path, progress_bar: bool, keep_times: Callable[[], None]
+    ) -> tuple[BaseAlgorithm, bool]:
         result, checkpoint = folder / "model.zip", folder / "checkpoint.zip"
         if result.exists():
             return TDPG.load(result, device="cpu"), (folder / "selected.json").exists()
@@ -123,7 +129,7 @@ class Run:
         model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), suffix)]))
         if selection is not None:
             selection.save_path = folder / "selected.zip"
-        callbacks = [*training.callbacks, TrainingCheckpointCallback(checkpoint, save_freq)]
+        callbacks = [*training.callbacks, _TimedCheckpoint(checkpoint, save_freq, keep_times)]
         model.learn(n_timesteps, callbacks, reset_num_timesteps=not resumes, progress_bar=progress_bar)
         model.logger.close()
         if selection is not None and selection.best is not None:
@@ -145,7 +151,9 @@ class SB3Run(Run):
         """The settings that make this run."""
         return {**super().config, "algo": self.algo}
 
-    def _train(self, attempt: int, folder: Path, progress_bar: bool) -> tuple[BaseAlgorithm, bool]:
+    def _train(
+        self, attempt: int, folder: Path, progress_bar: bool, keep_times: Callable[[], None]
+    ) -> tuple[BaseAlgorithm, bool]:
         algorithm: Any = {"ppo": PPO, "ppo_lstm": RecurrentPPO}[self.algo]
         path = folder / "model.zip"
         if path.exists():
@@ -161,6 +169,19 @@ class SB3Run(Run):
         with replaced_atomically(path) as partial:
             model.save(partial)
         return model, False
+
+
+class _TimedCheckpoint(TrainingCheckpointCallback):
+    """Also keep the time until each checkpoint, which a killed training has taken."""
+
+    def __init__(self, save_path: Path, save_freq: int, keep_times: Callable[[], None]) -> None:
+        super().__init__(save_path, save_freq)
+        self.keep_times = keep_times
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        if self.tdpg.epoch % self.save_freq == 0:
+            self.keep_times()
 
 
 Task = tuple[Run, Path, Sequence[Scenario]]

@@ -80,7 +80,7 @@ class _Database(RDBStorage):
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
         # Optuna would wait forever for a worker that has died before its first heartbeat.
-        early = [t._trial_id for t in _silent_trials(self, study_id) if STARTED not in t.user_attrs]
+        early = [t._trial_id for t in _silent_trials(self, study_id) if t.user_attrs.get(STARTED) != t.number]
         return [*super()._get_stale_trial_ids(study_id), *early]
 
 
@@ -217,20 +217,24 @@ def work(
     if n_trials is not None and n_trials < 1:
         raise ValueError(f"n_trials={n_trials} must be at least 1")
     number: int | None = None  # of the trial that this worker runs
+    is_interrupted = False
 
     def attempt(trial: optuna.Trial) -> float | Sequence[float]:
-        nonlocal number
+        nonlocal number, is_interrupted
         if n_trials is None:
             job, earlier = trial.user_attrs.get(JOB), study.get_trials(deepcopy=False)[: trial.number]
             if job is None or any(t.user_attrs.get(JOB) == job and t.state != TrialState.FAIL for t in earlier):
                 return [float("nan")] * len(study.directions)  # for Optuna, the trial has failed
         number = trial.number
-        trial.set_user_attr(STARTED, os.getpid())
+        trial.set_user_attr(STARTED, number)  # a trial that is run again inherits the attribute
         try:
             values = objective(trial)
             if np.isnan(values).any():
                 raise ValueError(f"the result is {values}")
             return values
+        except KeyboardInterrupt:  # Optuna forgets it where it cannot tell the state of the trial
+            is_interrupted = True
+            raise
         except (TrialPruned, ValueError) as e:
             trial.set_user_attr(REASON, _one_line(e))
             raise TrialPruned(_one_line(e)) from e
@@ -259,16 +263,21 @@ def work(
             else:
                 return
         except (Exception, KeyboardInterrupt) as e:
+            is_interrupted |= isinstance(e, KeyboardInterrupt)
             if outage := _outage_in(e):
                 report(f"the storage does not answer ({_one_line(outage)}): waiting for it")
             trials = _trials_when_answered(study)
             if any(number in trial.system_attrs.get("retry_history", ()) for trial in trials):
                 report(f"trial {number} was taken over by another worker: its result is dropped")
+                if is_interrupted:
+                    raise KeyboardInterrupt from e
                 continue
             if number is not None and trials[number].state == TrialState.FAIL:
                 # A trial may be interrupted any number of times.
-                max_retries = None if outage or isinstance(e, KeyboardInterrupt) else MAX_RETRIES
+                max_retries = None if outage or is_interrupted else MAX_RETRIES
                 RetryHeartbeatStaleTrialCallback(max_retries)(study, trials[number])
+            if is_interrupted:
+                raise KeyboardInterrupt from e
             if not outage:
                 raise
 

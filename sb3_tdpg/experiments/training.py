@@ -55,6 +55,7 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
         env_id,
         settings.pop("n_envs", None),
         n_episodes=settings.get("n_episodes"),
+        epoch_steps=settings.get("epoch_steps"),
         env_kwargs=settings.pop("env_kwargs", {}),
         use_processes=False,  # runs are made side by side in processes of their own
     )

@@ -14,6 +14,7 @@ import pandas as pd
 import yaml
 from pandas.errors import EmptyDataError
 from stable_baselines3.common.monitor import get_monitor_files, load_results
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
 from sb3_tdpg.callbacks import Candidate
 from sb3_tdpg.common.provenance import as_typed, jsonable, with_numbers
@@ -168,11 +169,19 @@ def read_zoo_folder(
     args, settings = (_read_plain(inner / name) for name in ("args.yml", "config.yml"))
     if missing := {"env", "seed"} - set(args):
         raise ValueError(f"{inner / 'args.yml'} lacks {', '.join(sorted(missing))}: give a folder that rl-zoo3 wrote")
+    if wrapped := [name for name in ("env_wrapper", "vec_env_wrapper") if settings.get(name)]:
+        raise ValueError(
+            f"{folder} was trained with {' and '.join(wrapped)}, and the evaluation for the card knows no wrappers: "
+            "evaluate it yourself, and give write_model_card a Publication"
+        )
     env_kwargs = settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
     say_what_is_trusted(folder)
-    env_id, env = str(args["env"]), None
+    env_id = str(args["env"])
+    env: VecEnv | None = None
     if (inner / "vecnormalize.pkl").exists():
         env = load_statistics(inner / "vecnormalize.pkl", make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
+        if settings.get("frame_stack"):
+            env = VecFrameStack(env, settings["frame_stack"])
     model = TDPG.load(model_path, env=env, device="cpu")
     rows = PAPER_ROWS.get(env_id, [Scenario("Training", env_id)]) if scenarios is None else scenarios
     options: Any = dict(seed=seed, env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))

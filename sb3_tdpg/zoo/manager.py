@@ -1,11 +1,14 @@
 """The experiment manager of rl-zoo3, extended for the environments and the algorithm of this plugin."""
 
+import copy
 import inspect
+import json
 import os
 import re
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -13,17 +16,21 @@ from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import rl_zoo3.train
+import torch as th
 import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from sb3_tdpg import hyperparams as yaml_files
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
-from sb3_tdpg.common.provenance import write_run_config
+from sb3_tdpg.checks import schedule_of
+from sb3_tdpg.common.provenance import differences, jsonable, write_run_config
 from sb3_tdpg.common.trust import check_plain
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import batched_class, largest_divisor, make_episodes_env
@@ -71,8 +78,9 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
             raise ValueError(f"{where} has {key}: {block[key]!r}, which must be a number of at least 1")
     if not isinstance(block.get("callback", []), (str, list, dict)):
         raise ValueError(f"{where} has callback: {block['callback']!r}, which must be a class or a list of classes")
-    if "seed" in block:
-        raise ValueError(f"{where} has seed: {block['seed']!r}: give --seed on the command line")
+    for key in ("seed", "device", "verbose"):
+        if key in block:
+            raise ValueError(f"{where} has {key}: {block[key]!r}: give --{key} on the command line")
     if "n_timesteps" not in block:
         raise ValueError(f"{where} has no n_timesteps, the length of training in environment steps: add it")
 
@@ -113,8 +121,11 @@ class TDPGExperimentManager(ExperimentManager):
         try:
             return super().setup_experiment()
         except BaseException:
-            if self.has_claimed or not was_there:
+            if self.has_claimed:
                 shutil.rmtree(self.save_path, ignore_errors=True)
+            elif not was_there:  # another process may have begun there meanwhile
+                with suppress(OSError):
+                    os.rmdir(self.save_path)
             raise
 
     def create_log_folder(self) -> None:
@@ -142,26 +153,39 @@ class TDPGExperimentManager(ExperimentManager):
             ) from e
         finally:
             self.env_name = env_name
+        saved = copy.deepcopy(saved)  # the zoo adds gamma to normalize
         check_block(hyperparams, self.algo, f"block {block} of {self.config}")
         if self.resume is not None:
+            trained = json.loads(Path(self.resume, RECORD).read_text()).get("hyperparams", saved)
+            if changed := differences(*map(_without_addresses, (trained, saved))):
+                raise ValueError(f"{self.resume} was trained with other settings than {self.config} has now, {changed}")
             for key in EVALUATED & set(hyperparams):
                 if isinstance(text := hyperparams[key], str):
                     check_plain(text, f"{self.resume} was trained with {key}:")
         return hyperparams, saved
 
+    def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
+        if self.algo != "tdpg":
+            return super()._preprocess_schedules(hyperparams)
+        # Not the zoo's class, without which the model could not be loaded; it also takes no end other than 0.
+        names = {"learning_rate", "clip_range"} & set(hyperparams)
+        return {**hyperparams, **{name: schedule_of(name, hyperparams[name]) for name in names}}
+
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if self.algo == "tdpg" and "n_envs" not in hyperparams:
             # The keywords of the command line replace those of the block.
             env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs")
-            length = {name: hyperparams.get(name) for name in ("n_episodes", "epoch_steps")}
-            env = self._make_env(env_kwargs, **length, use_processes=False)
-            hyperparams["n_envs"] = env.num_envs if self.is_batch else largest_divisor(env.num_envs)
-            env.close()
+            hyperparams["n_envs"] = self._default_n_envs(env_kwargs, hyperparams)
         processed, wrap, *others = super()._preprocess_hyperparams(hyperparams)
         self.env_wrapper = None if wrap is None else lambda env: _TaskHorizon(wrap(env), env)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         return processed, self.env_wrapper, *others
+
+    def _default_n_envs(self, env_kwargs: dict[str, Any] | None, settings: Mapping[str, Any]) -> int:
+        length = {name: settings.get(name) for name in ("n_episodes", "epoch_steps")}
+        with closing(self._make_env(env_kwargs, **length, use_processes=False)) as env:
+            return env.num_envs if self.is_batch else largest_divisor(env.num_envs)
 
     def _make_env(self, env_kwargs: dict[str, Any] | None, **kwargs: Any) -> VecEnv:
         try:
@@ -175,6 +199,11 @@ class TDPGExperimentManager(ExperimentManager):
             is_logged = not (eval_env or no_log or self.optimize_hyperparameters)
             env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
             self.vec_env_class = partial(self._make_batch, env_kwargs, is_logged)  # type: ignore[assignment]
+        elif self.resume is not None and not (eval_env or no_log):
+            # Monitor would begin its files anew: those of the first start get higher numbers.
+            logs = {int(path.name.partition(".")[0]): path for path in Path(self.save_path).glob("*.monitor.csv")}
+            for number, path in sorted(logs.items(), reverse=True):
+                path.rename(path.with_name(f"{number + n_envs}.monitor.csv"))
         return super().create_envs(n_envs, eval_env, no_log)
 
     def _make_batch(self, env_kwargs: dict[str, Any], is_logged: bool, env_fns: list[Any]) -> VecEnv:
@@ -184,7 +213,8 @@ class TDPGExperimentManager(ExperimentManager):
         with warnings.catch_warnings():
             # The batch reports the returns of its episodes itself, but does not write them to a file.
             warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Monitor`")
-            return VecMonitor(env, os.path.join(self.save_path, str(n_logs)) if is_logged else None)
+            file = os.path.join(self.save_path, str(n_logs)) if is_logged else None
+            return VecMonitor(env, file, tuple(self.monitor_kwargs.get("info_keywords", ())))
 
     def create_callbacks(self) -> None:
         """Create the callbacks. TDPG's write the selected policy and the checkpoint to the folder of the training."""
@@ -195,6 +225,9 @@ class TDPGExperimentManager(ExperimentManager):
             if isinstance(callback, SelectionCallback) and callback.save_path is None:
                 callback.save_path = Path(self.save_path, "selected.zip")
         self.callbacks.append(TrainingCheckpointCallback(Path(self.save_path, CHECKPOINT), CHECKPOINT_EPOCHS))
+        for callback in self.callbacks:
+            if isinstance(callback, EvalCallback):
+                callback._on_step = _without_drawing(callback._on_step)  # type: ignore[method-assign]
 
     def learn(self, model: BaseAlgorithm) -> None:
         """Train the model. An interrupt ends the training; :meth:`save_trained_model` raises it again."""
@@ -203,6 +236,9 @@ class TDPGExperimentManager(ExperimentManager):
             if self.resume is not None:
                 assert isinstance(model, TDPG)
                 n_timesteps, kwargs["reset_num_timesteps"] = model.remaining_timesteps, False
+                for callback in self.callbacks:
+                    if isinstance(callback, EvalCallback):
+                        _go_on_evaluating(callback, model.num_timesteps, model.n_envs)
             try:
                 model.learn(n_timesteps, **kwargs)
             except KeyboardInterrupt:  # the zoo swallows it
@@ -249,6 +285,37 @@ def register(manager: type[ExperimentManager] = TDPGExperimentManager) -> None:
     """
     ALGOS["tdpg"] = TDPG  # all programs of the zoo share this dictionary
     rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
+
+
+def _without_addresses(settings: Mapping[str, Any]) -> Any:
+    return json.loads(re.sub(r" at 0x[0-9a-f]+", "", json.dumps(jsonable(settings))))
+
+
+def _without_drawing(evaluate: Callable[[], bool]) -> Callable[[], bool]:
+    """Evaluate without a change of the training's random numbers: a resumed training evaluates other episodes."""
+
+    def apart() -> bool:
+        with th.random.fork_rng():
+            return evaluate()
+
+    return apart
+
+
+def _go_on_evaluating(callback: EvalCallback, n_timesteps: int, n_envs: int) -> None:
+    """Keep the evaluations before a checkpoint, their rhythm, and the best model."""
+    callback.n_calls = n_timesteps // n_envs
+    path = Path(f"{callback.log_path}.npz")
+    if callback.log_path is None or not path.exists():
+        return
+    with np.load(path) as found:
+        kept = found["timesteps"] <= n_timesteps
+        callback.evaluations_timesteps = found["timesteps"][kept].tolist()
+        callback.evaluations_results = found["results"][kept].tolist()
+        callback.evaluations_length = found["ep_lengths"][kept].tolist()
+        if "successes" in found:
+            callback.evaluations_successes = found["successes"][kept].tolist()
+        # The best model may be of an evaluation after the checkpoint.
+        callback.best_mean_reward = float(found["results"].mean(axis=1).max())
 
 
 class _TaskHorizon(gym.Wrapper):

@@ -94,8 +94,11 @@ class TuningManager(TDPGExperimentManager):
         settings = put_in(self.settings, sample(trial, self.space), abs(self.cost_limit))
         sampled = {key: value for key, value in settings.items() if value != self.settings.get(key)}
         hyperparams = {**self._hyperparams, **self._preprocess_schedules(sampled)}
+        n_envs = self.n_envs
+        if "n_envs" not in self.settings and {"n_episodes", "epoch_steps"} & set(self.space):
+            n_envs = self._default_n_envs(self.env_kwargs, settings)
         with (
-            contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env,
+            contextlib.closing(self.create_envs(n_envs, no_log=True)) as env,
             contextlib.closing(self.create_envs(self.n_eval_episodes, eval_env=True)) as eval_env,
         ):
             model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
@@ -169,7 +172,7 @@ class _Measuring(BaseCallback):
         super().__init__()
         # With an infinite limit the cost itself is minimised. The interval is in environment steps.
         self.trial, self.env, self.limit, self.interval = trial, env, limit, interval
-        self.is_pruned, self.last, self._next = False, (math.inf, math.inf), interval
+        self.is_pruned, self.last, self._next, self._n_reports = False, (math.inf, math.inf), interval, 0
 
     def measure(self) -> tuple[float, float]:
         """Return the expected cost and the information in nats of the current policy."""
@@ -186,7 +189,8 @@ class _Measuring(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.num_timesteps >= self._next:
             self._next += self.interval
-            self.trial.report(_rank(*self.measure(), self.limit), self.num_timesteps)
+            self._n_reports += 1  # the zoo's pruners count evaluations, not steps
+            self.trial.report(_rank(*self.measure(), self.limit), self._n_reports)
             self.is_pruned = self.trial.should_prune()
 
     def _on_step(self) -> bool:

@@ -13,10 +13,11 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
+from small_problems import ToyEnv
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.lava import GOAL
@@ -189,6 +190,19 @@ def test_a_model_that_was_never_stacked_is_not_stacked_for_a_smaller_space():
     model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, device="cpu")
     with pytest.raises(ValueError, match="observation_space"):
         evaluate_scenarios(model, LAVA[:1], 2)
+
+
+def test_a_channels_last_image_in_a_dict_is_transposed_as_in_training(registry):
+    space = spaces.Dict(cam=spaces.Box(0, 255, (36, 36, 3), np.uint8))
+    gym.register("Camera-v0", lambda: ToyEnv(space))
+    model = PPO("MultiInputPolicy", "Camera-v0", n_steps=6, batch_size=6, device="cpu")
+    assert len(evaluate_scenarios(model, [Scenario("x", "Camera-v0")], 2)) == 2
+
+
+def test_normalised_stacks_are_stacked_below_the_normalisation():
+    env = VecNormalize(VecFrameStack(make_vec_env("Pendulum-v1", 2), 2), norm_reward=False)
+    model = PPO("MlpPolicy", env, n_steps=6, batch_size=6, device="cpu")
+    assert len(evaluate_scenarios(model, [Scenario("x", "Pendulum-v1")], 2)) == 2
 
 
 def test_what_is_no_array_in_the_last_info_is_left_out():

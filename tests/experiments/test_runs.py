@@ -21,11 +21,12 @@ import pytest
 from small_problems import assert_same_parameters, complete_runs_here, parameters
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.callbacks import TDPGProgressBar
+from sb3_tdpg.callbacks import TDPGProgressBar, TrainingCheckpointCallback
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.experiments.runs import Run, complete_run, complete_runs, read_progress
+from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.paper.lava_tables import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -165,6 +166,29 @@ def test_runs_that_would_be_mixed_up_are_refused(tmp_path):
     with pytest.raises(ValueError, match="does not keep the statistics"):
         complete_run(tiny_run(normalize={}), tmp_path / "two", LAVA[:1])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_has_the_epochs_that_its_settings_say():
+    training = make_training("Lava-v0", dict(policy="TRVPolicy", n_timesteps=2000, epoch_steps=500), device="cpu")
+    assert training.model.n_envs * training.model.horizon == 500
+
+
+def test_the_time_until_a_checkpoint_counts(tmp_path, monkeypatch):
+    begin = TrainingCheckpointCallback._on_rollout_start
+
+    def killed(self):
+        begin(self)
+        if self.tdpg.epoch == 6:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", killed)
+    with pytest.raises(KeyboardInterrupt):
+        complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    times = [json.loads((tmp_path / "attempt0" / "time.json").read_text())]
+    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", begin)
+    complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
+    times.append(json.loads((tmp_path / "time.json").read_text()))
+    assert 0 < times[0]["cpu_s"] < times[1]["cpu_s"]
 
 
 def test_attempts_go_on_until_one_meets_the_limits(tmp_path):

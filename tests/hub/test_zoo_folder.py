@@ -19,7 +19,7 @@ from sb3_tdpg.common.provenance import provenance
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.hub import write_model_card
-from sb3_tdpg.hub.publication import read_publication
+from sb3_tdpg.hub.publication import read_publication, read_zoo_folder
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +92,14 @@ def test_a_zoo_folder_without_its_last_policy_gives_the_best_one(zoo_folder, tmp
     (copy / "best_model.zip").unlink()
     with pytest.raises(ValueError, match=r"neither Lava-v0.zip nor best_model.zip: let the training end first"):
         read_publication(copy)
+
+
+def test_a_training_with_wrappers_is_not_evaluated_without_them(zoo_folder, tmp_path):
+    copy = shutil.copytree(zoo_folder, tmp_path / "wrapped")
+    (path,) = copy.glob("*/config.yml")
+    path.write_text(path.read_text() + "  - - env_wrapper\n    - rl_zoo3.wrappers.TimeFeatureWrapper\n")
+    with pytest.raises(ValueError, match="was trained with env_wrapper"):
+        read_zoo_folder(copy)
 
 
 def test_the_card_of_our_own_folder_says_which_policy_it_is(zoo_folder, tmp_path):

@@ -203,6 +203,13 @@ def test_trials_that_fall_behind_are_pruned(here):  # noqa: F811
     assert len(states) == 8
 
 
+def test_the_number_of_episodes_may_be_searched(here):  # noqa: F811
+    (here / "space.yml").write_text("n_episodes: {choices: [20, 60]}")
+    assert main(["tune", *TINY, "--n-trials", "2", "--seed", "0", "--space", "space.yml"]) == 0
+    (path,) = here.rglob("trials.csv")
+    assert {trial["state"] for trial in csv.DictReader(path.open())} == {"COMPLETE"}
+
+
 @pytest.mark.slow
 def test_two_workers_share_a_study(here):  # noqa: F811
     command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "6", "--storage", "study.log"]

@@ -4,12 +4,14 @@ import json
 import os
 import pickle
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from small_problems import assert_same_parameters, parameters
@@ -17,7 +19,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import load_results
 
 from sb3_tdpg import TDPG, hyperparams
+from sb3_tdpg.callbacks import TrainingCheckpointCallback
 from sb3_tdpg.cli import main
+from sb3_tdpg.hyperparams import load_hyperparams
 
 pytest.importorskip("rl_zoo3")
 
@@ -93,6 +97,49 @@ def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
 
     assert main(arguments) == 0
     assert_same_training(here)
+
+
+def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, monkeypatch, capsys):
+    arguments = ["train", "--env", "CartPole-v1", "-params", "epoch_steps:200", "batch_size:100", "n_epochs:1"]
+    arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1"]
+    begin = TrainingCheckpointCallback._on_rollout_start
+
+    def killed(self):
+        begin(self)
+        if self.tdpg.epoch == 13:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", killed)
+    assert main(arguments) == 130
+    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", begin)
+    folder = folder_of(here, 1, env="CartPole-v1")
+    n_episodes = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
+    record = json.loads((folder / "run.json").read_text())
+    record["hyperparams"]["n_epochs"] = 2
+    other = shutil.copytree(folder, here / "other")
+    (other / "run.json").write_text(json.dumps(record))
+    capsys.readouterr()
+    assert main(["train", "--resume", str(other)]) == 2
+    assert "was trained with other settings than" in capsys.readouterr().err
+
+    assert main(["train", "--resume", str(folder)]) == 0
+    assert main(arguments) == 0
+    again = folder_of(here, 2, env="CartPole-v1")
+    resumed, whole = (TDPG.load(each / "CartPole-v1.zip", device="cpu") for each in (folder, again))
+    assert_same_parameters(parameters(resumed.policy), parameters(whole.policy))
+    evaluations = [np.load(each / "evaluations.npz")["timesteps"] for each in (folder, again)]
+    assert len(evaluations[0]) == len(evaluations[1])
+    kept = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
+    assert kept > n_episodes
+
+
+def test_a_model_of_the_zoo_loads_without_it_and_its_rates_may_end_anywhere(here):
+    block = {**load_hyperparams("Lava-v0-pg"), "learning_rate": "lin_1e-3_1e-5"}
+    (here / "mine.yml").write_text(yaml.dump({"Lava-v0": block}))
+    assert main(["train", *LAVA[:2], "--conf-file", "mine.yml", "-n", "500", "-params", "n_episodes:20"]) == 0
+    path = folder_of(here) / "Lava-v0.zip"
+    code = f"import sys; sys.modules['rl_zoo3'] = None; from sb3_tdpg import TDPG; TDPG.load({str(path)!r})"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.slow
