@@ -1,14 +1,17 @@
 """Small environments with known answers, and a quick TDPG model, for the tests."""
 
 import re
+from contextlib import contextmanager
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tdpg import TDPG, BatchedVecEnv
+from sb3_tdpg.callbacks import TrainingCheckpointCallback
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.lava import LavaEnv
@@ -204,6 +207,21 @@ class AtEveryEpoch(BaseCallback):
 
 def toy_vec_env(n_envs=4, **kwargs) -> VecEnv:
     return DummyVecEnv([lambda: ToyEnv(**kwargs) for _ in range(n_envs)])
+
+
+@contextmanager
+def stopped_in_epoch(epoch):
+    """Stop trainings with checkpoints at the start of an epoch, as Ctrl-C does."""
+    begin = TrainingCheckpointCallback._on_rollout_start
+
+    def stop(self):
+        begin(self)
+        if self.tdpg.epoch == epoch:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainingCheckpointCallback, "_on_rollout_start", stop)
+        yield
 
 
 def lava_env(n=20):

@@ -18,10 +18,10 @@ from unittest.mock import Mock
 import numpy as np
 import pandas as pd
 import pytest
-from small_problems import assert_same_parameters, complete_runs_here, parameters
+from small_problems import assert_same_parameters, complete_runs_here, parameters, stopped_in_epoch
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.callbacks import TDPGProgressBar, TrainingCheckpointCallback
+from sb3_tdpg.callbacks import TDPGProgressBar
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import aggregate_seeds
@@ -173,19 +173,10 @@ def test_a_run_has_the_epochs_that_its_settings_say():
     assert training.model.n_envs * training.model.horizon == 500
 
 
-def test_the_time_until_a_checkpoint_counts(tmp_path, monkeypatch):
-    begin = TrainingCheckpointCallback._on_rollout_start
-
-    def killed(self):
-        begin(self)
-        if self.tdpg.epoch == 6:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", killed)
-    with pytest.raises(KeyboardInterrupt):
+def test_the_time_until_a_checkpoint_counts(tmp_path):
+    with pytest.raises(KeyboardInterrupt), stopped_in_epoch(6):
         complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
     times = [json.loads((tmp_path / "attempt0" / "time.json").read_text())]
-    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", begin)
     complete_run(tiny_run(), tmp_path, LAVA[:1], n_eval_episodes=4)
     times.append(json.loads((tmp_path / "time.json").read_text()))
     assert 0 < times[0]["cpu_s"] < times[1]["cpu_s"]

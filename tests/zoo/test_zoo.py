@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from small_problems import assert_same_parameters, parameters
+from small_problems import assert_same_parameters, parameters, stopped_in_epoch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import load_results
 
 from sb3_tdpg import TDPG, hyperparams
-from sb3_tdpg.callbacks import TrainingCheckpointCallback
 from sb3_tdpg.cli import main
 from sb3_tdpg.hyperparams import load_hyperparams
 
@@ -99,19 +98,11 @@ def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     assert_same_training(here)
 
 
-def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, monkeypatch, capsys):
+def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, capsys):
     arguments = ["train", "--env", "CartPole-v1", "-params", "epoch_steps:200", "batch_size:100", "n_epochs:1"]
     arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1"]
-    begin = TrainingCheckpointCallback._on_rollout_start
-
-    def killed(self):
-        begin(self)
-        if self.tdpg.epoch == 13:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", killed)
-    assert main(arguments) == 130
-    monkeypatch.setattr(TrainingCheckpointCallback, "_on_rollout_start", begin)
+    with stopped_in_epoch(13):
+        assert main(arguments) == 130
     folder = folder_of(here, 1, env="CartPole-v1")
     n_episodes = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
     record = json.loads((folder / "run.json").read_text())
