@@ -54,7 +54,7 @@ def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
 
 def stacked_for(model: Any, env: VecEnv) -> VecEnv:
     """Stack as many observations as a model was trained on at once (``VecFrameStack``)."""
-    if (trained := model.get_env()) is not None and not is_vecenv_wrapped(trained, VecFrameStack):
+    if (trained := getattr(model, "env", None)) is not None and not is_vecenv_wrapped(trained, VecFrameStack):
         return env
     own, single = model.observation_space, env.observation_space
     if type(own) is type(single) and isinstance(own, (spaces.Box, spaces.Dict)):

@@ -69,7 +69,7 @@ def test_the_time_of_a_training_is_that_of_all_attempts_and_of_all_its_parts(tmp
     monkeypatch.setattr(runs.time, "perf_counter", wall)
     monkeypatch.setattr(runs.time, "process_time", cpu)
 
-    def train(run, attempt, folder, progress_bar):
+    def train(run, attempt, folder, progress_bar, keep_times):
         folder.mkdir(parents=True, exist_ok=True)
         wall.now += 10.0
         cpu.now += 3.0
