@@ -35,8 +35,9 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     """
     Load a model of TDPG, Stable-Baselines3 or sb3-contrib, and recognise its algorithm from the file.
 
-    If statistics of observations lie beside it (``vecnormalize.pkl`` of rl-zoo3, ``vec_normalize.pkl`` of the Hub), they
-    are normalised as in training. Loading unpickles the file, which can run any code: load only files that you trust.
+    If statistics of observations lie beside it (``vecnormalize.pkl`` of rl-zoo3, ``vec_normalize.pkl`` of the Hub),
+    these are normalised as in training. Loading unpickles the file, which can run any code: load only files that you
+    trust.
 
     :param path: The file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
