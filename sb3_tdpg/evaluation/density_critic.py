@@ -201,8 +201,8 @@ def _choose_ridge(
     :param basis: Orthonormal columns ``(n, R)``, with their squared singular values ``values``, ``(R,)``.
     :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
     :param leverage: Leverage of each episode in the fit of the mean that the targets are distances from.
-    :param spare_before: 1 less the leverage of each episode in the regression whose residuals are the targets, as
-        ``(n, Y)``.
+    :param spare_before: ``1 - h``, ``(n, Y)``, if the targets are residuals of an earlier regression: h is the leverage
+        of each episode in it.
     :return: the shrinkage factors of the projections, ``(R, Y)``, and the leave-one-out residuals, ``(n, Y)``
     """
     n = len(targets)
