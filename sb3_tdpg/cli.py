@@ -160,7 +160,7 @@ def _certify(
 
 
 def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:
-    from sb3_tdpg.common.processes import usable_cores
+    from sb3_tdpg.common.threads import usable_cores
     from sb3_tdpg.report import parse_models, robustness_report
 
     out = out or Path("results", f"report-{env.rpartition(':')[2]}")

@@ -22,7 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_tdpg.common.processes import usable_cores
+from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.presets import DEFAULTS, preset_of
 from sb3_tdpg.problem import horizon_of

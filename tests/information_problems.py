@@ -6,12 +6,14 @@ import numpy as np
 import torch as th
 
 from sb3_tdpg.evaluation.density_critic import Encoded
-from sb3_tdpg.information import ESTIMATORS, CriticEstimator, InformationBatch
+from sb3_tdpg.information import ESTIMATORS, InformationBatch, get_estimator_class
+from sb3_tdpg.information.critic import CriticEstimator
 
-CRITICS = sorted(name for name, cls in ESTIMATORS.items() if issubclass(cls, CriticEstimator))
+CLASSES = {name: get_estimator_class(name) for name in ESTIMATORS}
+CRITICS = sorted(name for name, cls in CLASSES.items() if issubclass(cls, CriticEstimator))
 CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))
-UPPER = sorted(name for name, cls in ESTIMATORS.items() if cls.bound == "upper")
-LOWER = sorted(name for name, cls in ESTIMATORS.items() if cls.bound == "lower")
+UPPER = sorted(name for name, cls in CLASSES.items() if cls.bound == "upper")
+LOWER = sorted(name for name, cls in CLASSES.items() if cls.bound == "lower")
 
 # One time step for each: gains a of ``trv = a * state + noise`` in each of two dimensions.
 GAINS = ((0.0, 0.0), (0.8, 0.0), (1.0, 1.0))
@@ -60,7 +62,7 @@ def gaussian_information(gains, noise_std=1.0):
 
 def build(name, horizon, state_dim, trv_dim, **kwargs):
     kwargs = kwargs if name in CRITICS else {}
-    return ESTIMATORS[name](horizon, state_dim, trv_dim, **kwargs)
+    return CLASSES[name](horizon, state_dim, trv_dim, **kwargs)
 
 
 def random_batch(horizon=4, n=60, alive=None):

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from scipy.stats import binomtest
 
-from sb3_tdpg.common.processes import usable_cores
+from sb3_tdpg.common.threads import usable_cores
 
 ROOT = Path(__file__).resolve().parents[1]
 TREE = ROOT / "build" / "mutants"

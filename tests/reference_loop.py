@@ -292,7 +292,7 @@ def unbatch(mlp: BatchedMLP) -> list[nn.Sequential]:
 
 
 def draw_randomness(model: TDPG, rng: np.random.Generator) -> Randomness:
-    """Draw what an epoch of a model needs, minibatches as :class:`~sb3_tdpg.information.Mine` has them."""
+    """Draw what an epoch of a model needs, minibatches as :class:`~sb3_tdpg.information.mine.Mine` has them."""
     n, horizon, trv_dim = model.n_episodes, model.horizon, model.policy.trv_dim
     size = min(model.estimator.batch_size, n // 2)
 

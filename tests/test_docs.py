@@ -17,7 +17,8 @@ from stable_baselines3 import PPO
 from sb3_tdpg import TDPG
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
-from sb3_tdpg.information import ESTIMATORS, CriticEstimator
+from sb3_tdpg.information import ESTIMATORS
+from sb3_tdpg.information.critic import CriticEstimator
 from sb3_tdpg.robustness import PERTURBATIONS
 
 ROOT = Path(__file__).parents[1]

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdpg import TDPG, InformationCallback
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
 from sb3_tdpg.common.running_norms import Changes
-from sb3_tdpg.information import LogDet
+from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.presets import DEFAULTS, discount_of, preset_of
 
 

@@ -267,7 +267,7 @@ def test_every_estimator_trains_from_its_name_and_its_parameters_fit_another_mod
 
 
 def test_an_estimator_of_ones_own_is_given_as_a_class_and_saved(tmp_path):
-    from sb3_tdpg.information import LogDet
+    from sb3_tdpg.information.logdet import LogDet
 
     model = train_epochs(tiny_tdpg(mi_estimator=LogDet, mi_kwargs={}), 1)
     model.save(tmp_path / "model")

@@ -37,7 +37,8 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
 from sb3_tdpg.evaluation.rollout import act
-from sb3_tdpg.information import InformationBatch, LogDet
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.robustness.core import Members
 from sb3_tdpg.vec_env import BatchedVecEnv
 

@@ -16,11 +16,6 @@ from tqdm import tqdm
 from sb3_tdpg.common.threads import set_threads
 
 
-def usable_cores() -> int:
-    """Count the processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextmanager
 def process_pool(
     n_processes: int, initializer: Callable[..., Any] | None = None, initargs: tuple[Any, ...] = ()

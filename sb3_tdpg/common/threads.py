@@ -1,10 +1,16 @@
-"""Limit the threads of torch and of NumPy's linear algebra."""
+"""The cores of the machine, and the threads of torch and of NumPy's linear algebra."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch as th
 from threadpoolctl import threadpool_limits
+
+
+def usable_cores() -> int:
+    """Count the processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def set_threads(n: int) -> None:

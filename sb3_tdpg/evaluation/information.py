@@ -28,7 +28,8 @@ from sb3_tdpg.evaluation.interval_bounds import MAX_TRAINING
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
-from sb3_tdpg.information import InformationBatch, LogDet
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import log_density_matrix
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.problem import read_problem
@@ -243,7 +244,7 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
 
 def _lower_bound(at_t: InformationBatch) -> float:
     r"""
-    Estimate the same bound as :func:`~sb3_tdpg.information.own_sample_bound`, with less noise from sampling the TRVs.
+    Estimate the bound of :func:`~sb3_tdpg.information.loo.own_sample_bound`, with less noise from sampling the TRVs.
 
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
     :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0

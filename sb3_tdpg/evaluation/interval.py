@@ -181,8 +181,8 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
     e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
 
-    - ``"logdet"``: :class:`~sb3_tdpg.information.LogDet`, its bias removed by the jackknife;
-    - ``"loo"``: :class:`~sb3_tdpg.information.LeaveOneOut`;
+    - ``"logdet"``: :class:`~sb3_tdpg.information.logdet.LogDet`, its bias removed by the jackknife;
+    - ``"loo"``: :class:`~sb3_tdpg.information.loo.LeaveOneOut`;
     - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the marginal density a of the critic, also on
       fresh episodes.
 

@@ -21,8 +21,9 @@ from tqdm import tqdm
 from sb3_tdpg.callbacks import TrainingCheckpointCallback
 from sb3_tdpg.checks import schedule_of
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
-from sb3_tdpg.common.processes import process_pool, usable_cores
+from sb3_tdpg.common.processes import process_pool
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
+from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.training import make_training, take_env

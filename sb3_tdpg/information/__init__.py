@@ -4,28 +4,24 @@ Mutual-information estimators and bounds; independent of Stable-Baselines3.
 To add an estimator, add a file here and a row to :data:`ESTIMATORS`.
 """
 
-from sb3_tdpg.information.base import InformationBatch, InformationEstimator
-from sb3_tdpg.information.critic import CriticEstimator
-from sb3_tdpg.information.directed import DirectedLeaveOneOut, DirectedLogDet
-from sb3_tdpg.information.infonce import InfoNCE
-from sb3_tdpg.information.logdet import LogDet
-from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
-from sb3_tdpg.information.mine import Mine
-from sb3_tdpg.information.nwj import Nwj
-from sb3_tdpg.information.smile import Smile
-from sb3_tdpg.information.vib import VariationalBottleneck
+import pkgutil
+from typing import cast
 
-ESTIMATORS: dict[str, type[InformationEstimator]] = {
-    "mine": Mine,
-    "nwj": Nwj,
-    "smile": Smile,
-    "infonce": InfoNCE,
-    "logdet": LogDet,
-    "directed": DirectedLogDet,
-    "loo": LeaveOneOut,
-    "directed-loo": DirectedLeaveOneOut,
-    "vib": VariationalBottleneck,
+from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+
+# Only the file of the estimator that is trained is read.
+ESTIMATORS: dict[str, str | type[InformationEstimator]] = {
+    "mine": "sb3_tdpg.information.mine:Mine",
+    "nwj": "sb3_tdpg.information.nwj:Nwj",
+    "smile": "sb3_tdpg.information.smile:Smile",
+    "infonce": "sb3_tdpg.information.infonce:InfoNCE",
+    "logdet": "sb3_tdpg.information.logdet:LogDet",
+    "directed": "sb3_tdpg.information.directed:DirectedLogDet",
+    "loo": "sb3_tdpg.information.loo:LeaveOneOut",
+    "directed-loo": "sb3_tdpg.information.directed:DirectedLeaveOneOut",
+    "vib": "sb3_tdpg.information.vib:VariationalBottleneck",
 }
+"""The estimators by name: a class, or where to find it, in the form ``"module:class"``."""
 
 
 def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[InformationEstimator]:
@@ -34,29 +30,14 @@ def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[Inf
 
     :raises ValueError: if it is neither.
     """
-    if isinstance(estimator, str) and estimator in ESTIMATORS:
-        return ESTIMATORS[estimator]
-    if isinstance(estimator, type) and issubclass(estimator, InformationEstimator):
-        return estimator
+    found = ESTIMATORS.get(estimator, estimator) if isinstance(estimator, str) else estimator
+    if isinstance(found, str) and found is not estimator:
+        found = cast(type[InformationEstimator], pkgutil.resolve_name(found))
+    if isinstance(found, type) and issubclass(found, InformationEstimator):
+        return found
     raise ValueError(
         f"mi_estimator={estimator!r} is unknown: use one of {sorted(ESTIMATORS)} or a subclass of InformationEstimator"
     )
 
 
-__all__ = [
-    "ESTIMATORS",
-    "CriticEstimator",
-    "DirectedLeaveOneOut",
-    "DirectedLogDet",
-    "InfoNCE",
-    "InformationBatch",
-    "InformationEstimator",
-    "LeaveOneOut",
-    "LogDet",
-    "Mine",
-    "Nwj",
-    "Smile",
-    "VariationalBottleneck",
-    "get_estimator_class",
-    "own_sample_bound",
-]
+__all__ = ["ESTIMATORS", "InformationBatch", "InformationEstimator", "get_estimator_class"]

@@ -29,8 +29,8 @@ class VariationalBottleneck(InformationEstimator):
         D[q \,\|\, r_t] \le -\log \sum_k w_k e^{-D[q \| N_k]}.
 
     With one component this is exact, and the best prior has the moments of the TRVs: the estimate is
-    :class:`~sb3_tdpg.information.LogDet` without the covariances, so it is looser for correlated TRVs. A mixture is
-    fitted by expectation-maximisation; the responsibility of a component for an episode is proportional to
+    :class:`~sb3_tdpg.information.logdet.LogDet` without the covariances, so it is looser for correlated TRVs. A mixture
+    is fitted by expectation-maximisation; the responsibility of a component for an episode is proportional to
     :math:`w_k e^{-D[q \| N_k]}`.
 
     Before the first fit the prior is the standard normal. On the samples of the fit, the estimate is too low by about

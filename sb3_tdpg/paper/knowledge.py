@@ -21,7 +21,10 @@ from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.information import rollout_information
 from sb3_tdpg.evaluation.randomness import EvaluationSeeds, evaluation_seeds, isolated_randomness
 from sb3_tdpg.evaluation.rollout import act, rollout
-from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet, Mine, own_sample_bound
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
+from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.problem import read_problem
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG

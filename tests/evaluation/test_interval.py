@@ -20,7 +20,7 @@ from sb3_tdpg.evaluation.interval import (
     normal_quantile,
 )
 from sb3_tdpg.evaluation.interval_bounds import Estimate
-from sb3_tdpg.information import LeaveOneOut, own_sample_bound
+from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
 
 
 def test_the_interval_holds_the_information_of_gaussian_channels_and_is_narrow():

@@ -22,7 +22,9 @@ from sb3_tdpg.evaluation.interval_bounds import (
     log_det_bound,
     noise_controls,
 )
-from sb3_tdpg.information import InformationBatch, LeaveOneOut, LogDet
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.loo import LeaveOneOut
 
 
 def test_the_jackknife_of_the_log_det_bound_is_that_of_its_definition():

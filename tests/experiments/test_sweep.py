@@ -21,7 +21,8 @@ from sb3_tdpg.envs.scenarios import LAVA  # noqa: E402
 from sb3_tdpg.evaluation.information import information_bounds, rollout_information  # noqa: E402
 from sb3_tdpg.experiments.studies import enqueue_once, open_storage  # noqa: E402
 from sb3_tdpg.experiments.sweep import beta_label, parse_inverse_beta, select, sweep  # noqa: E402
-from sb3_tdpg.information import InformationBatch, own_sample_bound  # noqa: E402
+from sb3_tdpg.information import InformationBatch  # noqa: E402
+from sb3_tdpg.information.loo import own_sample_bound  # noqa: E402
 
 SETTINGS = dict(mi_estimator="logdet", n_episodes=20, policy_kwargs=dict(net_arch=dict(encoder=[8], action_head=[8])))
 

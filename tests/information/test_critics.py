@@ -19,8 +19,9 @@ from information_problems import (
 )
 from small_problems import TINY_CRITIC, assert_same_parameters, parameters
 
-from sb3_tdpg.information import ESTIMATORS, InformationBatch, Mine
+from sb3_tdpg.information import ESTIMATORS, InformationBatch
 from sb3_tdpg.information.critic import Scores
+from sb3_tdpg.information.mine import Mine
 
 # -- critics: derangements, warm-up, guards, moving average ---------------------------------------------------
 

@@ -8,7 +8,10 @@ import torch as th
 from information_problems import gaussian_batch, random_batch
 from small_problems import lava_env, tiny_tdpg
 
-from sb3_tdpg.information import DirectedLeaveOneOut, DirectedLogDet, InformationBatch, LeaveOneOut, LogDet
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.directed import DirectedLeaveOneOut, DirectedLogDet
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.loo import LeaveOneOut
 
 ESTIMATORS = pytest.mark.parametrize(
     ("estimator", "undirected"), [(DirectedLogDet, LogDet), (DirectedLeaveOneOut, LeaveOneOut)]

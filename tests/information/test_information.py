@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from information_problems import (
+    CLASSES,
     CRITIC_FREE,
     CRITICS,
     GAINS,
@@ -24,17 +25,11 @@ from information_problems import (
 )
 from small_problems import TINY_CRITIC
 
-from sb3_tdpg.information import (
-    ESTIMATORS,
-    InformationBatch,
-    InformationEstimator,
-    LeaveOneOut,
-    LogDet,
-    Mine,
-    get_estimator_class,
-    own_sample_bound,
-)
+from sb3_tdpg.information import ESTIMATORS, InformationBatch, InformationEstimator, get_estimator_class
 from sb3_tdpg.information.critic import Scores
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
+from sb3_tdpg.information.mine import Mine
 
 
 @pytest.fixture(scope="module")
@@ -243,7 +238,7 @@ def test_fitting_leaves_no_gradient_in_the_policys_samples(name):
 
 
 def test_every_estimator_says_which_kind_of_bound_it_is():
-    assert {cls.bound for cls in ESTIMATORS.values()} <= {"lower", "upper", "neither"}
+    assert {cls.bound for cls in CLASSES.values()} <= {"lower", "upper", "neither"}
     assert set(UPPER) == {"logdet", "loo", "vib"}
     assert set(LOWER) == {"mine", "nwj", "infonce"}
 
@@ -283,7 +278,7 @@ def test_anything_else_is_refused_with_the_list(estimator):
 ], ids=str)  # fmt: skip
 def test_a_keyword_out_of_its_range_is_refused(name, kwargs):
     with pytest.raises(ValueError, match=f"mi_kwargs: {next(iter(kwargs))}="):
-        ESTIMATORS[name](4, 2, 2, **kwargs)
+        CLASSES[name](4, 2, 2, **kwargs)
 
 
 def test_information_knows_nothing_of_stable_baselines():

@@ -17,7 +17,9 @@ from information_problems import (
 from small_problems import tiny_tdpg, train_epochs
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.information import InformationBatch, LogDet, VariationalBottleneck
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.logdet import LogDet
+from sb3_tdpg.information.vib import VariationalBottleneck
 
 
 def fitted(batch, **kwargs):

@@ -15,7 +15,8 @@ from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import PANDA_CAMERA, PANDA_GRASP
 from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hyperparams import load_hyperparams
-from sb3_tdpg.information import InformationBatch, Mine
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.paper import common, grasp, knowledge
 from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
 from sb3_tdpg.paper.plots import failures_by_camera, failures_by_yaw

@@ -10,7 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from sb3_tdpg.common.processes import process_pool, usable_cores
+from sb3_tdpg.common.processes import process_pool
+from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.experiments.public.page import Records
 from sb3_tdpg.experiments.public.tasks import TASKS
 from sb3_tdpg.experiments.public.trainings import PRESET, TUNED, Training, complete_training, with_limit

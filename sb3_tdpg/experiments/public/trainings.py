@@ -25,7 +25,7 @@ from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, jsonable, write_frame_atomically, write_run_config
 from sb3_tdpg.experiments.public.tasks import PublicTask
 from sb3_tdpg.experiments.training import make_training
-from sb3_tdpg.information import LogDet
+from sb3_tdpg.information.logdet import LogDet
 
 N_EVAL_ENVS = 10
 EVAL_SEED = 10_000  # its environments are seeded alike for all methods

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 import torch as th
 from torch import nn
 
-from sb3_tdpg.information import InformationBatch, Mine
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.mine import Mine
 from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
 from tests.reference_loop import unbatch
 
