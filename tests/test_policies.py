@@ -275,20 +275,15 @@ def test_the_paper_s_convolutions_stand_before_the_encoder_of_small_images_and_o
     assert not np.allclose(dark, bright)
 
 
-@pytest.mark.parametrize(("kwargs", "channels", "n_features"), [
-    (None, 16, 32),
-    (dict(layers=((6, 6, 2), (6, 4, 2)), keypoints=False), 6, 5400),  # the paper's
-])  # fmt: skip
-def test_depth_images_have_the_papers_network_of_grasping_but_for_keypoints(kwargs, channels, n_features):
-    space = spaces.Box(0.2, 0.7, (1, 128, 128), np.float32)
-    policy = make_policy(space, horizon=1, features_extractor_kwargs=kwargs)
+def test_depth_images_have_the_network_of_the_papers_grasping_problem():
+    policy = make_policy(spaces.Box(0.2, 0.7, (1, 128, 128), np.float32), horizon=1)
     convolutions = [layer for layer in policy.features_extractor.cnn if isinstance(layer, th.nn.Conv2d)]
     assert [(c.out_channels, c.kernel_size, c.stride) for c in convolutions] == [
-        (channels, (6, 6), (2, 2)),
-        (channels, (4, 4), (2, 2)),
+        (6, (6, 6), (2, 2)),
+        (6, (4, 4), (2, 2)),
     ]
     shapes = [tuple(layer.weight.shape[1:]) for layer in policy.encoder.mlp.layers]
-    assert shapes == [(16 + n_features, 128), (128, 64), (64, 32)]
+    assert shapes == [(16 + 5400, 128), (128, 64), (64, 32)]
     assert [tuple(layer.weight.shape[1:]) for layer in policy.action_head.mlp.layers] == [(16, 64), (64, 64), (64, 4)]
     assert isinstance(policy.encoder.mlp.activation, th.nn.Tanh)
     assert isinstance(policy.action_head.mlp.activation, th.nn.ELU)
