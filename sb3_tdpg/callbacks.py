@@ -122,7 +122,7 @@ class SelectionCallback(TDPGCallback):
     :param mi_limit: Upper limit on the information in nats, summed over time.
     :param save_path: File of the selected model (``.zip``); a ``.json`` beside it has its epoch, cost and information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, or one is NaN or negative.
+    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative.
     """
 
     def __init__(

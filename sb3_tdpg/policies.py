@@ -50,7 +50,7 @@ class TRVPolicy(BasePolicy):
     long horizon), see the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The network sizes
     of "vector" and "depth" are the paper's; the preset "paper" has those of its ball catching.
 
-    :param observation_space: A vector, or an image with channels first.
+    :param observation_space: Vectors, images with channels first, ``Discrete``, or a ``Dict`` of these.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: Number of time steps T; the algorithm passes the environment's.

@@ -104,7 +104,7 @@ DEFAULTS = dict(vector=VECTOR, image=IMAGE, depth=DEPTH, long=LONG)
 
 
 class PolicyDefaults(NamedTuple):
-    """Arguments of :class:`~sb3_tdpg.TRVPolicy` that depend on the kind of observation; for images the paper's."""
+    """Arguments of :class:`~sb3_tdpg.TRVPolicy` that depend on the kind of observation."""
 
     trv_dim: int
     encoder: Sequence[int]

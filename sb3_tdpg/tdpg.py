@@ -95,7 +95,8 @@ class TDPG(EpisodicAlgorithm):
         ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both are unbiased; the second
         has less variance.
     :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons; the time
-        steps must share their weights (``time_varying=False``). ``None``: whole episodes.
+        steps must share their weights (``time_varying=False``). Default: 5 for vectors with a horizon of 50 or more
+        (the horizon gives whole episodes), otherwise whole episodes.
     :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO.
     :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
