@@ -2,6 +2,7 @@
 
 import os
 import time
+from functools import cached_property
 from importlib import import_module
 from typing import Any
 
@@ -64,6 +65,7 @@ class BallCatchEnv(POMDPEnv):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
     shares_work = True
+    resources = frozenset({"_renderer", "_pool", "_view"})
     state_names = ("d (m)", "b_x (m)", "b_y (m)", "v_x (m/s)", "v_y (m/s)")
 
     def __init__(
@@ -119,12 +121,26 @@ class BallCatchEnv(POMDPEnv):
         self.observation_space = spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
         module, name = RENDERERS[renderer]
-        renderer_class = getattr(import_module(f".{module}", __package__), name)
-        self._renderer = renderer_class(self.scene)
+        self._renderer_class = getattr(import_module(f".{module}", __package__), name)
         n_processes = checks.count("n_processes", n_processes)
         self.n_processes = n_processes if renderer == "pybullet" else 1
-        self._pool: WorkPool | None = None  # when it is needed
-        self._view: Any = None  # a SideView, when it is needed
+
+    @cached_property
+    def _renderer(self) -> Any:
+        self.check_open()
+        return self._renderer_class(self.scene)
+
+    @cached_property
+    def _pool(self) -> WorkPool:
+        self.check_open()
+        return WorkPool(self.n_processes, self._renderer_class, self.scene)
+
+    @cached_property
+    def _view(self) -> Any:
+        from .ball_bullet import SideView
+
+        self.check_open()
+        return SideView(self.scene, gui=self.render_mode == "human")
 
     def initial_state(self, n: int) -> np.ndarray:
         state = np.empty((n, 5))
@@ -144,8 +160,6 @@ class BallCatchEnv(POMDPEnv):
         if self.n_processes == 1 or len(state) == 1:
             images = self._renderer.images(seen)
         else:
-            if self._pool is None:
-                self._pool = WorkPool(self.n_processes, type(self._renderer), self.scene)
             images = self._pool.call("images", seen)
         return self._with_noise(images, self.np_random)
 
@@ -178,10 +192,6 @@ class BallCatchEnv(POMDPEnv):
         if self.render_mode is None:
             return None
         state = self._current_state()
-        if self._view is None:
-            from .ball_bullet import SideView
-
-            self._view = SideView(self.scene, gui=self.render_mode == "human")
         self._view.place(state[0])
         if self.render_mode == "human":
             time.sleep(self.dt)
@@ -190,11 +200,3 @@ class BallCatchEnv(POMDPEnv):
         # The noise is a new sample, so that rendering does not change an episode.
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)
-
-    def close(self) -> None:
-        """Release renderer and window; closing twice is fine."""
-        self._renderer.close()
-        if self._pool is not None:
-            self._pool.close()
-        if self._view is not None:
-            self._view.close()

@@ -82,10 +82,10 @@ class FastRenderer:
         # u (upward) is the slow index, v (to the left) the fast one.
         self._wall_texels = pack(shaded[::-1].transpose(1, 0, 2)).ravel()
         copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m of wall to a copy of the texture
-        ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)
+        self._ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)  # from behind the wall is not seen
         self._u_at_zero = PLANE_COPIES / 2 + (self.scene.camera_height - WALL_Z) / copy
-        self._u_per_metre = self._ray_z / ahead / copy  # (64,)
-        self._v_per_metre = (self._ray_y / copy / ahead[:, None]).astype(np.float32)  # (64, 64)
+        self._u_per_metre = self._ray_z / self._ahead / copy  # (64,)
+        self._v_per_metre = (self._ray_y / copy / self._ahead[:, None]).astype(np.float32)  # (64, 64)
 
     @staticmethod
     def _depth_of(distance: float | np.ndarray, ray: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ class FastRenderer:
     def images(self, state: np.ndarray) -> np.ndarray:
         """Return one image for each state: ``(N, 3, 64, 64)`` uint8 from ``(N, 5)``."""
         images = np.repeat(self._behind[None], len(state), axis=0)
-        wall_depth = self._depth_of(WALL_X - state[:, :1], self._ray_x)  # (N, 64)
+        wall_depth = self._depth_of(WALL_X - state[:, :1], self._ahead)  # (N, 64)
         wall_depth[wall_depth > FAR] = np.inf
         for start in range(0, len(state), CHUNK):
             chunk = slice(start, start + CHUNK)

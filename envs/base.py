@@ -50,6 +50,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
     shares_work: bool = False
+    #: Cached properties that hold a Bullet world or processes, made by the process that first uses them.
+    resources: frozenset[str] = frozenset()
     #: Further entries for the info of each episode of the last :meth:`dynamics`, or none.
     _details: Sequence[Mapping[str, Any]] = ()
 
@@ -60,6 +62,22 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._state: np.ndarray | None = None  # (1, X)
         self._time = 0
+        self._is_closed = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out worlds and processes: a copy makes its own."""
+        return {name: value for name, value in self.__dict__.items() if name not in self.resources}
+
+    def check_open(self) -> None:
+        """Raise a ``RuntimeError`` after :meth:`close`."""
+        if self._is_closed:  # perhaps before there was a BulletClient, which says the same
+            raise RuntimeError("this environment has been closed: make a new one")
+
+    def close(self) -> None:
+        """Close worlds, processes and windows; closing twice is fine."""
+        self._is_closed = True
+        for name in self.resources & set(self.__dict__):
+            getattr(self, name).close()
 
     @abstractmethod
     def initial_state(self, n: int) -> np.ndarray:
@@ -99,14 +117,17 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         :param state: x_t, ``(N, X)``
         :param action: u_t, ``(N, U)``; it is clipped to the action space
         :param is_last: Whether this is control T - 1, so that the terminal cost is due.
-        :raises ValueError: if an action is NaN or infinite.
+        :raises ValueError: if the actions have another shape, or one is NaN or infinite.
         """
+        action, expected = np.asarray(action, dtype=np.float64), (len(state), *self.action_space.shape)
+        if action.shape != expected:
+            raise ValueError(f"{type(self).__name__} received actions of shape {action.shape}: expected {expected}")
         if not np.all(np.isfinite(action)):
             bad = action[~np.isfinite(action).all(-1)][0]
             raise ValueError(
                 f"{type(self).__name__} received an action that is not finite: {bad}; the policy has probably diverged"
             )
-        action = np.clip(np.asarray(action, dtype=np.float64), self.action_space.low, self.action_space.high)
+        action = np.clip(action, self.action_space.low, self.action_space.high)
         cost = self.cost(state, action)
         next_state = self.dynamics(state, action)
         if is_last:
@@ -130,10 +151,10 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded(
                 f"the episode has not begun or is over (horizon={self.horizon}): call reset() first"
             )
-        self._time += 1
-        terminated = self._time == self.horizon
+        terminated = self._time + 1 == self.horizon
         batch = np.asarray(action, dtype=np.float64).reshape(1, -1)
         self._state, observation, cost, details = self.step_batch(self._state, batch, is_last=terminated)
+        self._time += 1
         info = {"state": self._state[0].copy(), "cost": float(cost[0])}
         for more in details:
             info.update(more)

@@ -94,6 +94,7 @@ class PandaGraspEnv(POMDPEnv):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
     shares_work = True
+    resources = frozenset({"_world", "_pool", "_view"})
 
     def __init__(
         self,
@@ -112,7 +113,9 @@ class PandaGraspEnv(POMDPEnv):
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=1, render_mode=render_mode)
-        self.xy_half_width = checks.between("xy_half_width", xy_half_width, 0.0, 0.2, " m: the arm's reach")
+        self.xy_half_width = checks.between(
+            "xy_half_width", xy_half_width, 0.0, 0.15, " m: further out the mug leaves the image"
+        )
         self.yaw_range = checks.low_high("yaw_range", yaw_range, unit=" in rad")
         self.scene = PandaScene(
             checks.between("mug_scale", mug_scale, 0.5, 1.5, ": it is a multiple of the paper's size"),
@@ -133,7 +136,6 @@ class PandaGraspEnv(POMDPEnv):
         self.state_space = spaces.Box(-np.inf, np.inf, (len(self.state_names),), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
-        self._is_closed = False
         self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
     # The Bullet worlds are made at their first use, and so in the process that uses them.
@@ -152,8 +154,7 @@ class PandaGraspEnv(POMDPEnv):
         return PandaView(scene, gui=self.render_mode == "human")
 
     def _world_arguments(self) -> tuple[PandaScene, Motion, int | None]:
-        if self._is_closed:  # perhaps before there was a BulletClient, which says the same
-            raise RuntimeError("this environment has been closed: make a new one")
+        self.check_open()
         return self.scene, MOTIONS[self.motion], self.solver_iterations
 
     def _shared(self, method: str, *arrays: np.ndarray) -> Any:
@@ -256,12 +257,6 @@ class PandaGraspEnv(POMDPEnv):
     def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
         (depth,) = self._with_noise(self._world.images(self._seen(np.array([state]))), np.random.default_rng(0))
         return depth
-
-    def close(self) -> None:
-        """Close the Bullet worlds and the window; closing twice is fine."""
-        self._is_closed = True
-        for name in {"_world", "_pool", "_view"} & set(self.__dict__):
-            getattr(self, name).close()
 
 
 def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float] | None:

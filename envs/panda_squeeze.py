@@ -52,6 +52,7 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
     shares_work = True
+    resources = frozenset({"_simulation", "_pool", "_view"})
 
     def __init__(
         self,
@@ -77,7 +78,6 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
             " m: else a jaw may come down on the part",
         )
         self.n_processes = checks.count("n_processes", n_processes)
-        self._is_closed = False
         self._film: list[Configuration] = []  # of the last step, if there is a render_mode
 
     # The Bullet worlds are made at their first use, and so in the process that uses them.
@@ -95,8 +95,7 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
         return SqueezeView(self._open_scene())
 
     def _open_scene(self) -> SqueezeScene:
-        if self._is_closed:
-            raise RuntimeError("this environment has been closed: make a new one")
+        self.check_open()
         return self.scene
 
     def _shared(self, method: str, *arrays: np.ndarray) -> Any:
@@ -146,9 +145,3 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
         if not self._film:
             raise ValueError("there is no squeeze to show before step()")
         yield from map(self._view.picture, list(self._film))
-
-    def close(self) -> None:
-        """Close the Bullet worlds; closing twice is fine."""
-        self._is_closed = True
-        for name in {"_simulation", "_pool", "_view"} & set(self.__dict__):
-            getattr(self, name).close()

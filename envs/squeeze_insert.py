@@ -97,7 +97,7 @@ class SqueezeInsertEnv(POMDPEnv):
         return self._with_yaw(yaw, kind)
 
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        self._fingers = float(action[0, 0])
+        self._fingers = float(action[0, 0]) if len(action) == 1 else None  # a batch has many grippers
         yaw = self.yaw(state)
         away = wrap(yaw - action[:, 0])
         rest = np.where(np.abs(away) < self.basin, 0.0, np.sign(away) * RIGHT_ANGLE)

@@ -22,6 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_tdpg.checks import check_count
 from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.presets import DEFAULTS, preset_of
@@ -118,13 +119,20 @@ class BatchedVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render the current state of every episode."""
-        images: list[Any] = []
-        batch_state = self.env._state
-        for state in self._state:
-            self.env._state = state[None]
-            images.append(self.env.render())
-        self.env._state = batch_state
-        return images
+        return [self._rendered(state) for state in self._state]
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """Tile the pictures of all episodes, as every VecEnv; PyBullet's one window shows the first episode."""
+        if self.render_mode == "human" and mode in (None, "human"):
+            return self._rendered(self._state[0])
+        return super().render(mode)
+
+    def _rendered(self, state: np.ndarray) -> Any:
+        before, self.env._state = self.env._state, state[None]
+        try:
+            return self.env.render()
+        finally:
+            self.env._state = before
 
 
 def _spec(env_id: str) -> EnvSpec:
@@ -149,7 +157,8 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
     """
     spec = _spec(env_id)
     creator = _creator(spec)
-    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv) and not spec.additional_wrappers
+    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv)
+    is_batched = is_batched and not spec.additional_wrappers and spec.max_episode_steps is None
     return cast(type[POMDPEnv], creator) if is_batched else None
 
 
@@ -193,8 +202,12 @@ def make_episodes_env(
     :param seed: Seed for the first reset.
     :param use_processes: Whether the Panda environments use one process per core, with the same numbers as without.
     :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
+    :raises ValueError: if a number is not an integer of at least 1.
     :raises gymnasium.error.Error: if the id is not registered.
     """
+    for name, value in dict(n_envs=n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps).items():
+        if value is not None:
+            check_count(name, value)
     env_kwargs = dict(env_kwargs or {})
     env_class, spec = batched_class(env_id), _spec(env_id)
     if env_class is not None:
@@ -203,7 +216,8 @@ def make_episodes_env(
         own = {**spec.kwargs, **env_kwargs}
         env = env_class(**own)
         env.spec = dataclasses.replace(spec, kwargs=own)  # as gym.make does
-        n_envs = n_envs or _default_n_envs(env, n_episodes, epoch_steps, batched=True)
+        if n_envs is None:
+            n_envs = _default_n_envs(env, n_episodes, epoch_steps, batched=True)
         vec_env: VecEnv = BatchedVecEnv(env, n_envs)
         vec_env.seed(seed)
         return vec_env

@@ -13,6 +13,7 @@ from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import LAVA_TABLE_READING
+from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 
 N = 7
 
@@ -200,6 +201,45 @@ def test_an_environment_without_pictures_is_not_asked_for_any(registry):
         env = make_episodes_env("Blind-v0", 2, env_kwargs=dict(horizon=7), seed=1)
     assert env.get_attr("horizon") == [7, 7]
     assert make_episodes_env("Pendulum-v1", 2).render_mode == "rgb_array"
+
+
+def test_a_time_limit_of_the_registration_is_kept(registry):
+    gym.register("LavaShort-v0", "sb3_tdpg.envs.lava:LavaEnv", max_episode_steps=2)
+    env = make_episodes_env("LavaShort-v0", 1, seed=0)
+    env.reset()
+    assert [env.step(np.zeros((1, 1)))[2].item() for _ in range(2)] == [False, True]
+
+
+@pytest.mark.parametrize("name", ["n_envs", "n_episodes", "epoch_steps"])
+@pytest.mark.parametrize("value", [0, -3, 2.5])
+def test_a_number_that_is_none_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name}={value} must be an integer of at least 1"):
+        make_episodes_env("Lava-v0", **{name: value})
+
+
+class Window(LavaEnv):
+    metadata = {**LavaEnv.metadata, "render_modes": ["human"]}
+
+    def render(self):
+        self.shown = self._current_state()
+
+
+def test_a_window_shows_the_first_episode():
+    env = BatchedVecEnv(Window(render_mode="human"), 3)
+    env.reset()
+    for mode in (None, "human"):
+        assert env.render(mode) is None
+        np.testing.assert_array_equal(env.env.shown[0], env.reset_infos[0]["state"])
+    assert env.env._state is None
+
+
+def test_pictures_of_a_batch_have_no_gripper():
+    """Each episode has its own; that of the first stood in every picture."""
+    env = BatchedVecEnv(SqueezeInsertEnv(render_mode="rgb_array"), 2)
+    env.reset()
+    env.step(np.array([[0.0], [1.5]]))
+    grey = [(image == (140, 140, 150)).all(-1).any() for image in env.get_images()]
+    assert grey == [False, False]
 
 
 def test_an_unknown_id_is_refused():

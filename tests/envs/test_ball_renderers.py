@@ -77,6 +77,15 @@ def test_the_renderers_agree_far_from_the_task(robot, ball, lowest):
     assert within_two > lowest
 
 
+@pytest.mark.parametrize("changes", [dict(fov=150.0), dict(camera_pitch=70.0)], ids=words)
+def test_the_wall_is_not_seen_from_behind(changes):
+    """A ray that points back, from beyond the wall, met it at a depth that was positive: minus over minus."""
+    states = random_states(20)
+    states[:, 0] = np.linspace(11.0, 20.0, 20)
+    within_two, _ = compare(scene(**changes), states)
+    assert within_two > 0.995
+
+
 def test_a_ball_around_the_eye_does_no_harm():
     rng = np.random.default_rng(0)
     states = random_states(200)

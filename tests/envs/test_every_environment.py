@@ -1,5 +1,7 @@
 """What every registered environment must satisfy, and what the constructors refuse."""
 
+import copy
+import pickle
 import re
 import warnings
 from pathlib import Path
@@ -206,6 +208,38 @@ def test_processes_give_the_same_episodes_and_end_with_the_environment(env_id, k
             env.step(np.ones(shape))
 
 
+@EVERY_ID
+def test_a_copy_goes_on_as_the_original_and_leaves_it_alone(env_id):
+    """Worlds and processes cannot be copied: half-made copies of a pool's pipes closed those of the original."""
+    env_kwargs = dict(n_processes=2) if gym.make(env_id).unwrapped.shares_work else {}
+    original = make_episodes_env(env_id, 2, env_kwargs=env_kwargs, seed=0)
+    original.reset()
+    actions = np.zeros((2, *original.action_space.shape))
+    copies = copy.deepcopy(original), pickle.loads(pickle.dumps(original))
+    expected = original.step(actions)[:2]
+    for other in copies:
+        np.testing.assert_equal(other.step(actions)[:2], expected)
+        other.close()
+    original.step(actions)
+    original.close()
+
+
+@EVERY_ID
+def test_actions_of_another_shape_are_refused_and_not_counted(env_id):
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=0)
+    (size,) = env.action_space.shape
+    with pytest.raises(ValueError, match=rf"received actions of shape \(1, {size + 1}\): expected \(1, {size}\)"):
+        env.step(np.zeros(size + 1))
+    for _ in range(env.horizon):
+        assert not env.step(np.zeros(size))[3]
+    batch = BatchedVecEnv(env, 3)
+    batch.reset()
+    for shape in ((1, size), (3, size + 1), (3,)):
+        with pytest.raises(ValueError, match=rf"expected \(3, {size}\)"):
+            batch.step(np.zeros(shape))
+
+
 # -- what the constructors refuse ------------------------------------------------------------------------------------
 
 CAMERA_RANGE = r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1"
@@ -250,8 +284,8 @@ REFUSED = {
         (dict(texture=np.zeros((8, 8, 3))), "dtype float64; expected"),
     ],
     PandaGraspEnv: [
-        (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.2 m"),
-        (dict(xy_half_width=np.nan), "xy_half_width=nan must be between 0 and 0.2 m"),
+        (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.15 m"),
+        (dict(xy_half_width=np.nan), "xy_half_width=nan must be between 0 and 0.15 m"),
         (dict(yaw_range=(1.0, -1.0)), r"yaw_range=\(1.0, -1.0\) must be \(low, high\) of finite numbers in rad"),
         (dict(yaw_range=3.0), "yaw_range=3.0 must be"),
         (dict(yaw_range=(0.0, np.inf)), "yaw_range=.* must be"),
