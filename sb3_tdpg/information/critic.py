@@ -149,7 +149,7 @@ class CriticEstimator(InformationEstimator):
 
     @th.no_grad()
     def fit(self, batch: InformationBatch) -> dict[str, float]:
-        """Train the critics on the epoch's samples (Algorithm 1); see :class:`InformationEstimator`."""
+        """Train the critics on the epoch's samples (Algorithm 1); as in every ``InformationEstimator``."""
         train, held_out = self._hold_out(batch)
         if self.standardize:
             self._update_scaling(train)
