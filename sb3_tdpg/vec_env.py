@@ -157,9 +157,9 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
     """
     spec = _spec(env_id)
     creator = _creator(spec)
-    is_batched = isinstance(creator, type) and issubclass(creator, POMDPEnv)
-    is_batched = is_batched and not spec.additional_wrappers and spec.max_episode_steps is None
-    return cast(type[POMDPEnv], creator) if is_batched else None
+    is_ours = isinstance(creator, type) and issubclass(creator, POMDPEnv)
+    is_wrapped = spec.additional_wrappers or spec.max_episode_steps is not None
+    return cast(type[POMDPEnv], creator) if is_ours and not is_wrapped else None
 
 
 def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | None, *, batched: bool) -> int:

@@ -212,7 +212,7 @@ def test_a_time_limit_of_the_registration_is_kept(registry):
 
 @pytest.mark.parametrize("name", ["n_envs", "n_episodes", "epoch_steps"])
 @pytest.mark.parametrize("value", [0, -3, 2.5])
-def test_a_number_that_is_none_is_refused(name, value):
+def test_a_number_of_environments_episodes_or_steps_below_one_is_refused(name, value):
     with pytest.raises(ValueError, match=f"{name}={value} must be an integer of at least 1"):
         make_episodes_env("Lava-v0", **{name: value})
 

@@ -30,8 +30,8 @@ def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[Inf
 
     :raises ValueError: if it is neither.
     """
-    found = ESTIMATORS.get(estimator, estimator) if isinstance(estimator, str) else estimator
-    if isinstance(found, str) and found is not estimator:
+    found = ESTIMATORS.get(estimator) if isinstance(estimator, str) else estimator
+    if isinstance(found, str):
         found = cast(type[InformationEstimator], pkgutil.resolve_name(found))
     if isinstance(found, type) and issubclass(found, InformationEstimator):
         return found

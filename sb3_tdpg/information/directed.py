@@ -13,8 +13,8 @@ RIDGE = 1e-4  # of a regression, in shares of the mean variance of its inputs
 
 class DirectedLogDet(LogDet):
     r"""
-    The bound of :class:`~sb3_tdpg.information.logdet.LogDet` on what a linear regression on the
-    last TRVs leaves of the present ones.
+    The bound of :class:`~sb3_tdpg.information.logdet.LogDet` on what a linear regression on the last TRVs leaves of
+    the present ones.
 
     The penalty becomes the directed information from the sensor to the TRVs. Given x~_{t-1}, the TRVs depend on the
     past only through y_t, hence by the chain rule it bounds all that an episode's TRVs know of its observations:
@@ -37,8 +37,8 @@ class DirectedLogDet(LogDet):
 
 class DirectedLeaveOneOut(LeaveOneOut):
     r"""
-    The bound of :class:`~sb3_tdpg.information.loo.LeaveOneOut` on what a linear regression on the
-    last TRVs leaves of the present ones.
+    The bound of :class:`~sb3_tdpg.information.loo.LeaveOneOut` on what a linear regression on the last TRVs leaves of
+    the present ones.
 
     It bounds the same directed information as :class:`DirectedLogDet`. With :math:`r_i = \tilde x_i - A_t
     \tilde x_{i, t-1}`, and :math:`q_j` the density of r in episode j, a Gaussian around
