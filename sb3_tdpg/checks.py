@@ -31,7 +31,6 @@ OF_PPO = dict(
     clip_range_vf="nothing: the value network is not clipped",
     use_sde="the noise of the TRVs, policy_kwargs=dict(encoder_log_var_init=...), which lasts from step to step",
     sde_sample_freq="nothing: the noise is drawn at each step",
-    target_kl="clip_range; train/approx_kl logs the divergence",
     rollout_buffer_class="nothing: rollouts are whole episodes",
     rollout_buffer_kwargs="nothing: rollouts are whole episodes",
 )
@@ -92,7 +91,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
                 f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
                 "returns one; float('inf') turns the clipping off"
             )
-    for name in ("gamma", "gae_lambda", "max_grad_norm"):
+    for name in ("gamma", "gae_lambda", "max_grad_norm", "target_kl"):
         if not isinstance(settings[name], (int, float, np.number)):
             raise ValueError(f"{name}={settings[name]!r} must be a number")
     seed = settings["seed"]
@@ -108,6 +107,13 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     if not settings["max_grad_norm"] > 0:
         raise ValueError(
             f"max_grad_norm={settings['max_grad_norm']} must be positive; float('inf') turns the clipping off"
+        )
+    if not settings["target_kl"] > 0:
+        raise ValueError(f"target_kl={settings['target_kl']} must be positive; float('inf') sets no limit")
+    if math.isfinite(settings["target_kl"]) and math.isinf(clip_ranges[0]):
+        raise ValueError(
+            f"target_kl={settings['target_kl']} limits several updates on the same rollouts, and clip_range=inf allows "
+            "one: give clip_range=0.2, as in PPO, or leave target_kl out"
         )
 
 
@@ -312,6 +318,15 @@ def check_floors(**floors: float | None) -> None:
     for name, floor in floors.items():
         if floor is not None and not floor >= 0:
             raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
+
+
+def check_action_mean(means: Sequence[float], space: spaces.Space) -> np.ndarray:
+    """Return the first means of the actions, ``(U,)``, or raise a ``ValueError`` if they are not those of a Box."""
+    array = np.asarray(means, dtype=np.float32).ravel()
+    size = math.prod(space.shape) if isinstance(space, spaces.Box) else 0
+    if len(array) != size or not np.isfinite(array).all():
+        raise ValueError(f"policy_kwargs: action_mean_init={means!r} must be {size} numbers, one for each in {space}")
+    return array
 
 
 def check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:

@@ -402,7 +402,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             ) from e
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_problem"]
+        return [*super()._excluded_save_params(), "_problem", "_has_default_device"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         # The estimator's state dict holds its optimiser, too.

@@ -25,7 +25,15 @@ from torch.distributions import Normal
 from torch.nn import functional as F
 
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
-from sb3_tdpg.checks import check_count, check_floors, check_memory, check_net_arch, check_single, check_time
+from sb3_tdpg.checks import (
+    check_action_mean,
+    check_count,
+    check_floors,
+    check_memory,
+    check_net_arch,
+    check_single,
+    check_time,
+)
 from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, BatchedLinear, TimeMLP, bounded_variance
 from sb3_tdpg.common.running_norms import Changes
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
@@ -74,6 +82,8 @@ class TRVPolicy(BasePolicy):
     :param gate: Whether a gate g in [0, 1] for each TRV, another output of the encoder, decides how much of the last
         TRVs is kept, as the update gate of a GRU: ``mean = g * candidate + (1 - g) * last TRVs``, where the candidate
         is the mean without a gate. The policy then remembers over many steps. Not with ``skip``.
+    :param action_mean_init: The action to begin with, ``(U,)``, in the units of the head's outputs; default: near 0
+        (Box actions).
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0.
     :param action_log_var_init: The same for the action head (Box actions).
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
@@ -111,6 +121,7 @@ class TRVPolicy(BasePolicy):
         shared_action_noise: bool | None = None,
         squash_trv_mean: bool | None = None,
         gate: bool | None = None,
+        action_mean_init: Sequence[float] | None = None,
         encoder_log_var_init: float | None = None,
         action_log_var_init: float | None = None,
         encoder_var_floor: float | None = None,
@@ -143,6 +154,7 @@ class TRVPolicy(BasePolicy):
         self.squash_trv_mean = default(squash_trv_mean, not defaults.is_long)
         self.gate = default(gate, defaults.gate)
         self.activation_fn = activation_fn
+        self.action_mean_init = action_mean_init
         self.encoder_log_var_init = default(encoder_log_var_init, defaults.encoder_log_var_init)
         self.action_log_var_init = default(action_log_var_init, defaults.action_log_var_init)
         self.encoder_var_floor = default(encoder_var_floor, defaults.encoder_var_floor)
@@ -170,6 +182,9 @@ class TRVPolicy(BasePolicy):
         if defaults.is_long:  # begin near the middle of the actions, and with little else than the features in the TRVs
             self.encoder.scale_output(0.1)
             self.action_head.scale_output(0.1)
+        if action_mean_init is not None:
+            means = check_action_mean(action_mean_init, action_space)
+            cast(BatchedLinear, self.action_head.mlp.layers[-1]).bias.data[..., : len(means)] = th.as_tensor(means)
         if self.shared_action_noise and isinstance(self.action_dist, DiagGaussianDistribution):
             self.action_log_var = nn.Parameter(th.zeros(self.action_dist.action_dim))
         if self.scale_actions and isinstance(action_space, spaces.Box):

@@ -38,6 +38,7 @@ class Defaults(NamedTuple):
     gamma: float | None = 1.0  # None: by the horizon
     gae_lambda: float = 0.95
     max_grad_norm: float = float("inf")
+    target_kl: float = float("inf")
     share: str = "95%"  # the cost_limit of beta="auto"
 
 

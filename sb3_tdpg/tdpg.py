@@ -100,6 +100,8 @@ class TDPG(EpisodicAlgorithm):
     :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO.
     :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
+    :param target_kl: As in PPO: the passes of an epoch end when the policy has moved by 1.5 times this divergence, in
+        nats a step; ``inf``: no limit. It needs a ``clip_range``.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning.
     :param gamma: Discount factor; the paper has none.
@@ -115,7 +117,8 @@ class TDPG(EpisodicAlgorithm):
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.
     :param verbose: 0: no output; 1: a table per epoch; 2: debug messages.
     :param seed: Seed of all random number generators. The episodes also depend on the number of environments.
-    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``: a GPU, if there is one, for images; for vectors the CPU, which
+        is faster.
     :param n_threads: Threads of torch and of NumPy's linear algebra during ``learn``; default: 1, which is fastest for
         small networks and gives the same numbers on any machine; for images torch's setting.
     :param _init_setup_model: Whether to build the networks in the constructor.
@@ -145,6 +148,7 @@ class TDPG(EpisodicAlgorithm):
         n_epochs: int | None = None,
         batch_size: int | None = None,
         clip_range: float | Schedule | None = None,
+        target_kl: float | None = None,
         normalize_advantage: bool | None = None,
         gamma: float | None = None,
         gae_lambda: float | None = None,
@@ -176,6 +180,7 @@ class TDPG(EpisodicAlgorithm):
         self.preset = None if env is None or not _init_setup_model else preset_of(env.observation_space, horizon)
         settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1), horizon or 1)
         self._has_default_batch_size = batch_size is None
+        self._has_default_device = device == "auto"
         check_policy(policy, self.policy_aliases)
         check_arguments({**settings, "seed": seed})
         super().__init__(
@@ -204,6 +209,7 @@ class TDPG(EpisodicAlgorithm):
         self.n_epochs: int = settings["n_epochs"]
         self.batch_size: int | None = settings["batch_size"]
         self.clip_range: Any = settings["clip_range"]
+        self.target_kl: float = settings["target_kl"]
         self.normalize_advantage: bool = settings["normalize_advantage"]
         self.n_threads: int | None = settings["n_threads"]
         self.nuisance = nuisance
@@ -222,6 +228,8 @@ class TDPG(EpisodicAlgorithm):
         check_policy(self.policy_class, self.policy_aliases)
         check_arguments(vars(self))
         self.lr_schedule = FloatSchedule(schedule_of("learning_rate", self.learning_rate))
+        if self._has_default_device and self.preset in ("vector", "long"):
+            self.device = th.device("cpu")
         self.set_random_seed(self.seed)
         if self.env is not None:
             self._set_problem(self._check_problem(self.env), self.env)
@@ -333,38 +341,39 @@ class TDPG(EpisodicAlgorithm):
             with th.no_grad():
                 old_log_prob = self.policy.stored_log_prob(passes, self.encoder_gradient)
 
-        for _ in range(self.n_epochs):
-            for columns in self._minibatches(passes):
-                part = passes.select(columns)
-                log_prob, rebuilt = self.policy.evaluate_episodes(part, self.encoder_gradient, mi_coef > 0.0)
-                if old_log_prob is None:
-                    policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
-                else:
-                    old = old_log_prob[:, columns]
-                    policy_loss = losses.clipped_policy_loss(log_prob, old, part.advantages, part.alive, clip_range)
-                    kl, clip_fraction = losses.policy_distance(log_prob.detach(), old, part.alive, clip_range)
-                    self.logger.record_mean("train/approx_kl", kl.item())
-                    self.logger.record_mean("train/clip_fraction", clip_fraction.item())
-                if in_segments:  # the loss of a step: segments are of no fixed number
-                    policy_loss = policy_loss * len(part.costs[0]) / part.alive.sum()
-                loss = policy_loss
-                if rebuilt is not None and mi_coef > 0.0:
-                    # Equation 15: the critics are frozen, and the gradient flows through the rebuilt TRVs.
-                    samples = part._replace(**rebuilt._asdict()).information_batch(self.pools_information)
-                    mi_loss = mi_coef * losses.information_loss(self.estimator(samples))
-                    loss = loss + mi_loss / cost_scale
-                    self.logger.record_mean("train/mi_loss", mi_loss.item())
-                self._check_finite("policy loss", policy_loss)
-                self._check_finite("loss", loss)
+        for columns in (part for _ in range(self.n_epochs) for part in self._minibatches(passes)):
+            part = passes.select(columns)
+            log_prob, rebuilt = self.policy.evaluate_episodes(part, self.encoder_gradient, mi_coef > 0.0)
+            if old_log_prob is None:
+                policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
+            else:
+                old = old_log_prob[:, columns]
+                policy_loss = losses.clipped_policy_loss(log_prob, old, part.advantages, part.alive, clip_range)
+                kl, clip_fraction = losses.policy_distance(log_prob.detach(), old, part.alive, clip_range)
+                self.logger.record_mean("train/approx_kl", kl.item())
+                self.logger.record_mean("train/clip_fraction", clip_fraction.item())
+                if kl > 1.5 * self.target_kl:
+                    break
+            if in_segments:  # the loss of a step: segments are of no fixed number
+                policy_loss = policy_loss * len(part.costs[0]) / part.alive.sum()
+            loss = policy_loss
+            if rebuilt is not None and mi_coef > 0.0:
+                # Equation 15: the critics are frozen, and the gradient flows through the rebuilt TRVs.
+                samples = part._replace(**rebuilt._asdict()).information_batch(self.pools_information)
+                mi_loss = mi_coef * losses.information_loss(self.estimator(samples))
+                loss = loss + mi_loss / cost_scale
+                self.logger.record_mean("train/mi_loss", mi_loss.item())
+            self._check_finite("policy loss", policy_loss)
+            self._check_finite("loss", loss)
 
-                self.policy.optimizer.zero_grad()
-                loss.backward()
-                grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
-                self._check_finite("gradient", grad_norm)
-                self.policy.optimizer.step()
-                self.logger.record_mean("train/policy_loss", policy_loss.item())
-                self.logger.record_mean("train/loss", loss.item())
-                self.logger.record_mean("train/grad_norm", grad_norm.item())
+            self.policy.optimizer.zero_grad()
+            loss.backward()
+            grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self._check_finite("gradient", grad_norm)
+            self.policy.optimizer.step()
+            self.logger.record_mean("train/policy_loss", policy_loss.item())
+            self.logger.record_mean("train/loss", loss.item())
+            self.logger.record_mean("train/grad_norm", grad_norm.item())
         # Last: the rollouts and all of their gradients saw the same inputs.
         self.policy.update_statistics(whole)
 

@@ -123,6 +123,8 @@ ARGUMENTS = {
     "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),
     "max_grad_norm negative": (dict(max_grad_norm=-1.0), "max_grad_norm=-1.0", "positive", "inf"),
     "max_grad_norm NaN": (dict(max_grad_norm=math.nan), "max_grad_norm=nan", "positive", "inf"),
+    "target_kl zero": (dict(target_kl=0.0), "target_kl=0.0", "positive", "inf"),
+    "target_kl without clipping": (dict(target_kl=0.1), "target_kl=0.1", "clip_range=inf", "clip_range=0.2"),
     "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "non-negative"),
     "learning_rate NaN": (dict(learning_rate=math.nan), "learning_rate=nan", "not negative|positive|finite"),
     "learning_rate a string": (dict(learning_rate="1e-3"), "learning_rate='1e-3'", "number"),
@@ -166,6 +168,9 @@ ARGUMENTS = {
     ),
     "unknown key of net_arch": (
         dict(policy_kwargs=dict(net_arch=dict(pi=[64]))), "net_arch", r"\['action_head', 'encoder'\]"
+    ),
+    "action_mean_init too long": (
+        dict(policy_kwargs=dict(action_mean_init=[0.1, 0.2])), r"action_mean_init=\[0.1, 0.2\]", "1 numbers", "Box"
     ),
     "net_arch a list": (dict(policy_kwargs=dict(net_arch=[64, 64])), "net_arch", r"\['action_head', 'encoder'\]"),
     "trv_dim zero": (dict(policy_kwargs=dict(trv_dim=0)), "trv_dim=0", "at least 1"),

@@ -205,6 +205,16 @@ def test_an_epoch_logs_what_it_did():
     assert modes == [True] * 4
 
 
+@pytest.mark.parametrize(("target_kl", "n_steps"), [(1e-9, 1), (math.inf, 8)])
+def test_the_passes_end_when_the_policy_has_moved_far(target_kl, n_steps):
+    model = tiny_tdpg(n_episodes=40, n_epochs=4, batch_size=20, clip_range=0.2, learning_rate=1e-2, target_kl=target_kl)
+    steps = []
+    step = model.policy.optimizer.step
+    model.policy.optimizer.step = lambda *_: (steps.append(1), step())[1]
+    train_epochs(model, 1)
+    assert len(steps) == n_steps
+
+
 def test_a_small_weight_is_a_penalty_too():
     model = train_epochs(tiny_tdpg(n_episodes=40, beta=10.0, mi_estimator="logdet"), 1)
     assert model.logger.name_to_value["train/mi_loss"] == pytest.approx(0.1 * model.information.sum(), rel=1e-4)

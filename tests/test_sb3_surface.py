@@ -282,6 +282,14 @@ def test_the_discount_reaches_the_advantages():
     assert not th.allclose(*gradients)
 
 
+def test_vectors_stay_on_the_cpu_unless_asked(tmp_path, monkeypatch):
+    tiny_tdpg().save(tmp_path / "model")
+    monkeypatch.setattr("stable_baselines3.common.base_class.get_device", lambda device: th.device("cuda"))
+    assert tiny_tdpg(device="auto").device.type == "cpu"
+    assert TDPG.load(tmp_path / "model", device="auto").device.type == "cpu"
+    assert tiny_tdpg(device="cuda:0", _init_setup_model=False).device.type == "cuda"
+
+
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("mi_estimator", ["mine", "logdet"])
 def test_everything_runs_on_the_gpu(mi_estimator, tmp_path):
