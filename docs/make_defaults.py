@@ -32,7 +32,8 @@ def shown(name: str, kind: str, value: Any) -> str:
         pooled = f"means of {value['pool']} x {value['pool']} pixels, " if "pool" in value else ""
         layers = ", ".join(f"{n} ({size} x {size})" for n, size, _ in value["layers"])
         linear = f", {value['features_dim']} features" if "features_dim" in value else ""
-        return f"{pooled}channels {layers}{linear}"
+        keypoints = ", keypoints" if value.get("keypoints") else ""
+        return f"{pooled}channels {layers}{linear}{keypoints}"
     if name == "trv_dim" and kind == "long":
         return f"features + {value}"
     if value is None:

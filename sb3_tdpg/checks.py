@@ -110,11 +110,6 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
         )
     if not settings["target_kl"] > 0:
         raise ValueError(f"target_kl={settings['target_kl']} must be positive; float('inf') sets no limit")
-    if math.isfinite(settings["target_kl"]) and math.isinf(clip_ranges[0]):
-        raise ValueError(
-            f"target_kl={settings['target_kl']} limits several updates on the same rollouts, and clip_range=inf allows "
-            "one: give clip_range=0.2, as in PPO, or leave target_kl out"
-        )
 
 
 def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) -> None:

@@ -16,7 +16,8 @@ from torch.nn.functional import avg_pool2d
 
 from sb3_tdpg.common.running_norms import RunningNorm
 
-MIN_SIDE = 12  # pixels, the minimum for the two convolutions for depth images
+MIN_SIDE = 12  # pixels, the minimum for the paper's two convolutions
+LEAST_MAP = 3  # side of the smallest map in which a position means something
 
 
 def observation_kind(space: spaces.Space | None, *, normalize_images: bool = True) -> str:
@@ -49,12 +50,42 @@ def flat_action_space(space: spaces.Space) -> spaces.Space:
     return space
 
 
-def least_side(layers: Sequence[tuple[int, int, int]]) -> int:
+def least_side(layers: Sequence[tuple[int, int, int]], keypoints: bool = False) -> int:
     """Return the smallest side of an image, in pixels, for convolutions given as in :class:`TRVCnn`."""
-    side = 1
+    side = LEAST_MAP if keypoints else 1
     for _, kernel_size, stride in reversed(layers):
         side = stride * (side - 1) + kernel_size
     return side
+
+
+class SpatialSoftmax(nn.Module):
+    r"""
+    Where each channel is active: the mean position of its pixels under a softmax, a *keypoint*.
+
+    .. math::
+        p_c = \sum_i \mathrm{softmax}_i(\alpha_c z_{ci}) \, (x_i, y_i)
+
+    over the pixels i, with positions from -1 to 1, the activations :math:`z_{ci}` standardised over the image, and a
+    learned factor :math:`\alpha_c`. What moves in the image moves its keypoint in proportion, also to where it never
+    was in training. From Levine et al. (2016), End-to-end training of deep visuomotor policies, who do not standardise.
+
+    :param channels: C
+    :param height: H
+    :param width: W
+    """
+
+    def __init__(self, channels: int, height: int, width: int) -> None:
+        super().__init__()
+        self.log_factor = nn.Parameter(th.full((channels, 1), math.log(2.0)))
+        self.norm = nn.LayerNorm(height * width, elementwise_affine=False)
+        y, x = th.meshgrid(th.linspace(-1, 1, height), th.linspace(-1, 1, width), indexing="ij")
+        self.positions: th.Tensor
+        self.register_buffer("positions", th.stack([x.flatten(), y.flatten()], dim=1), persistent=False)
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """``(N, C, H, W) -> (N, 2 C)``: x and y of the first channel, of the second, ..."""
+        weights = th.softmax(self.norm(maps.flatten(2)) * self.log_factor.exp(), dim=2)
+        return (weights @ self.positions).flatten(1)
 
 
 class TRVCnn(BaseFeaturesExtractor):
@@ -64,6 +95,9 @@ class TRVCnn(BaseFeaturesExtractor):
     With ``pool`` every square of ``pool x pool`` pixels is replaced by its mean before: a layer of stride 2 would
     otherwise turn fine textures, finer than its own step, into coarse ones (aliasing), and textures that were never
     seen then move the features most.
+
+    With ``keypoints`` the last layer's maps are replaced by the positions at which they are active
+    (:class:`SpatialSoftmax`), without its nonlinearity: where a thing is, and not how it looks.
 
     Images of floats (depth in m, say) are first scaled from the bounds of their space to [-1, 1], if these are finite.
 
@@ -75,6 +109,7 @@ class TRVCnn(BaseFeaturesExtractor):
         makes them less sensitive to the contrast.
     :param pool: Side of the squares in pixels; 1: no pooling, as in the paper. Images that would be too small for the
         layers are not pooled.
+    :param keypoints: Whether the features are positions: two for each channel of the last layer.
     :raises ValueError: if the images are too small for the layers.
     """
 
@@ -86,9 +121,10 @@ class TRVCnn(BaseFeaturesExtractor):
         features_dim: int | None = None,
         layer_norm: bool = False,
         pool: int = 1,
+        keypoints: bool = False,
     ) -> None:
         super().__init__(observation_space, features_dim=1)
-        needed = least_side(layers)
+        needed = least_side(layers, keypoints)
         self.image_size = observation_space.shape[1:]
         if min(self.image_size) < needed:
             raise ValueError(f"images of {self.image_size} pixels are too small for layers={layers}, {needed} a side")
@@ -101,9 +137,12 @@ class TRVCnn(BaseFeaturesExtractor):
         for n_channels, kernel_size, stride in layers:
             modules += [nn.Conv2d(channels, n_channels, kernel_size, stride=stride), activation_fn()]
             channels = n_channels
-        self.cnn = nn.Sequential(*modules, nn.Flatten())
         with th.no_grad():
-            self._features_dim = self.cnn(self.pooled(th.zeros(1, *observation_space.shape))).shape[1]
+            maps = nn.Sequential(*modules)(self.pooled(th.zeros(1, *observation_space.shape)))
+        if keypoints:
+            modules[-1] = SpatialSoftmax(*maps.shape[1:])
+        self.cnn = nn.Sequential(*modules, nn.Flatten())
+        self._features_dim = 2 * channels if keypoints else maps[0].numel()
         if features_dim is not None:
             norm = [nn.LayerNorm(features_dim)] if layer_norm else []
             self.cnn.extend([nn.Linear(self._features_dim, features_dim), *norm, activation_fn()])

@@ -101,7 +101,7 @@ class TDPG(EpisodicAlgorithm):
     :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
     :param target_kl: As in PPO: the passes of an epoch end when the policy has moved by 1.5 times this divergence, in
-        nats a step; ``inf``: no limit. It needs a ``clip_range``.
+        nats a step; ``inf``: no limit.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning.
     :param gamma: Discount factor; the paper has none.

@@ -124,7 +124,6 @@ ARGUMENTS = {
     "max_grad_norm negative": (dict(max_grad_norm=-1.0), "max_grad_norm=-1.0", "positive", "inf"),
     "max_grad_norm NaN": (dict(max_grad_norm=math.nan), "max_grad_norm=nan", "positive", "inf"),
     "target_kl zero": (dict(target_kl=0.0), "target_kl=0.0", "positive", "inf"),
-    "target_kl without clipping": (dict(target_kl=0.1), "target_kl=0.1", "clip_range=inf", "clip_range=0.2"),
     "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "non-negative"),
     "learning_rate NaN": (dict(learning_rate=math.nan), "learning_rate=nan", "not negative|positive|finite"),
     "learning_rate a string": (dict(learning_rate="1e-3"), "learning_rate='1e-3'", "number"),

@@ -254,6 +254,17 @@ def test_the_variances_have_the_floors_and_offsets_that_were_asked_for():
     assert louder.stds.min() > 4
 
 
+@pytest.mark.parametrize("scale_actions", [False, True])
+def test_the_first_actions_are_those_asked_for(scale_actions):
+    space = spaces.Box(-4.0, 4.0, (2,), np.float32)
+    asked = np.array([0.25, -0.5], np.float32)
+    policy = make_policy(action_space=space, action_mean_init=asked.tolist(), scale_actions=scale_actions)
+    with th.no_grad():
+        policy.action_head.mlp.layers[-1].weight.zero_()
+        means = policy.action_gaussian(policy.action_head.at(th.zeros(N, 2), 1))[0].numpy()
+    np.testing.assert_allclose(means, np.tile(asked * (4 if scale_actions else 1), (N, 1)), rtol=1e-6)
+
+
 def test_sizes_and_activations_are_those_of_the_policy_kwargs():
     policy = make_policy(trv_dim=5, net_arch=dict(encoder=[7, 9], action_head=[]), activation_fn=th.nn.Tanh)
     assert [tuple(layer.weight.shape) for layer in policy.encoder.mlp.layers] == [(T, 8, 7), (T, 7, 9), (T, 9, 10)]
@@ -275,15 +286,20 @@ def test_the_paper_s_convolutions_stand_before_the_encoder_of_small_images_and_o
     assert not np.allclose(dark, bright)
 
 
-def test_depth_images_have_the_network_of_the_papers_grasping_problem():
-    policy = make_policy(spaces.Box(0.2, 0.7, (1, 128, 128), np.float32), horizon=1)
+@pytest.mark.parametrize(("kwargs", "channels", "n_features"), [
+    (None, 16, 32),
+    (dict(layers=((6, 6, 2), (6, 4, 2)), keypoints=False), 6, 5400),  # the paper's
+])  # fmt: skip
+def test_depth_images_have_the_papers_network_of_grasping_but_for_keypoints(kwargs, channels, n_features):
+    space = spaces.Box(0.2, 0.7, (1, 128, 128), np.float32)
+    policy = make_policy(space, horizon=1, features_extractor_kwargs=kwargs)
     convolutions = [layer for layer in policy.features_extractor.cnn if isinstance(layer, th.nn.Conv2d)]
     assert [(c.out_channels, c.kernel_size, c.stride) for c in convolutions] == [
-        (6, (6, 6), (2, 2)),
-        (6, (4, 4), (2, 2)),
+        (channels, (6, 6), (2, 2)),
+        (channels, (4, 4), (2, 2)),
     ]
     shapes = [tuple(layer.weight.shape[1:]) for layer in policy.encoder.mlp.layers]
-    assert shapes == [(16 + 5400, 128), (128, 64), (64, 32)]
+    assert shapes == [(16 + n_features, 128), (128, 64), (64, 32)]
     assert [tuple(layer.weight.shape[1:]) for layer in policy.action_head.mlp.layers] == [(16, 64), (64, 64), (64, 4)]
     assert isinstance(policy.encoder.mlp.activation, th.nn.Tanh)
     assert isinstance(policy.action_head.mlp.activation, th.nn.ELU)

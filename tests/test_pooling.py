@@ -1,4 +1,4 @@
-"""The encoder of images: pixels are pooled to their means before the first layer."""
+"""The encoder of images: pixels are pooled to their means before the first layer, or keypoints follow the last."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ from stable_baselines3 import PPO
 from torch import nn
 from torch.nn.functional import avg_pool2d
 
-from sb3_tdpg.features import TRVCnn
+from sb3_tdpg.features import SpatialSoftmax, TRVCnn, least_side
+from sb3_tdpg.policies import TRVPolicy
 
 
 @pytest.mark.parametrize("shape", [(3, 24, 24), (1, 25, 26), (3, 26, 25)])
@@ -53,6 +54,34 @@ def test_a_last_linear_layer_gives_the_number_of_features_that_was_asked_for():
 def test_images_smaller_than_the_layers_are_refused():
     with pytest.raises(ValueError, match=r"\(9, 9\) pixels are too small for layers=.*10 a side"):
         TRVCnn(spaces.Box(0, 255, (3, 9, 9), np.uint8))
+
+
+@pytest.mark.parametrize("axis", [2, 3])
+def test_a_keypoint_moves_in_proportion_to_what_moves_in_the_image(axis):
+    space = spaces.Box(0.0, 1.0, (1, 64, 48), np.float32)
+    th.manual_seed(0)
+    cnn = TRVCnn(space, layers=((8, 6, 2), (5, 4, 2)), keypoints=True)
+    first = th.full((1, 1, 64, 48), 0.8)
+    first[:, :, 18:30, 16:26] = 0.1
+    images = th.cat([first.roll(shift, axis) for shift in (-4, 0, 4, 8)])  # the layers' step is 4 pixels
+    x_and_y = cnn(images).view(4, 5, 2)
+    moved = th.diff(x_and_y, dim=0)  # (3, channels, 2)
+    along, across = moved[..., 3 - axis], moved[..., axis - 2]
+    assert across.abs().max() < 1e-5 < 0.01 < along[0].abs().max()
+    th.testing.assert_close(along[1:], along[:1].expand(2, -1), atol=1e-5, rtol=1e-4)
+    assert cnn.features_dim == 10
+    assert x_and_y.abs().max() <= 1
+
+
+def test_keypoints_need_a_map_and_small_depth_images_have_the_papers_layers():
+    layers = ((16, 6, 2), (16, 4, 2))
+    assert least_side(layers, keypoints=True) == 20
+    with pytest.raises(ValueError, match="20 a side"):
+        TRVCnn(spaces.Box(0, 1, (1, 19, 30), np.float32), layers, keypoints=True)
+    for side in (19, 20):
+        space = spaces.Box(0, 1, (1, side, 30), np.float32)
+        policy = TRVPolicy(space, spaces.Box(-1, 1, (1,)), lambda _: 1e-3, horizon=1)
+        assert any(isinstance(module, SpatialSoftmax) for module in policy.modules()) == (side == 20)
 
 
 def test_the_convolutions_can_stand_in_sb3s_own_policies():
