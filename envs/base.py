@@ -85,7 +85,11 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
 
     @abstractmethod
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """Return a new array x_{t+1} ~ p(. | x_t, u_t): ``(N, X)`` from ``(N, X)`` and ``(N, U)``."""
+        """
+        Return a new array x_{t+1} ~ p(. | x_t, u_t): ``(N, X)`` from ``(N, X)`` and ``(N, U)``.
+
+        Actions of a ``Discrete`` space are ``(N,)``, here and in :meth:`cost`.
+        """
 
     @abstractmethod
     def sensor(self, state: np.ndarray) -> np.ndarray:
@@ -127,7 +131,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(
                 f"{type(self).__name__} received an action that is not finite: {bad}; the policy has probably diverged"
             )
-        action = np.clip(action, self.action_space.low, self.action_space.high)
+        if isinstance(self.action_space, spaces.Box):
+            action = np.clip(action, self.action_space.low, self.action_space.high)
         cost = self.cost(state, action)
         next_state = self.dynamics(state, action)
         if is_last:
@@ -152,7 +157,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"the episode has not begun or is over (horizon={self.horizon}): call reset() first"
             )
         terminated = self._time + 1 == self.horizon
-        batch = np.asarray(action, dtype=np.float64).reshape(1, -1)
+        batch = np.asarray(action, dtype=np.float64)
+        batch = batch.reshape(1, -1) if self.action_space.shape else batch.reshape(1)
         self._state, observation, cost, details = self.step_batch(self._state, batch, is_last=terminated)
         self._time += 1
         info = {"state": self._state[0].copy(), "cost": float(cost[0])}

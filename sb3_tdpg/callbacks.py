@@ -160,12 +160,17 @@ class SelectionCallback(TDPGCallback):
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
-            self.best = Candidate.from_json(_record_path(self.save_path).read_text())
+            found = Candidate.from_json(_record_path(self.save_path).read_text())
+            if not self._is_eligible(found):  # selected under other limits
+                return
+            self.best = found
             # Loading the whole model would seed all random number generators.
             _, parameters, _ = load_from_zip_file(self.save_path, device=self.model.device, load_data=False)
             self._best_policy = cast("dict[str, th.Tensor]", parameters["policy"])
         elif not resumes:
             self.best, self._best_policy = None, None
+            if self.save_path is not None:  # the selection of an earlier training is not one of this training
+                _record_path(self.save_path).unlink(missing_ok=True)
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg

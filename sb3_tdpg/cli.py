@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import os
 import pkgutil
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -209,7 +210,7 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
         if key in keywords:
             raise ValueError(f"{text!r}: {key} is given twice")
         try:
-            keywords[key] = _plain(yaml.safe_load(value))
+            keywords[key] = _plain(yaml.load(value, _Loader))
         except (yaml.YAMLError, TypeError) as e:
             raise ValueError(
                 f"{text!r}: the value must be a number, a text, true, false, null or a list of these"
@@ -217,13 +218,18 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
     return keywords
 
 
+class _Loader(yaml.SafeLoader):
+    """Also reads 1e-3 and inf as numbers, which YAML 1.1 reads as text; text in quotes stays text."""
+
+
+_NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789in"))
+
+
 def _plain(value: Any) -> Any:
-    """Refuse anything but scalars and lists, and read 1e-3 as a number, which PyYAML reads as text."""
+    """Refuse anything but scalars and lists."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
-    if isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            return float(value)
     if not isinstance(value, (str, bool, int, float, type(None))):
         raise TypeError(f"{value!r} is a {type(value).__name__}")
     return value
@@ -241,7 +247,11 @@ ZOO_PROGRAMS = {
 def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
     """Whether to call a program of rl-zoo3; its ``enjoy`` takes no file."""
     program = arguments[0] if arguments else None
-    return program in ZOO_PROGRAMS or (program == "enjoy" and not any(a.endswith(".zip") for a in arguments))
+    return program in ZOO_PROGRAMS or (
+        program == "enjoy"
+        and not any(a.endswith(".zip") for a in arguments)
+        and all(a[:1] == "-" for a in arguments[1:2])
+    )
 
 
 def _integer(least: int) -> Callable[[str], int]:

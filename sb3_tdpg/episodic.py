@@ -13,6 +13,7 @@ import os
 import traceback
 import warnings
 from collections.abc import Collection, Iterable
+from inspect import signature
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -27,7 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.advantages import ValueFunction
 from sb3_tdpg.buffers import EpisodeBuffer, each
-from sb3_tdpg.checks import nearest_multiples
+from sb3_tdpg.checks import nearest_multiples, refuse_others
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.information import InformationEstimator
@@ -384,6 +385,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
             if kwargs.get(one) is not None:
                 kwargs.setdefault(other, None)
+        known = {name for each in cls.__mro__[:-1] for name in signature(each).parameters}
+        refuse_others({name: 0 for name in kwargs if name not in known and name[0] != "_"}, known)
         if "batch_size" in kwargs:
             kwargs.setdefault("_has_default_batch_size", kwargs["batch_size"] is None)
         try:
@@ -392,6 +395,14 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             # Damaged bytes lead to any error, but the arguments of this call to none while the file is read.
             names = [frame.f_code.co_name for frame, _ in traceback.walk_tb(e.__traceback__)]
             is_read = "load_from_zip_file" in names or ("set_parameters" in names and not kwargs)
+            changed = [
+                f"{k}={value!r}" for k, value in kwargs.items() if k in ("mi_estimator", "mi_kwargs", "baseline")
+            ]
+            if "set_parameters" in names and changed:
+                raise ValueError(
+                    f"{path} has no networks for {', '.join(changed)}: load it with what it was trained with, or make "
+                    "a new model, and model.policy.load_state_dict(TDPG.load(path).policy.state_dict())"
+                ) from e
             # What SB3 itself finds missing: "No data found in the saved file", and keys of the data.
             is_lacking = names[-1] == "load" and isinstance(e, (AssertionError, KeyError))
             if isinstance(e, OSError) or not (is_read or is_lacking):

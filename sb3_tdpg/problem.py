@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, VecEnvWrapper, VecMonitor
 
 from sb3_tdpg.features import observation_kind
 
@@ -59,7 +59,7 @@ class Problem:
 
     def _states(self, env: VecEnv, infos: list[dict[str, Any]], obs: np.ndarray) -> np.ndarray:
         if self.state_is_observation:
-            obs = vars(env).get("unperturbed", obs)  # of a PerturbedVecEnv
+            obs = unperturbed(env, obs)
             parts = list(obs.values()) if isinstance(obs, dict) else [obs]
             return np.concatenate([x.reshape(len(x), -1) for x in parts], axis=1, dtype=np.float32)
         try:
@@ -73,6 +73,13 @@ class Problem:
                     f"{(self.state_dim,)}: mend reset() and step(), or the space"
                 )
         return np.stack(states)
+
+
+def unperturbed(env: VecEnv, obs: Any) -> Any:
+    """Return the observations as they were before every ``PerturbedVecEnv``, also of one inside another."""
+    while isinstance(env, VecEnvWrapper) and ("unperturbed" in vars(env) or type(env) in (VecMonitor, VecCheckNan)):
+        obs, env = vars(env).get("unperturbed", obs), env.venv
+    return obs
 
 
 def read_problem(env: VecEnv) -> Problem:

@@ -151,6 +151,18 @@ def test_a_selection_goes_on_with_a_resumed_training_and_starts_anew_with_a_new_
     assert fresh.best.epoch == 0
 
 
+def test_a_selection_of_another_training_or_under_looser_limits_is_not_taken_over(tmp_path):
+    path = tmp_path / "best"
+    train_epochs(tiny_tdpg(), 3, callback=[Scripted(MEASURED), SelectionCallback(cost_limit=40.0, save_path=path)])
+    assert path.with_suffix(".json").exists()
+    tighter = SelectionCallback(cost_limit=1.0, save_path=path)
+    model = train_epochs(tiny_tdpg(), 1)
+    train_epochs(model, 1, callback=tighter, reset_num_timesteps=False)
+    assert tighter.best is None
+    train_epochs(tiny_tdpg(), 1, callback=SelectionCallback(cost_limit=1.0, save_path=path))  # selects nothing
+    assert not path.with_suffix(".json").exists()
+
+
 def test_going_on_from_a_saved_selection_does_not_repeat_the_random_numbers_of_the_start(tmp_path):
     model, path = tiny_tdpg(), tmp_path / "best"
     train_epochs(model, 2, callback=SelectionCallback(cost_limit=1e9, save_path=path))

@@ -18,7 +18,7 @@ from small_problems import (
     train_epochs,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.robustness import PerturbedVecEnv
@@ -84,8 +84,25 @@ def test_the_policy_acts_on_what_it_is_shown_and_the_states_stay_true():
         trv = batch.trvs[t]
 
 
-def test_where_the_observation_stands_in_for_the_state_it_is_the_unperturbed_one():
-    batch = rollouts(tiny_tdpg(make_vec_env("CartPole-v1", 4, seed=0), n_episodes=8, nuisance={"vector_bias": 5}))
+def in_place(observations, rng):
+    observations += rng.uniform(1.0, 2.0)
+    return observations
+
+
+NESTED = {
+    "one": (lambda env: env, {"vector_bias": 5}),
+    "one inside": (lambda env: PerturbedVecEnv(env, "vector_bias", 5), None),
+    "two": (lambda env: PerturbedVecEnv(PerturbedVecEnv(env, "vector_bias", 5), "vector_noise"), None),
+    "nuisance around another": (lambda env: PerturbedVecEnv(env, "vector_bias", 5), {"vector_noise": 1}),
+    "inside a monitor": (lambda env: VecMonitor(PerturbedVecEnv(env, "vector_bias", 5)), None),
+    "in place": (lambda env: env, in_place),
+}
+
+
+@pytest.mark.parametrize(("wrap", "nuisance"), NESTED.values(), ids=NESTED)
+def test_where_the_observation_stands_in_for_the_state_it_is_the_unperturbed_one(wrap, nuisance):
+    env = wrap(make_vec_env("CartPole-v1", 4, seed=0))
+    batch = rollouts(tiny_tdpg(env, n_episodes=8, nuisance=nuisance))
     assert batch.states[0].abs().max() <= 0.05 < batch.observations[0].abs().max()  # where a cart starts
     now, following = batch.states[:-1], batch.states[1:]
     runs = batch.alive[1:] > 0

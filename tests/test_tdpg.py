@@ -218,6 +218,15 @@ def test_a_time_limit_is_the_horizon():
 # -- beta ------------------------------------------------------------------------------------------------------
 
 
+def test_a_misspelt_or_impossible_change_of_a_loaded_model_is_told(tmp_path):
+    tiny_tdpg(beta=math.inf, mi_estimator="logdet").save(tmp_path / "model")
+    with pytest.raises(TypeError, match=r"n_episode.*n_episodes"):
+        TDPG.load(tmp_path / "model", n_episode=100)
+    for change in (dict(mi_estimator="mine"), dict(baseline="value")):
+        with pytest.raises(ValueError, match=f"has no networks for {next(iter(change))}"):
+            TDPG.load(tmp_path / "model", device="cpu", **change)
+
+
 def test_policy_gradient_has_critics_and_never_trains_them():
     model = tiny_tdpg(beta=math.inf, mi_estimator="mine")
     before = parameters(model.estimator)

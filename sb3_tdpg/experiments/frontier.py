@@ -111,7 +111,9 @@ def frontier(
         rows = [finished_row(task, n_eval_episodes, {"label": key[0]}) for task, key in measured]
     runs = pd.DataFrame(rows)
     first = np.mean([read_progress(folder)["rollout/ep_cost_mean"].iloc[0] for _, folder, _ in tasks[:n_seeds]])
-    return _write(out, dict(env_id=env_id, block=block, settings=shared), runs, frontier_table(runs, float(first)))
+    used = tasks[0][0].settings.get("env_kwargs") or {}  # also those of the block
+    config = dict(env_id=env_id, block=block, settings=shared)
+    return _write(out, config, runs, frontier_table(runs, float(first)), used)
 
 
 def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str, seed: int, out: Path) -> Task:
@@ -226,7 +228,9 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def _write(out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.DataFrame) -> str:
+def _write(
+    out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.DataFrame, env_kwargs: Mapping[str, Any]
+) -> str:
     write_frame_atomically(runs, out / "runs.csv")
     write_frame_atomically(table, out / "frontier.csv")
     write_run_config(out / "config.json", {**config, "runs": [*runs["folder"]]})
@@ -253,7 +257,7 @@ def _write(out: Path, config: Mapping[str, Any], runs: pd.DataFrame, table: pd.D
         env_id=config["env_id"],
         verdict=verdict(table),
         knee=best,
-        report=report_command(out, runs, config["env_id"], config["settings"].get("env_kwargs") or {}),
+        report=report_command(out, runs, config["env_id"], env_kwargs),
         overview=markdown_table(pd.DataFrame(overview)),
         runs=markdown_table(shown, digits=4),
         made=how_made("sb3-tdpg frontier", provenance()),

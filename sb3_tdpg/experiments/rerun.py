@@ -52,6 +52,8 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
             f"the run started from the policy {content['start_policy']}, and {config.parent / start / 'model.zip'} is "
             f"{run.config['start_policy']}: put the run's own there"
         )
+    if not scenarios:
+        raise ValueError(f"{config} was evaluated behind a function alone (an open loop), which a rerun leaves out")
     if run.start is not None:
         say_what_is_trusted(run.start)
     if left_out := [row["name"] for row in content["scenarios"] if "sensor" in row]:

@@ -11,8 +11,9 @@ import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -189,16 +190,20 @@ def sweep(
         raise ValueError(f"study_name={study_name!r} needs a storage that keeps the study")
     for name in {"beta", "seed"} & set(settings or ()):
         raise ValueError(f"{name} is varied by the sweep: leave it out of the settings")
-    block = block or env_id
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_module(module)
+    block = block or name
     length = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
-    rows = PAPER_ROWS.get(env_id, (Scenario("Training", env_id),))
+    rows = PAPER_ROWS.get(name, (Scenario("Training", env_id),))
+    rows = tuple(replace(row, env_id=env_id) if row.env_id == name else row for row in rows)
     plan = _Plan(
         env_id,
         block,
         settings={**(settings or {}), **length},
         scenarios=PANDA_GRASP_CAMERA if block.startswith("PandaGrasp-v0-camera") else rows,
         n_eval_episodes=n_eval_episodes,
-        cost_limit=_cost_limit(env_id, cost_limit),
+        cost_limit=_cost_limit(name, cost_limit),
         out=out or Path("results", f"sweep-{block}"),
         study=None if storage is None else (storage, study_name or f"sweep-{block}", grace_period),
     )
@@ -209,11 +214,11 @@ def sweep(
     for task in tasks:
         check_folder(*task, n_eval_episodes)
 
-    failures: Mapping[str, str] = {}
+    failures: dict[str, str] = {}
     with threads(1):
         if plan.study is None:
-            complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
-            results = [plan.row(*job) for job in wanted]
+            complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs, failures=failures)
+            results = [plan.row(*job) for job in wanted if plan.task(*job)[1].name not in failures]
         else:
             if jobs is None or jobs == 1:
                 _work(plan, wanted)

@@ -115,7 +115,7 @@ def robustness_report(
     plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
-    _check_different(fingerprints, names)
+    _check_different(fingerprints, names, {k: {type(m).__name__ for m in v} for k, v in loaded.items()})
     config = {name: value for name, value in vars(plan).items() if name != "sources"} | {"models": fingerprints}
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
@@ -246,8 +246,13 @@ def _check_fit(models: Models, rows: Sequence[Row]) -> None:
     check_models_fit({label: first}, [row.scenario for row in rows[1:] if row.kind in ("own", "scene")])
 
 
-def _check_different(fingerprints: Mapping[str, Sequence[str]], names: Mapping[str, Sequence[str]]) -> None:
+def _check_different(
+    fingerprints: Mapping[str, Sequence[str]], names: Mapping[str, Sequence[str]], kinds_of: Mapping[str, set[str]]
+) -> None:
     """Refuse a policy that occurs twice: as two training seeds it would make intervals too narrow."""
+    for label, kinds in kinds_of.items():
+        if len(kinds) > 1:
+            raise ValueError(f"{label!r} has models of {' and '.join(sorted(kinds))}: give each a label, LABEL=FILE")
     for label, prints in fingerprints.items():
         for number, each in enumerate(prints):
             if (before := prints.index(each)) != number:

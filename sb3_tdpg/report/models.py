@@ -2,6 +2,7 @@
 
 import glob
 import hashlib
+import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
     An argument is a file, a folder with a ``model.zip``, or a pattern such as ``runs/pg-seed*/model.zip``, with an
     optional ``LABEL=`` in front. Without a label, the name of the method is that of the file, or that of its folder if
     any model may have the file's name (``model.zip``, ``best_model.zip``, the environment's id), without the seed:
-    ``runs/pg-seed3/model.zip`` is a model of ``pg``.
+    ``runs/pg-seed3/model.zip`` is a model of ``pg``, and ``logs/ppo/Lava-v0_1/Lava-v0.zip`` of ``ppo Lava-v0``.
 
     :return: the files of each method, in the order of the arguments
     :raises ValueError: if a file does not exist, or is given twice.
@@ -50,7 +51,13 @@ def label_of(path: Path, env_id: str = "") -> str:
     is_plain = PLAIN_NAMES.fullmatch(stem) is not None or stem == env_id.rpartition(":")[2]
     folder = path.absolute().parent.name
     name = folder if is_plain and folder else stem
-    return SEED.sub("", name) or name
+    name = SEED.sub("", name) or name
+    if name != env_id.rpartition(":")[2]:
+        return name
+    # Every training of the environment by `train` is logs/<algo>/<env>_<n>/<env>.zip.
+    record = path.parent / "run.json"
+    block = json.loads(record.read_text()).get("block") if record.exists() else None
+    return f"{path.absolute().parent.parent.name} {block or name}"
 
 
 def _split(argument: str) -> tuple[str, str]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.problem import attribute_of, horizon_of
@@ -27,7 +27,8 @@ class Family:
     """
     What an environment's episodes may show; :meth:`members` draws a member for each of them.
 
-    A declaration is one of the following. A dict or a list: each episode has one of the entries, at random.
+    A declaration is one of the following. A dict or a list: each episode has one of the entries, at
+    random; a range of severities counts as so many entries.
 
     - a name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or a :class:`~sb3_tdpg.robustness.Perturbation`;
     - a dict: names with a severity or a range ``(1, 3)`` of them; ``"images"`` with keywords of
@@ -100,7 +101,10 @@ class Family:
 
     @cached_property
     def _measured_scale(self) -> Any:
-        return default_scale(self._env.observation_space, self._env, self._given_scale)
+        env = self._env
+        while isinstance(env, VecEnvWrapper) and "unperturbed" in vars(env):  # the unit is that of the plain sensor
+            env = env.venv
+        return default_scale(env.observation_space, env, self._given_scale)
 
     def _named(self, name: Any, value: Any, factor: float = 1.0) -> list[Callable[..., Members]]:
         """Return one perturbation for each severity."""
@@ -190,7 +194,7 @@ class FunctionMembers(Members):
         self.function = function
 
     def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
-        changed = self.function(observations, self._rng)
+        changed = self.function(each_part(np.copy, observations), self._rng)  # it may change them in place
         if not isinstance(observations, dict):
             changed = np.asarray(changed)
             if changed.shape != observations.shape or changed.dtype != observations.dtype:

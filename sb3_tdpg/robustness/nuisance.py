@@ -32,6 +32,8 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
     try:
         return NuisanceVecEnv(env, family, None)
     except ValueError as e:
+        if isinstance(declared, str) and declared == "auto":
+            raise ValueError(f"nuisance='auto', the default for images: {e}; or give nuisance=None") from e
         raise ValueError(f"nuisance={declared!r}: {e}") from e
 
 

@@ -89,5 +89,7 @@ def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: floa
         if name == WEIGHT:
             block["beta"] = 1.0 / (value * cost_scale)
         else:
-            (block[prefix] if prefix else block)[argument] = f"lin_{value!r}" if name == "learning_rate" else value
+            (block[prefix] if prefix else block)[argument] = (
+                f"lin_{value!r}" if name == "learning_rate" and not isinstance(value, str) else value
+            )
     return block

@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import optuna
+import torch as th
 import yaml
 from rl_zoo3.utils import get_callback_list
 from stable_baselines3.common.callbacks import BaseCallback
@@ -45,6 +46,9 @@ class TuningManager(TDPGExperimentManager):
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         super().__init__(args, algo, env_id, *rest, **kwargs)
         if algo != "tdpg":
+            given = dict(objective=self.objective_kind, cost_limit=self.cost_limit, space=self.space_path)
+            if ours := [f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None]:
+                raise ValueError(f"{', '.join(ours)} is for TDPG, not for {algo}, which the zoo tunes for the reward")
             return
         if self.objective_kind is None:
             self.objective_kind = "information" if self._eval_env_kwargs_args is None else "shift"
@@ -67,7 +71,12 @@ class TuningManager(TDPGExperimentManager):
             self.settings = copy.deepcopy(dict(saved))
             policy_kwargs = self.settings.get("policy_kwargs")
             if isinstance(policy_kwargs, str):  # as on the command line, and in the zoo's own files
-                self.settings["policy_kwargs"] = eval(policy_kwargs)
+                self.settings["policy_kwargs"] = eval(policy_kwargs, {"nn": th.nn})
+            try:
+                yaml.safe_dump(self.settings)
+            except yaml.YAMLError as e:  # before the trials rather than after them
+                reason = " ".join(str(e).split())
+                raise ValueError(f"tune writes the best block as YAML, which this one has no form in: {reason}") from e
             self.space = relevant(self.space, block)
             self.cost_limit = self._find_limit(block)
             if block.get("beta") == "auto":
@@ -80,6 +89,10 @@ class TuningManager(TDPGExperimentManager):
         given = self.cost_limit
         if given is not None and not (math.isfinite(given) and given != 0):
             raise ValueError(f"--cost-limit {given} must be a finite number other than 0")
+        if given is None and isinstance(share := block.get("cost_limit"), str):
+            raise ValueError(
+                f"cost_limit: {share} is another cost in each trial, and tuning needs one: give --cost-limit"
+            )
         for limit in (given, block.get("cost_limit"), *selections, -threshold):
             if limit and math.isfinite(limit):
                 return float(limit)

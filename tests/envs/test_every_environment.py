@@ -1,6 +1,7 @@
 """What every registered environment must satisfy, and what the constructors refuse."""
 
 import copy
+import math
 import pickle
 import re
 import warnings
@@ -9,14 +10,16 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from small_problems import words
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tdpg import BatchedVecEnv, make_episodes_env
+from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs import ENTRY_POINTS
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
@@ -353,3 +356,37 @@ def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=f"{name}' cannot be read as an image"):
             BallCatchEnv(texture=kind(tmp_path / name))
+
+
+class Switch(POMDPEnv):
+    """Two actions, and a cost of 1 for the wrong one."""
+
+    def __init__(self):
+        super().__init__(horizon=3)
+        self.state_space = self.observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space = spaces.Discrete(2)
+
+    def initial_state(self, n):
+        return self.np_random.choice([-1.0, 1.0], (n, 1))
+
+    def dynamics(self, state, action):
+        return state
+
+    def sensor(self, state):
+        return state.astype(np.float32)
+
+    def cost(self, state, action):
+        return (action != (state[:, 0] > 0)).astype(float)
+
+    def terminal_cost(self, state):
+        return np.zeros(len(state))
+
+
+def test_actions_may_be_discrete():
+    env = Switch()
+    observation, _ = env.reset(seed=0)
+    assert [env.step(action)[1] for action in (0, 1)] == [-1.0, 0.0] if observation[0] > 0 else [0.0, -1.0]
+    env = BatchedVecEnv(Switch(), 100)
+    model = TDPG("TRVPolicy", env, n_episodes=100, beta=math.inf, learning_rate=1e-2, seed=0, device="cpu")
+    model.learn(100 * 3 * 30)
+    assert model.rollout_buffer.episode_costs.mean() < 0.8  # 1.5 by chance

@@ -1,5 +1,6 @@
 """``python -m sb3_tdpg enjoy``: episodes of a saved model, printed and recorded as a film."""
 
+import math
 import re
 import sys
 from unittest.mock import Mock
@@ -244,7 +245,9 @@ def test_a_grasp_is_shown_from_beginning_to_end(tmp_path):
 
 def test_keywords_are_read_as_yaml():
     texts = ["texture=violet_dots", "a=0.2", "b=1e-3", "c=[[8.0, 1], [8, 1e0]]", "d=null", "e=true", "f=7", "g=x=y"]
+    texts += ["h='007'", "i=info", "j=-.5", "k=inf", "l=1/25"]
     values = dict(texture="violet_dots", a=0.2, b=0.001, c=[[8.0, 1], [8, 1.0]], d=None, e=True, f=7, g="x=y")
+    values |= dict(h="007", i="info", j=-0.5, k=math.inf, l="1/25")
     assert parse_keywords(texts) == values
     assert [type(value) for value in parse_keywords(texts).values()] == [type(value) for value in values.values()]
 

@@ -66,6 +66,13 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
     pd.testing.assert_frame_equal(pd.read_csv(out / "frontier.csv"), table)
 
 
+def test_the_command_that_measures_it_has_the_keywords_of_the_block(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*COMMAND, *TINY, "--seeds", "1", "--block", "Lava-v0-logdet-table"]) == 0
+    (report,) = re.findall(r"^sb3-tdpg report .*$", capsys.readouterr().out, re.MULTILINE)
+    assert "--env-kwargs" in report and "action_cost=1.0" in report
+
+
 def test_an_interrupted_frontier_goes_on_and_more_shares_add_to_it(tmp_path, monkeypatch):
     done = []
 

@@ -3,6 +3,7 @@
 import json
 import math
 import multiprocessing as mp
+import re
 import time
 
 import numpy as np
@@ -66,6 +67,18 @@ def test_a_sweep_writes_everything_that_it_promises_and_a_second_call_trains_not
     monkeypatch.setattr(TDPG, "learn", lambda *args, **kwargs: pytest.fail("it trains again"))
     assert quick_sweep(tmp_path, n_seeds=1, jobs=1).split("\n\n")[:-1] == text.split("\n\n")[:-1]
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*")} == before
+
+
+def test_a_run_that_diverges_is_told_and_the_others_are_kept(tmp_path):
+    text = quick_sweep(tmp_path, betas=["1e-37", "inf"], jobs=1, n_seeds=1)
+    assert len(pd.read_csv(tmp_path / "runs.csv")) == 1
+    assert re.search(r"## Failed.*seed0`: .*NaN or infinite", text, re.DOTALL)
+    assert (tmp_path / "selected.zip").exists()
+
+
+def test_the_module_of_an_environment_may_stand_before_its_id(tmp_path):
+    quick_sweep(tmp_path, "sb3_tdpg:Lava-v0", betas=["inf"], jobs=1, n_seeds=1)
+    assert_complete(tmp_path, 1)
 
 
 def test_if_no_run_is_below_the_limit_none_is_selected_and_an_earlier_one_is_removed(tmp_path):

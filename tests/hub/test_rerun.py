@@ -53,6 +53,14 @@ def test_a_run_of_ppo_is_repeated_without_the_rows_that_a_function_changes(tmp_p
     assert "left out, for a function changes their sensor: Noisy\n" in capsys.readouterr().out
 
 
+def test_a_run_of_an_open_loop_is_refused_before_it_is_trained(tmp_path):
+    run = SB3Run("PPO", "Lava-v0", "Lava-v0", 0, overrides=dict(n_timesteps=10, n_steps=10, batch_size=10), algo="ppo")
+    complete_run(run, tmp_path / "run", [Scenario("Noisy", "Lava-v0", sensor=noisy)], n_eval_episodes=2)
+    with pytest.raises(ValueError, match="evaluated behind a function alone"):
+        rerun(tmp_path / "run" / "config.json", tmp_path / "again", progress_bar=False)
+    assert not (tmp_path / "again").exists()
+
+
 def noisy(env):
     return PerturbedVecEnv(env, "vector_noise", 5)
 

@@ -199,7 +199,11 @@ def test_models_are_grouped_by_label_or_folder(tmp_path):
         "ppo_s": ["c/ppo_s.zip"],
     }
     assert list(parse_models([f"{tmp_path}/runs/b=2_seed3/model.zip"])) == ["b=2"]
-    assert label_of(tmp_path / "logs" / "ppo" / "Lava-v0_1" / "Lava-v0.zip", "Lava-v0") == "Lava-v0"
+    folder = tmp_path / "logs" / "ppo" / "Lava-v0_1"
+    assert label_of(folder / "Lava-v0.zip", "Lava-v0") == "ppo Lava-v0"
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text('{"block": "Lava-v0-wide"}')
+    assert label_of(folder / "Lava-v0.zip", "sb3_tdpg:Lava-v0") == "ppo Lava-v0-wide"
     with pytest.raises(ValueError, match="given twice"):
         parse_models([f"A={tmp_path}/c/ppo_s.zip", f"B={tmp_path}/c/ppo_s.zip"])
 

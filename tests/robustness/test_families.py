@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from perturbed_problems import countdown, perturbed, run
 from small_problems import toy_vec_env
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
@@ -269,6 +270,12 @@ def test_a_scene_may_redraw_components_of_the_state():
         PerturbedVecEnv(env, {**declared, "redraw": ["e"]})
     with pytest.raises(ValueError, match="need the true state"):
         Family(declared, env).members(1)(seen[:1])
+
+
+def test_the_scale_around_another_perturbation_is_that_of_the_plain_sensor():
+    plain = make_vec_env("CartPole-v1", 2, seed=0)
+    noisy = PerturbedVecEnv(make_vec_env("CartPole-v1", 2, seed=0), "vector_noise", 5)
+    np.testing.assert_array_equal(*(Family("vector_bias", env)._measured_scale for env in (plain, noisy)))
 
 
 def test_a_perturbation_around_another_one_draws_its_own_numbers():

@@ -50,6 +50,10 @@ def test_sampled_values_lie_in_their_ranges_and_go_where_they_belong():
     assert block["policy_kwargs"]["trv_dim"] == 9
 
 
+def test_a_schedule_may_be_one_of_the_choices():
+    assert put_in({}, dict(learning_rate="lin_1e-3"), 1.0)["learning_rate"] == "lin_1e-3"
+
+
 def test_the_weight_is_not_sampled_where_there_is_none_to_choose():
     space = read_space()
     for beta in ("auto", math.inf):
@@ -253,6 +257,24 @@ BAD = {
     "space": (["--space", "none.yml"], "the search space none.yml cannot be read"),
     "storage": (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db cannot be opened"),
 }
+
+
+BLOCKS = {
+    "a share": ("beta: auto\n  cost_limit: 95%", "cost_limit: 95% is another cost in each trial.*--cost-limit"),
+    "a class": ('policy_kwargs: "dict(activation_fn=nn.ReLU)"', "tune writes the best block as YAML.*ReLU"),
+}
+
+
+@pytest.mark.parametrize("settings, message", BLOCKS.values(), ids=BLOCKS)
+def test_a_block_that_cannot_be_tuned_is_refused_before_the_trials(settings, message, here, capsys):  # noqa: F811
+    (here / "b.yml").write_text(f"Lava-v0:\n  policy: TRVPolicy\n  n_timesteps: 400\n  {settings}\n")
+    line = error_line(capsys, "tune", "--env", "Lava-v0", "--conf-file", "b.yml", "--n-trials", "1")
+    assert re.search(message, line)
+
+
+def test_what_only_tdpg_has_is_refused_for_other_algorithms(here, capsys):  # noqa: F811
+    line = error_line(capsys, "tune", "--algo", "ppo", "--env", "CartPole-v1", "-n", "100", "--cost-limit", "1")
+    assert "--cost-limit is for TDPG, not for ppo" in line
 
 
 @pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
