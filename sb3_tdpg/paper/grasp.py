@@ -23,11 +23,11 @@ TRAINING, ROTATION, TRANSLATION = (row.name for row in PANDA_GRASP)
 
 # The largest interquartile mean over seeds of the share of failed grasps, by method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
-    "PG": {TRAINING: 0.02, ROTATION: 0.08, TRANSLATION: 0.15},
-    "TDPG": {TRAINING: 0.03, ROTATION: 0.08, TRANSLATION: 0.15},
+    "PG": {TRAINING: 0.02, ROTATION: 0.04, TRANSLATION: 0.08},
+    "TDPG": {TRAINING: 0.02, ROTATION: 0.04, TRANSLATION: 0.08},
 }
 
-COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG", "PG"))
+COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG", "PG"), ("PG", "PG without the nuisance"))
 # At the rate of a training from scratch the first epoch of a second stage undoes the first stage, with the penalty and
 # without: where almost nothing fails, the gradient is mostly noise.
 SECOND_STAGE = dict(n_timesteps=8_000, learning_rate=2e-4)
@@ -43,7 +43,8 @@ def _methods(block: str) -> tuple[Method, ...]:
     )
 
 
-METHODS = {"fixed": _methods("PandaGrasp-v0"), "varying": _methods("PandaGrasp-v0-camera")}
+NO_NUISANCE = Method("PG without the nuisance", "PandaGrasp-v0-pg", overrides=dict(nuisance=None))
+METHODS = {"fixed": (*_methods("PandaGrasp-v0"), NO_NUISANCE), "varying": _methods("PandaGrasp-v0-camera")}
 """The methods, by whether the height of the camera is fixed or varies."""
 
 
