@@ -109,9 +109,9 @@ class TDPG(EpisodicAlgorithm):
         the next state; unused with ``baseline="mean"``.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping.
     :param nuisance: Changes of the sensor in the rollouts, that the policy is to ignore. ``"auto"``: random colours,
-        patterns, contrasts and noise for images, nothing for vectors. ``None``: nothing. A dict of perturbations and
-        severities, a function, ...: see :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is
-        wrapped in it.
+        patterns, contrasts and noise for images, noise and dropped pixels for depth images, nothing for vectors.
+        ``None``: nothing. A dict of perturbations and severities, a function, ...: see
+        :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is wrapped in it.
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.

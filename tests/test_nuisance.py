@@ -54,9 +54,11 @@ def test_the_algorithm_is_imported_without_any_perturbation():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_the_default_is_a_nuisance_for_images_of_bytes_and_none_for_vectors_and_depth():
+def test_the_default_is_a_nuisance_for_images_and_none_for_vectors_and_depth_without_bounds():
     assert wrappers(tiny_tdpg("Lava-v0")) == []
-    assert wrappers(tiny_tdpg(toy_vec_env(observation_space=DEPTH), beta=math.inf)) == []
+    assert wrappers(tiny_tdpg(toy_vec_env(observation_space=DEPTH), beta=math.inf)) == [NuisanceVecEnv]
+    boundless = spaces.Box(0.0, math.inf, DEPTH.shape, np.float32)
+    assert wrappers(tiny_tdpg(toy_vec_env(observation_space=boundless), beta=math.inf)) == []
     assert wrappers(tiny_tdpg(ball_env())) == [NuisanceVecEnv]
     assert wrappers(tiny_tdpg(toy_vec_env(observation_space=IMAGES_AND_VECTOR))) == [NuisanceVecEnv]
     assert wrappers(tiny_tdpg(ball_env(), nuisance=None)) == []
@@ -67,6 +69,18 @@ def test_with_the_default_for_images_the_policy_sees_changed_ones_each_with_its_
     first, second = (model.env._perturber(np.full((20, 3, 64, 64), 120, np.uint8)) for _ in range(2))
     assert (np.abs(first.astype(int) - 120).mean(axis=(1, 2, 3)) > 3).mean() > 0.8
     assert (np.abs(first.astype(int) - second).mean(axis=(1, 2, 3)) > 5).mean() > 0.8  # more than the noise
+
+
+def test_by_default_depth_images_are_noisy_or_lack_pixels_in_three_episodes_of_four():
+    model = tiny_tdpg(toy_vec_env(20, observation_space=DEPTH), beta=math.inf)
+    plain = np.full((20, *DEPTH.shape), 0.45, np.float32)
+    seen = np.concatenate([model.env._perturber(plain) for _ in range(2)])
+    offset = seen - 0.45
+    noisy, lacking = (offset > 0).any(axis=(1, 2, 3)), (seen == DEPTH.low.min()).mean(axis=(1, 2, 3))
+    assert 0 < (noisy & (abs(offset).mean(axis=(1, 2, 3)) < 0.05)).mean() < 0.6  # 5 % of .5 m
+    assert 0.2 < (~noisy & (lacking > 0)).mean() < 0.8
+    assert lacking.max() < 0.15
+    assert 0 < (offset == 0).all(axis=(1, 2, 3)).mean() < 0.6
 
 
 def test_the_policy_acts_on_what_it_is_shown_and_the_states_stay_true():

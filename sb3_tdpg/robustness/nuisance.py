@@ -7,9 +7,8 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tdpg.features import observation_kind
 from sb3_tdpg.robustness.families import Family
-from sb3_tdpg.robustness.sensor import parts_of
+from sb3_tdpg.robustness.sensor import Sensor, parts_of
 from sb3_tdpg.robustness.wrappers import PerturbedVecEnv
 
 OF_DEPTH = [None, ("noise", 1), ("dropped_pixels", (1, 2))]
@@ -58,13 +57,15 @@ def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:
 
 def automatic(declared: Any, space: spaces.Space, **keywords: Any) -> Any:
     """
-    Replace ``"auto"``: random changes for images of bytes, what depth cameras do for depth images, ``None`` for vectors.
+    Replace ``"auto"``: random changes for images of bytes, noise and dropped pixels for depth images.
+
+    For vectors, and for depth images without bounds, it is ``None``.
 
     :param keywords: Keywords of :func:`~sb3_tdpg.robustness.training.images`.
     """
     if not (isinstance(declared, str) and declared == "auto"):
         return declared
-    parts = parts_of(space).values()
-    if any(isinstance(part, spaces.Box) and is_image_space(part) for part in parts):
+    boxes = [part for part in parts_of(space).values() if isinstance(part, spaces.Box)]
+    if any(map(is_image_space, boxes)):
         return {"images": keywords}
-    return OF_DEPTH if any(observation_kind(part) == "depth" for part in parts) else None
+    return OF_DEPTH if any(Sensor(box).is_depth for box in boxes) else None

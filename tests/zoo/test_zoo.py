@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from small_problems import assert_same_parameters, parameters, stopped_in_epoch
+from small_problems import assert_same_parameters, error_line, parameters, stopped_in_epoch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import load_results
 
@@ -204,6 +204,10 @@ def test_enjoy_finds_the_latest_model_and_runs_its_stochastic_policy(here, capsy
     assert set(drawn) == {False}
     assert main(["enjoy", "--env", "Lava-v0", "--no-render", "-n", "20", "--deterministic"]) == 0
     assert drawn[-1] is True
+
+
+def test_enjoy_without_the_ending_of_the_file_says_what_it_takes(here, capsys):
+    assert "give the .zip file" in error_line(capsys, "enjoy", "logs/tdpg_lava", "--env", "Lava-v0")
 
 
 def test_plot_and_video_of_a_training(here):
