@@ -50,7 +50,7 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     files = {"summary.md", "seeds.csv", "episodes.csv.xz", "knowledge.csv", "config.json", "yaw.png", "training.png"}
     assert {path.name for path in published.iterdir()} == files
     records = pd.read_csv(out / "episodes.csv.xz")
-    assert len(records) == 3 * 2 * 3 * 3
+    assert len(records) == 4 * 2 * 3 * 3
     assert set(records["cost"]) <= {0.0, 1.0}
 
 
