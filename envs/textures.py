@@ -187,6 +187,8 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
         )
     try:
         with Image.open(path) as image:
+            if image.mode.startswith("I"):  # 16 bits of grey: Pillow would cut all above 255
+                return np.rint(np.asarray(image)[..., None].repeat(3, axis=2) / 257).astype(np.uint8)
             return np.array(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError) as error:  # what Pillow raises for a broken file differs by format
         raise ValueError(

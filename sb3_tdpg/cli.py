@@ -181,6 +181,12 @@ def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_epi
         named = Path(os.path.abspath(folder))  # "." has no name
         card = card or named.with_name(f"{named.name}-hub")
         folder = write_model_card(folder, card, repo_id, film_episodes=film_episodes)
+    elif card is not None or film_episodes:
+        raise ValueError(f"{folder} has a card already (README.md): leave out --card and --film-episodes")
+    else:
+        named_in_card = re.findall(r'load_from_hub\("([^"]+)"', (folder / "README.md").read_text())
+        if named_in_card and repo_id not in named_in_card:
+            raise ValueError(f"the card in {folder} is for {named_in_card[0]}, not for {repo_id}: write it anew")
     if not dry_run:
         print(f"{folder} is now at {push_to_hub(folder, repo_id)}")
         return

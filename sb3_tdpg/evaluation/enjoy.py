@@ -53,7 +53,7 @@ def enjoy(
     has_trvs = isinstance(model, TDPG)
     check_models_fit({str(model_path): model}, [Scenario("enjoy", env_id, env_kwargs)])
     env = gym.make(env_id, **env_kwargs)
-    fps = env.metadata.get("render_fps", 10)
+    fps = env.metadata.get("render_fps") or 10
     recorded = DummyVecEnv([lambda: _Recorder(env, record is not None)])
     with contextlib.closing(wrapped_for(model, recorded)) as vec_env:
         if record is not None and env.render_mode != "rgb_array":

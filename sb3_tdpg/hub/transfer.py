@@ -22,6 +22,7 @@ from sb3_tdpg.common.provenance import write_frame_atomically, write_run_config
 from sb3_tdpg.common.trust import refuse_links, say_what_is_trusted
 from sb3_tdpg.evaluation import save_figure, training_curves
 from sb3_tdpg.evaluation.enjoy import enjoy
+from sb3_tdpg.evaluation.loading import statistics_beside
 from sb3_tdpg.hub.model_card import ALGORITHM, model_card, model_name, results_with_intervals
 from sb3_tdpg.hub.publication import Publication, plain, read_publication
 from sb3_tdpg.tdpg import TDPG
@@ -64,9 +65,14 @@ def write_model_card(
         model_path = folder / f"{model_name(publication.env_id)}.zip"
         if isinstance(publication.model, TDPG):
             publication.model.save(model_path)
+            statistics = publication.model.get_vec_normalize_env()
+            if statistics is not None and statistics.norm_obs:
+                statistics.save(str(folder / "vec_normalize.pkl"))
         else:
             _check_model(publication.model)
             shutil.copyfile(publication.model, model_path)
+            if (beside := statistics_beside(Path(publication.model))) is not None:
+                shutil.copyfile(beside, folder / "vec_normalize.pkl")
         _write_records(publication, results, folder)
         if publication.progress is not None:
             figure = training_curves({publication.method: publication.progress})
@@ -201,6 +207,11 @@ def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -
     for name, content in (("config.yml", settings), ("args.yml", args), ("env_kwargs.yml", env_kwargs)):
         (out / name).write_text(yaml.safe_dump(content, sort_keys=False))
     training = results.iloc[0]
+    if training["scenario"] != "Training" and len(results) > 1:
+        raise ValueError(
+            f"no row of the records is called 'Training' (there are {', '.join(results['scenario'])}), and "
+            "results.json is for the training environment: evaluate it, too"
+        )
     zoo_results = dict(
         mean_reward=-float(training["mean"]),
         std_reward=float(training["std"]),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sb3_tdpg.envs.textures import TEST_TEXTURES, built_in_texture, floor_texture, load_texture, random_texture
 
@@ -63,6 +64,15 @@ def test_the_built_in_textures_differ_in_hue_and_the_seventh_is_reddish_like_the
     hues = np.array([color / color.sum() for color in mean.values()])
     apart = np.linalg.norm(hues[:, None] - hues, axis=-1) + 9 * np.eye(8)
     assert apart[:7, :7].min() > 0.05
+
+
+def test_sixteen_bits_of_grey_are_as_bright_as_eight(tmp_path):
+    ramp = np.linspace(0, 255, 16 * 16).reshape(16, 16)
+    Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / "8.png")
+    Image.fromarray((257 * ramp).astype(np.uint16)).save(tmp_path / "16.png")
+    eight, sixteen = (load_texture(tmp_path / f"{bits}.png").astype(int) for bits in (8, 16))
+    assert eight.shape == sixteen.shape == (16, 16, 3)
+    assert abs(eight - sixteen).max() <= 1
 
 
 def test_a_texture_is_the_same_every_time_and_a_random_one_follows_its_seed():

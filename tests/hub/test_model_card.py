@@ -1,6 +1,7 @@
 """The card of a published model: its content, the files beside it, and the input that is refused."""
 
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -14,11 +15,14 @@ import pytest
 import yaml
 from published_cards import REPO_ID, blocks, costs_of, text_of
 from small_problems import assert_same_parameters, error_line, parameters, tiny_tdpg, train_epochs
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.provenance import with_numbers
 from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
+from sb3_tdpg.evaluation.loading import load_model
 from sb3_tdpg.experiments.rerun import rerun
 from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hub import pull_from_hub, push_to_hub, write_model_card
@@ -131,6 +135,42 @@ def test_a_model_in_memory_is_published_with_its_records(tmp_path):
     assert huggingface_hub.ModelCard(text).data.eval_results[0].dataset_config == "Training"
     with pytest.raises(ValueError, match="does not describe a run"):
         rerun(card / "config.json", tmp_path / "again")
+
+
+def test_the_statistics_of_the_training_are_published_with_the_model(tmp_path):
+    env = VecNormalize(make_vec_env("Lava-v0", 4), norm_reward=False)
+    model = train_epochs(tiny_tdpg(env, n_episodes=20, beta=math.inf), 2)
+    records = evaluate_scenarios(model, LAVA[:1], 20)
+    card = write_model_card(Publication(model=model, env_id="Lava-v0", records=records), tmp_path / "card", REPO_ID)
+    assert "VecNormalize.load" in text_of(card)
+    copy = shutil.copytree(card, tmp_path / "copy")
+    shutil.copy(copy / "tdpg-Lava-v0.zip", copy / "model.zip")
+    for source in (card / "tdpg-Lava-v0.zip", copy / "model.zip"):
+        loaded = load_model(source, "Lava-v0", {})
+        pd.testing.assert_series_equal(evaluate_scenarios(loaded, LAVA[:1], 20)["cost"], records["cost"])
+    again = Publication(model=copy / "model.zip", env_id="Lava-v0", records=records)
+    assert (write_model_card(again, tmp_path / "again", REPO_ID) / "vec_normalize.pkl").exists()
+
+
+def test_the_card_of_stacked_observations_says_how_to_stack(tmp_path):
+    model = tiny_tdpg(VecFrameStack(make_vec_env("Lava-v0", 4), 3))
+    records = evaluate_scenarios(model, LAVA[:1], 4)
+    publication = Publication(model=model, env_id="Lava-v0", records=records, settings=dict(frame_stack=3))
+    assert "`VecFrameStack(env, 3)`" in text_of(write_model_card(publication, tmp_path / "card", REPO_ID))
+
+
+def test_results_of_the_training_need_its_row(tmp_path):
+    model = tiny_tdpg()
+    records = evaluate_scenarios(model, LAVA[1:3], 4)
+    with pytest.raises(ValueError, match="no row of the records is called 'Training'"):
+        write_model_card(Publication(model=model, env_id="Lava-v0", records=records), tmp_path / "card", REPO_ID)
+
+
+def test_a_card_that_is_written_is_not_given_other_settings_or_another_name(card, capsys):
+    line = error_line(capsys, "push", card, "--repo-id", REPO_ID, "--dry-run", "--film-episodes", "2")
+    assert "has a card already" in line
+    line = error_line(capsys, "push", card, "--repo-id", "other/name", "--dry-run")
+    assert f"is for {REPO_ID}, not for other/name" in line
 
 
 def test_shares_of_failures_have_wilsons_interval():
@@ -249,9 +289,8 @@ def test_a_symbolic_link_is_never_published(runs, card, tmp_path, capsys):
     copy, ready = shutil.copytree(runs / "pg-seed0", tmp_path / "run"), shutil.copytree(card, tmp_path / "ready")
     (copy / "progress_9.csv").symlink_to("/etc/hostname")
     (ready / "secret").symlink_to("/etc/hostname")
-    for folder in (copy, ready):
-        line = error_line(capsys, "push", folder, "--repo-id", REPO_ID, "--dry-run", "--card", tmp_path / "card")
-        assert "is a symbolic link" in line
+    for folder, more in ((copy, ["--card", tmp_path / "card"]), (ready, [])):
+        assert "is a symbolic link" in error_line(capsys, "push", folder, "--repo-id", REPO_ID, "--dry-run", *more)
     with pytest.raises(ValueError, match="ready/secret is a symbolic link"):
         push_to_hub(ready, REPO_ID)
     assert not (tmp_path / "card").exists()
