@@ -43,7 +43,7 @@ def _methods(block: str, cost_limit: float) -> tuple[Method, ...]:
     )
 
 
-NO_NUISANCE = Method("PG without the nuisance", "PandaGrasp-v0-pg", overrides=dict(nuisance=None), max_seeds=3)
+NO_NUISANCE = Method("PG without the nuisance", "PandaGrasp-v0-pg", overrides=dict(nuisance=None), max_seeds=2)
 METHODS = dict(
     fixed=(*_methods("PandaGrasp-v0", LIMITS["fixed"]), NO_NUISANCE),
     varying=_methods("PandaGrasp-v0-camera", LIMITS["varying"]),
