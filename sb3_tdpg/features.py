@@ -97,7 +97,7 @@ class TRVCnn(BaseFeaturesExtractor):
     seen then move the features most.
 
     With ``keypoints`` the last layer's maps are replaced by the positions at which they are active
-    (:class:`SpatialSoftmax`), without its nonlinearity: where a thing is, and not how it looks.
+    (:class:`~sb3_tdpg.features.SpatialSoftmax`), without its nonlinearity: where a thing is, and not how it looks.
 
     Images of floats (depth in m, say) are first scaled from the bounds of their space to [-1, 1], if these are finite.
 
