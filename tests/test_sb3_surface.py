@@ -287,6 +287,7 @@ def test_vectors_stay_on_the_cpu_unless_asked(tmp_path, monkeypatch):
     monkeypatch.setattr("stable_baselines3.common.base_class.get_device", lambda device: th.device("cuda"))
     assert tiny_tdpg(device="auto").device.type == "cpu"
     assert TDPG.load(tmp_path / "model", device="auto").device.type == "cpu"
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
     assert tiny_tdpg(device="cuda:0", _init_setup_model=False).device.type == "cuda"
 
 
