@@ -1,9 +1,11 @@
 """What all tests share."""
 
+import random
 import sys
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 
@@ -33,6 +35,8 @@ def registry(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def seeded_torch():
-    """Make every test draw the same numbers, whichever ran before it."""
+def seeded(monkeypatch):
+    """Make every test draw the same numbers, whichever ran before it; also those of generators without a seed."""
     th.manual_seed(0)
+    np.random.seed(0)  # noqa: NPY002 - the generator of libraries that use it
+    monkeypatch.setattr("numpy.random.bit_generator.randbits", random.Random(0).getrandbits)

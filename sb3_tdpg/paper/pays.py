@@ -25,7 +25,6 @@ from sb3_tdpg.robustness import PERTURBATIONS, PerturbedVecEnv
 
 # Seeds below 100 chose the defaults; faults and methods were fixed before the first of these was run.
 FIRST_SEED = 500
-N_SB3_SEEDS = 5  # of PPO and RecurrentPPO, which take most of the time
 FIRST_CUE_SEED = 520  # an earlier study saw the task with a cue on the seeds from 500 on
 TRAINING, MEAN, WORST = "Training", "mean of the faults", "worst fault"
 KINDS = {TRAINING: (TRAINING,), MEAN: (MEAN,), WORST: (WORST,)}
@@ -130,7 +129,7 @@ class Problem:
         for label, algo in (("PPO", "ppo"), ("RecurrentPPO", "ppo_lstm")):
             for more, wrapper in (("", None), (", noise to 4", noise(4.0)), (", told the faults", told)):
                 method = ours(label + more, wrapper, n_timesteps=block["n_timesteps"])
-                found.append(replace(method, algo=algo, max_seeds=N_SB3_SEEDS))
+                found.append(replace(method, algo=algo))
         return [method for method in found if self.labels is None or method.label in self.labels]
 
 
@@ -208,7 +207,7 @@ def reproduce_pays(
     Train all methods on all problems, evaluate them under the faults; write tables, a figure and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``pays.png``, ``config.json``, ``runs/``.
-    :param n_seeds: Training seeds of each method, at most five of PPO and RecurrentPPO.
+    :param n_seeds: Training seeds of each method.
     :param controls: Whether to train PPO and RecurrentPPO, which take most of the time.
     :param problems: Names in :data:`PROBLEMS`.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
