@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
@@ -21,6 +20,7 @@ from sb3_tdpg.evaluation.rollout import rollout
 from sb3_tdpg.report.numbers import Numbers
 from sb3_tdpg.report.plan import Plan
 from sb3_tdpg.report.rows import UNPERTURBED, Row
+from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.registry import PERTURBATIONS
 from sb3_tdpg.robustness.sensor import Sensor
@@ -154,37 +154,21 @@ def _part(observation: Any, key: str) -> np.ndarray:
     return np.asarray(observation[key] if key else observation)
 
 
-class _Recorder(VecEnvWrapper):
-    """Keep the observations before the wrappers of a model change them."""
-
-    def __init__(self, env: VecEnv) -> None:
-        super().__init__(env)
-        self.seen: list[Any] = []
-
-    def reset(self) -> Any:
-        self.seen = [self.venv.reset()]
-        return self.seen[-1]
-
-    def step_wait(self) -> VecEnvStepReturn:
-        step = self.venv.step_wait()
-        self.seen.append(step[0])
-        return step
-
-
 def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space]:
     """Return the first observations of an episode, each ``(1, *obs)``, and their space."""
-    recorders: list[_Recorder] = []
+    seen: list[Any] = []
 
-    def sensor(env: VecEnv) -> VecEnv:
-        recorders.append(_Recorder(env))
-        return recorders[0]
+    def keep(observations: Any, rng: np.random.Generator) -> Any:
+        seen.append(observations)
+        return observations
 
+    # The sensor is inside the wrappers of a model, which change the observations.
+    sensor = partial(PerturbedVecEnv, perturbation=keep)
     scenario = Scenario(UNPERTURBED, plan.env_id, plan.env_kwargs, sensor=sensor)
     with closing(scenario_env(scenario, model, n_episodes=1, n_envs=1)) as env:
         steps = rollout(model, env, 1, seeds=evaluation_seeds(plan.seed), deterministic=plan.deterministic)
         n_steps = len(list(islice(steps, MAX_STEPS)))
-        (recorder,) = recorders
-        return recorder.seen[:n_steps], recorder.observation_space
+        return seen[:n_steps], env.unwrapped.observation_space
 
 
 def _grid(n: int) -> tuple[Figure, np.ndarray]:
