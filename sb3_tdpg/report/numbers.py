@@ -98,18 +98,17 @@ def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 
         cost = np.stack([cube[:, group].mean(axis=1) for group in groups.values()], axis=1)  # (S, G, E)
         added = cost - cube[:, plain].mean(axis=1, keepdims=True)
         is_share = bool(np.isin(cube, (0.0, 1.0)).all())
-        method = dict(model=label, n_seeds=len(cube))
-        levels.append(rows.assign(**method, **_interval_columns(cube, how, is_share)))
         intervals = {**_interval_columns(cost, how, is_share), **_interval_columns(added, how, prefix="added")}
-        summaries.append(keys.assign(**method, **intervals))
+        summaries.append(pd.DataFrame(dict(model=label, **keys, n_seeds=len(cube), **intervals)))
+        intervals = _interval_columns(cube, how, is_share)
+        levels.append(pd.DataFrame(dict(model=label, **rows, n_seeds=len(cube), **intervals)))
         by_row[str(label)] = dict(cost=cube.mean(axis=2))
         by_seed[str(label)] = dict(cost=cost.mean(axis=2), added=added.mean(axis=2))
 
-    first = ["model", "perturbation", "severity", "kind", "n_seeds"]
     comparisons = [_compare(label, by_seed, keys) for label in list(by_seed)[1:]]
-    summary = _with_first([name for name in first if name != "severity"], pd.concat(summaries, ignore_index=True))
+    summary = pd.concat(summaries, ignore_index=True)
     return Numbers(
-        _with_first(first, pd.concat(levels, ignore_index=True)),
+        pd.concat(levels, ignore_index=True),
         summary.assign(lowest=_lowest(summary, by_seed)),
         pd.concat(comparisons, ignore_index=True) if comparisons else pd.DataFrame(),
         _long(by_row, rows[["perturbation", "severity"]]),
@@ -120,11 +119,11 @@ def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 
 def _long(by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
     """Turn arrays ``(S, rows)`` by method and name into a frame with a row for each model and row."""
     frames = [
-        keys.assign(model=label, train_seed=number, **{name: values[number] for name, values in arrays.items()})
+        pd.DataFrame(dict(model=label, train_seed=number, **keys, **{name: x[number] for name, x in arrays.items()}))
         for label, arrays in by_seed.items()
         for number in range(len(arrays["cost"]))
     ]
-    return _with_first(["model", "train_seed"], pd.concat(frames, ignore_index=True))
+    return pd.concat(frames, ignore_index=True)
 
 
 def _lowest(summary: pd.DataFrame, by_seed: Mapping[str, Mapping[str, np.ndarray]]) -> np.ndarray:
@@ -138,10 +137,6 @@ def _lowest(summary: pd.DataFrame, by_seed: Mapping[str, Mapping[str, np.ndarray
             is_below = high[one, group] < low[other, group]
             result[one, group] &= is_below and p_value(costs[one][:, group], of_other[:, group]) <= CLEAR
     return result.ravel()
-
-
-def _with_first(names: list[str], frame: pd.DataFrame) -> pd.DataFrame:
-    return frame[[*names, *(name for name in frame if name not in names)]]
 
 
 def _cube(of_model: pd.DataFrame, rows: pd.DataFrame) -> np.ndarray:
