@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -123,32 +124,42 @@ def robustness_report(
 
     writer = _Writer(plan, rows, names, loaded, space, out)
     if progress_bar:
-        _say_how_long(plan, rows, loaded, horizon, out, jobs)
+        writer.say_how_long(horizon, jobs)
     records = complete_rows(
         plan, rows, loaded, out / "rows", jobs=jobs, progress_bar=progress_bar, at_row=writer.write_unfinished
     )
     text = writer.write(rows, records)
     write_frame_atomically(records, out / "episodes.csv.xz")
     if information:
-        text = writer.write(rows, records, _measure_all(plan, rows[0], loaded, out, progress_bar))
+        text = writer.write(rows, records, writer.measure_information(progress_bar))
     return text
 
 
+@dataclass
 class _Writer:
     """Write the page and its files, for all rows or for those that are finished."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        rows: Sequence[Row],
-        names: Mapping[str, Sequence[str]],
-        models: Models,
-        space: spaces.Space,
-        out: Path,
-    ) -> None:
-        self.plan, self.rows, self.names, self.models, self.space, self.out = plan, rows, names, models, space, out
-        self.how = provenance()
-        self.not_before = 0.0
+    plan: Plan
+    rows: Sequence[Row]
+    names: Mapping[str, Sequence[str]]
+    models: Models
+    space: spaces.Space
+    out: Path
+    how: dict[str, Any] = field(default_factory=provenance)
+    not_before: float = 0.0
+
+    def say_how_long(self, horizon: int | None, jobs: int) -> None:
+        """Print an estimate of the time before the rows run."""
+        if not (missing := missing_rows(self.rows, self.out / "rows")):
+            return
+        seconds = seconds_of_a_row(self.plan, self.rows[0], self.models, horizon)
+        minutes = seconds * len(missing) / min(jobs, len(missing)) / 60
+        how_long = f"about {minutes:.0f} minutes" if minutes > 1.5 else f"about {60 * minutes:.0f} seconds"
+        print(
+            f"{len(missing)} rows of {self.plan.n_episodes} episodes of each model: {how_long} with {jobs} "
+            f"process{'es' * (jobs > 1)}; the finished rows are in {self.out / 'report.html'}",
+            file=sys.stderr,
+        )
 
     def write_unfinished(self, records: Mapping[Row, pd.DataFrame]) -> None:
         """Write the page of the finished rows, unless the last one was written just now."""
@@ -169,7 +180,7 @@ class _Writer:
         records = pd.concat([records[records["model"] == label] for label in self.names], ignore_index=True)
         out, numbers = self.out, make_numbers(records, seed=self.plan.seed)
         is_finished = len(rows) == len(self.rows)
-        figures = _draw(numbers, self.plan, rows if is_finished else (), self.models, self.space, out)
+        figures = self._draw(numbers, rows if is_finished else ())
         made = how_made(self.how["command"], self.how)
         page = Page(self.plan, rows, self.names, figures, knowledge, made, n_rows=len(self.rows))
         write_frame_atomically(numbers.levels, out / "levels.csv")
@@ -181,18 +192,46 @@ class _Writer:
         write_atomically(out / "report.html", html)
         return text
 
+    def _draw(self, numbers: Numbers, rows: Sequence[Row]) -> dict[str, str]:
+        """Draw the figures that this report has, with examples of some rows, and return their files by name."""
+        figures = {}
+        if numbers.perturbations:
+            figures["degradation"] = degradation_curves(numbers)
+        if (numbers.groups["kind"] == "own").any():
+            figures["own_rows"] = own_rows_figure(numbers)
+        if any(map(numbers.can_be_clear, numbers.models[1:])):
+            figures["comparison"] = comparison_figure(numbers)
+        # One picture does not show the timing.
+        of_sensor = [row for row in rows if row.kind == "sensor"]
+        shown = [row for row in of_sensor if PERTURBATIONS[row.perturbation].kind == "image"]
+        shown += [row for row in rows if row.kind == "scene"]
+        plan = self.plan
+        if kind_of(self.space) == "image" and shown:
+            names = list(dict.fromkeys(row.perturbation for row in shown))
+            figures["examples"] = perturbation_gallery(plan.env_id, names, env_kwargs=plan.env_kwargs, seed=plan.seed)
+        elif of_sensor and plan.scale is not None:
+            figures["examples"] = vector_examples(plan, of_sensor, next(iter(self.models.values()))[0])
+        return {name: _save(figure, self.out, name) for name, figure in figures.items()}
 
-def _say_how_long(plan: Plan, rows: Sequence[Row], models: Models, horizon: int | None, out: Path, jobs: int) -> None:
-    """Print an estimate of the time before the rows run."""
-    if not (missing := missing_rows(rows, out / "rows")):
-        return
-    minutes = seconds_of_a_row(plan, rows[0], models, horizon) * len(missing) / min(jobs, len(missing)) / 60
-    how_long = f"about {minutes:.0f} minutes" if minutes > 1.5 else f"about {60 * minutes:.0f} seconds"
-    print(
-        f"{len(missing)} rows of {plan.n_episodes} episodes of each model: {how_long} with {jobs} "
-        f"process{'es' * (jobs > 1)}; the finished rows are in {out / 'report.html'}",
-        file=sys.stderr,
-    )
+    def measure_information(self, progress_bar: bool) -> list[Knowledge]:
+        """Measure the information in the TRVs of the first model of each method; long episodes take many minutes."""
+        firsts = {label: of_method[0] for label, of_method in self.models.items()}
+        total = len(ESTIMATES) * sum(isinstance(model, TDPG) for model in firsts.values())
+        known = []
+        with threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
+            for number, (label, model) in enumerate(firsts.items()):
+                progress.set_postfix_str(f"information, {label}")
+                try:
+                    if not isinstance(model, TDPG):
+                        raise ValueError(f"{type(model).__name__} has no task-relevant variables")
+                    with closing(scenario_env(self.rows[0].scenario, model, n_episodes=N_INFORMATION)) as env:
+                        report = information_report(model, env, N_INFORMATION, self.plan.seed, at_end=progress.update)
+                    known.append(_knowledge(label, report, self.out, f"information-{number}"))
+                    if model.auto_weight is not None and (kept := model.auto_weight.kept()) is not None:
+                        known[-1].text += f" By the estimate of the training, {kept}."
+                except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
+                    known.append(Knowledge(label, f"not measured: {e}."))
+        return known
 
 
 def _import_extra() -> None:
@@ -262,54 +301,10 @@ def _check_different(
                 )
 
 
-def _draw(
-    numbers: Numbers, plan: Plan, rows: Sequence[Row], models: Models, space: spaces.Space, out: Path
-) -> dict[str, str]:
-    """Draw the figures that this report has, with examples of some rows, and return their files by name."""
-    figures = {}
-    if numbers.perturbations:
-        figures["degradation"] = degradation_curves(numbers)
-    if (numbers.groups["kind"] == "own").any():
-        figures["own_rows"] = own_rows_figure(numbers)
-    if any(map(numbers.can_be_clear, numbers.models[1:])):
-        figures["comparison"] = comparison_figure(numbers)
-    # One picture does not show the timing.
-    of_sensor = [row for row in rows if row.kind == "sensor"]
-    shown = [row for row in of_sensor if PERTURBATIONS[row.perturbation].kind == "image"]
-    shown += [row for row in rows if row.kind == "scene"]
-    if kind_of(space) == "image" and shown:
-        names = list(dict.fromkeys(row.perturbation for row in shown))
-        figures["examples"] = perturbation_gallery(plan.env_id, names, env_kwargs=plan.env_kwargs, seed=plan.seed)
-    elif of_sensor and plan.scale is not None:
-        figures["examples"] = vector_examples(plan, of_sensor, next(iter(models.values()))[0])
-    return {name: _save(figure, out, name) for name, figure in figures.items()}
-
-
 def _save(figure: Any, out: Path, name: str) -> str:
     path = f"figures/{name}.png"
     save_figure(figure, out / path, dpi=DPI)
     return path
-
-
-def _measure_all(plan: Plan, row: Row, models: Models, out: Path, progress_bar: bool) -> list[Knowledge]:
-    """Measure the information in the TRVs of the first model of each method; long episodes take many minutes."""
-    firsts = {label: of_method[0] for label, of_method in models.items()}
-    total = len(ESTIMATES) * sum(isinstance(model, TDPG) for model in firsts.values())
-    known = []
-    with threads(1), tqdm(total=total, unit="estimate", disable=not progress_bar or not total) as progress:
-        for number, (label, model) in enumerate(firsts.items()):
-            progress.set_postfix_str(f"information, {label}")
-            try:
-                if not isinstance(model, TDPG):
-                    raise ValueError(f"{type(model).__name__} has no task-relevant variables")
-                with closing(scenario_env(row.scenario, model, n_episodes=N_INFORMATION)) as env:
-                    report = information_report(model, env, N_INFORMATION, plan.seed, at_end=progress.update)
-                known.append(_knowledge(label, report, out, f"information-{number}"))
-                if model.auto_weight is not None and (kept := model.auto_weight.kept()) is not None:
-                    known[-1].text += f" By the estimate of the training, {kept}."
-            except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
-                known.append(Knowledge(label, f"not measured: {e}."))
-    return known
 
 
 def _knowledge(label: str, report: InformationReport, out: Path, prefix: str) -> Knowledge:
