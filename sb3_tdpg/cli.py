@@ -260,20 +260,11 @@ def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
     )
 
 
-def _integer(least: int) -> Callable[[str], int]:
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"{text} must be an integer of at least {least}")
-        return value
-
-    return read
-
-
-_positive = _integer(1)
+def _positive(text: str) -> int:
+    with contextlib.suppress(ValueError):
+        if (value := int(text)) >= 1:
+            return value
+    raise argparse.ArgumentTypeError(f"{text} must be an integer of at least 1")
 
 
 KEYWORDS: dict[str, Any] = dict(nargs="+", action="extend", default=[], metavar="KEY=VALUE")

@@ -21,8 +21,8 @@ class EvaluationSeeds(NamedTuple):
 
 def evaluation_seeds(seed: int) -> EvaluationSeeds:
     """Derive the seeds of the environments and of the policy's sampling from the seed that the user gives."""
-    if seed < 0:
-        raise ValueError(f"seed={seed} must not be negative")
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed={seed!r} must be an integer of at least 0")
     env_seed, policy_seed = np.random.SeedSequence([seed, _DOMAIN]).generate_state(2)
     # SB3 adds the environment's index to its seed, and NumPy's old generator takes 32 bits.
     return EvaluationSeeds(int(env_seed >> 1), int(policy_seed >> 1))

@@ -62,7 +62,7 @@ def evaluate_scenarios(
     models = _named_models(model)
     rows = [scenario.with_kwargs(**(env_kwargs or {})) for scenario in scenarios]
     labels = labels or {}
-    _check_arguments(rows, n_episodes, seed, labels)
+    _check_arguments(rows, n_episodes, labels)
     check_models_fit(models, rows)
 
     frames = []
@@ -175,7 +175,7 @@ def _named_models(model: Any) -> dict[str, Any]:
     return models
 
 
-def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, seed: int, labels: Mapping[str, Any]) -> None:
+def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, labels: Mapping[str, Any]) -> None:
     if not scenarios:
         raise ValueError("scenarios is empty: give at least one, for instance sb3_tdpg.envs.scenarios.LAVA")
     counts = Counter(scenario.name for scenario in scenarios)
@@ -183,8 +183,6 @@ def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, seed: int, 
         raise ValueError(f"scenario names must differ, but {twice} occur more than once")
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes per scenario")
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ValueError(f"seed={seed!r} must be an integer of at least 0")
     taken = [name for name in labels if name in {*COLUMNS, "failure"} or name.startswith("final_")]
     if taken:
         raise ValueError(f"labels={dict(labels)}: {taken} are names of columns already, choose others")

@@ -273,7 +273,7 @@ def test_a_keyword_that_cannot_be_read_is_refused(texts, message):
     (["--env", "Lava-v0", "--env-kwargs", "horizon=7"], ["horizon of 5", "has 7"]),
     (["--env", "Lava-v0", "--env-kwargs", "depth=1"], ["depth"]),
     (["--env", "Lava-v0", "--env-kwargs", "depth"], ["'depth' is not a keyword"]),
-    (["--env", "Lava-v0", "--seed", "-1"], ["seed=-1 must not be negative"]),
+    (["--env", "Lava-v0", "--seed", "-1"], ["seed=-1 must be an integer of at least 0"]),
     (["--env", "Lava-v0", "--record", "film.avi"], ["film.avi", "'.avi'", ".gif or .mp4"]),
     (["--env", "Lava-v0", "--record", "film"], ["''", ".gif or .mp4"]),
     (["--env", "Lava-v0", "--record", "film.gif", "--env-kwargs", "render_mode=null"], ["None", "'rgb_array'"]),
