@@ -5,10 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from sb3_tdpg.common.files import kept_by_this_process as keep
 from sb3_tdpg.common.files import replaced_atomically, write_atomically
+from sb3_tdpg.common.provenance import write_frame_atomically
+from sb3_tdpg.evaluation.animation import Episode, save_animation
 
 
 def test_two_workers_may_write_the_same_file_at_once(tmp_path):
@@ -29,12 +33,23 @@ def test_a_text_is_written_in_utf_8_wherever_it_is_written(tmp_path):
     assert (tmp_path / "page.html").read_text(encoding="utf-8") == "β = 1"
 
 
-def test_what_could_not_be_written_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "summary.md"
-    write_atomically(path, "old")
-    with pytest.raises(KeyboardInterrupt), replaced_atomically(path) as partial:
-        partial.write_text("ne")
+EPISODE = Episode([np.zeros((9, 9, 3), np.uint8)] * 2, np.zeros((1, 1)), np.zeros(1))
+
+
+@pytest.mark.parametrize(("name", "writer", "write"), [
+    ("episodes.csv", "pandas.DataFrame.to_csv", lambda path: write_frame_atomically(pd.DataFrame(), path)),
+    ("film.gif", "PIL.Image.Image.save", lambda path: save_animation([EPISODE], path, horizon=1, fps=10)),
+], ids=["frame", "film"])  # fmt: skip
+def test_what_could_not_be_written_leaves_the_old_file_and_nothing_else(name, writer, write, tmp_path, monkeypatch):
+    def interrupted(self, target, **kwargs):
+        target.write_bytes(b"ne")
         raise KeyboardInterrupt
+
+    path = tmp_path / name
+    write_atomically(path, "old")
+    monkeypatch.setattr(writer, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(path)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

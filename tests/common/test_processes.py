@@ -62,22 +62,24 @@ def test_an_exception_stops_the_workers_at_once():
         os.kill(pid, 0)
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
-def test_workers_end_with_the_main_process(name, tmp_path):
-    script = tmp_path / "program.py"
-    script.write_text(PROGRAM)
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    # Ctrl-C in a terminal reaches the workers as well: the whole group gets the signal.
-    process = subprocess.Popen(
-        [sys.executable, script],
+def started(tmp_path, program):
+    """Start a program whose whole group gets Ctrl-C, as in a terminal."""
+    (tmp_path / "program.py").write_text(program)
+    return subprocess.Popen(
+        [sys.executable, "program.py"],
         cwd=tmp_path,
-        env=environment,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    with process:
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+def test_workers_end_with_the_main_process(name, tmp_path):
+    with started(tmp_path, PROGRAM) as process:
         deadline = time.monotonic() + 120
         while not all((tmp_path / name).exists() for name in "ab"):
             assert time.monotonic() < deadline
@@ -93,32 +95,19 @@ def test_workers_end_with_the_main_process(name, tmp_path):
 
 
 def test_a_worker_that_is_stopped_leaves_no_semaphore_of_its_progress_bars(tmp_path):
-    script = tmp_path / "program.py"
-    script.write_text(
+    program = (
         "from tqdm import tqdm\nfrom sb3_tdpg.common.processes import process_pool\n"
         "def work():\n    list(tqdm(range(3), disable=True))\n    list(tqdm(range(3), file=open('/dev/null', 'w')))\n"
         "if __name__ == '__main__':\n    with process_pool(1) as pool:\n        pool.submit(work).result()\n"
         "        raise SystemExit('stopped')\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
-    assert done.stderr == "stopped\n"
+    with started(tmp_path, program) as process:
+        assert process.communicate(timeout=120)[1] == "stopped\n"
 
 
 def test_ctrl_c_while_the_workers_start_is_told_once_and_not_lost(tmp_path):
-    script = tmp_path / "program.py"
-    script.write_text(PROGRAM.replace("with process_pool", "print('begins', flush=True)\n    with process_pool"))
-    process = subprocess.Popen(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    with process:
+    program = PROGRAM.replace("with process_pool", "print('begins', flush=True)\n    with process_pool")
+    with started(tmp_path, program) as process:
         assert process.stdout.readline() == "begins\n"
         time.sleep(0.5)  # the server of the workers imports for seconds
         os.killpg(process.pid, signal.SIGINT)

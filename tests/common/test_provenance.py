@@ -5,7 +5,6 @@ import math
 import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -111,21 +110,6 @@ def test_a_frame_is_written_and_read_back_bit_for_bit(name, records, tmp_path):
     write_frame_atomically(records, path)
     assert path.read_bytes() == first
     assert [file.name for file in path.parent.iterdir()] == [name]
-
-
-def test_a_failing_write_leaves_the_old_file_whole(records, tmp_path, monkeypatch):
-    path = tmp_path / "episodes.csv"
-    write_frame_atomically(records, path)
-    before = path.read_bytes()
-
-    def half(self, target, **kwargs):
-        Path(target).write_text("half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(pd.DataFrame, "to_csv", half)
-    with pytest.raises(OSError, match="disk full"):
-        write_frame_atomically(records, path)
-    assert path.read_bytes() == before
 
 
 def test_a_frame_needs_a_name_that_tells_its_format(records, tmp_path):

@@ -1,16 +1,14 @@
 import math
-import random
 import subprocess
 import sys
-from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
-import torch as th
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from small_problems import ToyEnv
@@ -92,47 +90,12 @@ def test_an_evaluation_does_not_replay_the_episodes_of_a_training_with_the_same_
     assert not np.isin(rollout_states(tdpg, LAVA[0], 10, seed=5).states[0, :, 0], starts).any()
 
 
-def draw():
-    return random.random(), float(np.random.rand()), float(th.rand(()))  # noqa: NPY002
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_the_global_random_states_are_left_as_they_were_even_after_an_error(fails, tdpg, monkeypatch):
-    def explode(*args, **kwargs):
-        draw()
-        raise RuntimeError("boom")
-
-    def draw_after(function):
-        random.seed(0)
-        np.random.seed(0)  # noqa: NPY002
-        th.manual_seed(0)
-        function()
-        return draw()
-
-    def evaluate():
-        with pytest.raises(RuntimeError, match="boom") if fails else nullcontext():
-            evaluate_scenarios(tdpg, TWO_ROWS, 3)
-
-    space = tdpg.action_space
-    if fails:
-        monkeypatch.setattr(tdpg, "predict", explode)
-    assert draw_after(evaluate) == draw_after(lambda: None)
-    assert tdpg.action_space is space
-
-
 def test_the_costs_are_those_of_evaluate_policy(tdpg):
     frame = evaluate_scenarios(tdpg, LAVA[:1], 400, deterministic=True)
     env = make_episodes_env("Lava-v0", 400, env_kwargs=LAVA[0].env_kwargs, seed=9)
     mean, std = evaluate_policy(tdpg, env, 400, deterministic=True, warn=False)
     assert frame["cost"].mean() == pytest.approx(-mean, abs=4 * std / 400**0.5 * 2**0.5)
     assert frame["deterministic"].all()
-
-
-def test_more_episodes_than_run_side_by_side_are_recorded_all(tdpg, monkeypatch):
-    monkeypatch.setattr("sb3_tdpg.evaluation.records.MAX_PARALLEL_EPISODES", 4)
-    frame = evaluate_scenarios(tdpg, LAVA[:1], 10)
-    assert len(frame) == 10
-    assert frame["cost"].nunique() == 10
 
 
 def test_the_keywords_for_all_scenarios_reach_the_environment_and_a_scenarios_own_win(tdpg):
@@ -167,29 +130,22 @@ def test_labels_become_constant_columns_in_front(tdpg):
     assert (frame["model"] == "TDPG").all()
 
 
-def test_a_recurrent_ppo_keeps_its_memory_and_is_evaluated_reproducibly():
-    env = make_episodes_env("Lava-v0", 4)
-    model = RecurrentPPO("MlpLstmPolicy", env, n_steps=5, batch_size=20, seed=0, device="cpu")
-    frames = [evaluate_scenarios(model, LAVA[:1], 6) for _ in range(2)]
-    pd.testing.assert_frame_equal(*frames, check_exact=True)
-
-
 @pytest.mark.filterwarnings("ignore:You are trying to run PPO")
-def test_the_noise_of_gsde_belongs_to_the_seed(tmp_path):
-    PPO("MlpPolicy", "Pendulum-v1", use_sde=True, n_steps=20, batch_size=20, seed=0, device="cpu").save(tmp_path / "m")
-    frames = [
-        evaluate_scenarios(PPO.load(tmp_path / "m", device="cpu"), [Scenario("swing", "Pendulum-v1")], 3, seed=seed)
-        for seed in (0, 0, 1)
-    ]
-    pd.testing.assert_frame_equal(*frames[:2], check_exact=True)
-    assert (frames[0]["cost"] != frames[2]["cost"]).all()
-
-
-def test_a_model_that_was_never_stacked_is_not_stacked_for_a_smaller_space():
-    env = make_vec_env("CartPole-v1", 2)
-    model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, device="cpu")
-    with pytest.raises(ValueError, match="observation_space"):
-        evaluate_scenarios(model, LAVA[:1], 2)
+@pytest.mark.parametrize(("make", "env_id"), [
+    (partial(RecurrentPPO, "MlpLstmPolicy", n_steps=5, batch_size=5), "Lava-v0"),
+    (partial(PPO, "MlpPolicy", n_steps=20, batch_size=20, use_sde=True), "Pendulum-v1"),
+    (partial(DQN, "MlpPolicy"), "CartPole-v1"),
+], ids=["memory", "gSDE", "exploration"])  # fmt: skip
+def test_other_algorithms_are_evaluated_reproducibly(make, env_id, tmp_path):
+    model = make(env=env_id, seed=0, device="cpu")
+    model.exploration_rate = 0.5
+    model.save(tmp_path / "model")
+    again = type(model).load(tmp_path / "model", device="cpu")
+    rows = [Scenario("x", env_id)]
+    frames = [evaluate_scenarios(m, rows, 8, seed=seed) for m, seed in ((model, 0), (again, 0), (again, 0), (again, 1))]
+    for frame in frames[1:3]:
+        pd.testing.assert_frame_equal(frames[0], frame, check_exact=True)
+    assert (frames[0]["cost"] != frames[3]["cost"]).any()
 
 
 def test_a_channels_last_image_in_a_dict_is_transposed_as_in_training(registry):
@@ -207,15 +163,6 @@ def test_normalised_stacks_are_stacked_below_the_normalisation():
 
 def test_what_is_no_array_in_the_last_info_is_left_out():
     assert _final_columns({"contacts": [[1, 2], [3]], "x": 2.0}) == {"final_x": 2.0}
-
-
-def test_any_environment_works_also_where_episodes_differ_in_length_and_the_model_explores():
-    model = DQN("MlpPolicy", "CartPole-v1", seed=0, device="cpu")
-    model.exploration_rate = 0.5
-    frames = [evaluate_scenarios(model, [Scenario("cart", "CartPole-v1")], 8) for _ in range(2)]
-    pd.testing.assert_frame_equal(*frames, check_exact=True)
-    np.testing.assert_array_equal(-frames[0]["cost"], frames[0]["length"])
-    assert frames[0]["length"].nunique() > 1
 
 
 class RaceEnv(gym.Env):
@@ -248,6 +195,7 @@ def test_an_episode_has_the_same_number_whichever_ends_first(registry, monkeypat
     monkeypatch.setattr("sb3_tdpg.evaluation.records.MAX_PARALLEL_EPISODES", 4)
     frame = evaluate_scenarios(model, rows, 10)
     np.testing.assert_allclose(frame["cost"], frame["final_start"], atol=1e-5)
+    np.testing.assert_array_equal(frame["length"][:10], 1 + (30 * frame["final_start"][:10]).astype(int))
     low, high = (frame.loc[frame["scenario"] == row.name, "cost"].to_numpy() for row in rows)
     np.testing.assert_allclose(low, high)
     assert len(np.unique(low)) == 10
