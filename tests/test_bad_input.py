@@ -15,7 +15,14 @@ from small_problems import ToyEnv, error_line, tiny_tdpg, toy_vec_env
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_tdpg import TDPG, BatchedVecEnv, SelectionCallback, TrainingCheckpointCallback, TRVPolicy
+from sb3_tdpg import (
+    TDPG,
+    BatchedVecEnv,
+    InformationCallback,
+    SelectionCallback,
+    TrainingCheckpointCallback,
+    TRVPolicy,
+)
 from sb3_tdpg.envs.lava import LavaEnv
 
 IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
@@ -309,6 +316,7 @@ POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete
 
 
 @pytest.mark.parametrize(("make", "kwargs", "message"), [
+    (InformationCallback, dict(eval_freq=0), "eval_freq=0 must be at least 1"),
     (SelectionCallback, dict(), "give cost_limit .* mi_limit .* or both"),
     (SelectionCallback, dict(cost_limit=math.nan), "cost_limit is NaN"),
     (SelectionCallback, dict(mi_limit=math.nan), "mi_limit is NaN"),

@@ -78,7 +78,7 @@ def test_the_report_on_a_policy_has_frames_a_badge_and_figures(tmp_path):
     model = tiny_tdpg(PROBLEM)
     env = make_episodes_env(PROBLEM, n_episodes=40)
     report = information_report(model, env, n_episodes=50, seed=3, names=("d", "v"))
-    assert len(report.costs) == 50
+    assert len(set(report.costs.tolist())) == 50, "the episodes of the two rounds differ"
     assert report.frame["t"].tolist() == list(range(model.horizon))
     assert (report.frame["n_episodes"] == 50).all()
     assert (report.frame["lower"] <= report.frame["upper"]).all()
@@ -143,14 +143,6 @@ def test_a_callback_of_tdpg_refuses_other_algorithms(callback):
         model.learn(8, callback=callback)
 
 
-def test_rounds_of_episodes_differ():
-    model = tiny_tdpg(PROBLEM)
-    env = make_episodes_env(PROBLEM, n_episodes=25)
-    report = information_report(model, env, n_episodes=50, seed=0)
-    assert len(set(report.costs.tolist())) == 50
-    env.close()
-
-
 def test_the_map_shows_every_value_and_marks_what_is_not_known():
     frame = state_knowledge(looking_at_the_first_then_the_second(), names=("a", "b", "c"))
     axes = knowledge_map(frame).axes[0]
@@ -197,8 +189,3 @@ def test_a_callback_is_refused_where_an_epoch_has_too_few_episodes_for_an_interv
     model = tiny_tdpg(PROBLEM, n_episodes=min_episodes(2) - 1)
     with pytest.raises(ValueError, match=r"n_episodes=19 is too small.* at least 20"):
         train_epochs(model, 1, callback=InformationCallback())
-
-
-def test_a_callback_without_epochs_between_is_refused():
-    with pytest.raises(ValueError, match="eval_freq=0"):
-        InformationCallback(0)

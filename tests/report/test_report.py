@@ -4,16 +4,17 @@ import re
 import shutil
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 from gymnasium import spaces
 from perturbed_problems import ClockEnv
 from scipy.stats import mannwhitneyu, trim_mean
-from small_problems import error_line, tiny_tdpg
+from small_problems import ToyEnv, error_line, tiny_tdpg
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.lava import LavaEnv
@@ -170,14 +171,14 @@ def test_processes_give_the_same_episodes(report, tmp_path):
 
 def test_all_methods_meet_the_same_episodes(tmp_path):
     model = tiny_tdpg()
-    report_of(tmp_path, {"A": model, "B": [model]}, n_episodes=30, progress_bar=False)
+    report_of(tmp_path, {"A": model, "B": [model]}, n_episodes=30)
     records = pd.read_csv(tmp_path / "episodes.csv.xz").set_index(["model", "perturbation", "severity", "episode"])
     pd.testing.assert_series_equal(records.loc["A"]["cost"], records.loc["B"]["cost"])
 
 
 def test_one_model_is_not_taken_for_a_method(tmp_path):
     models = {"A": tiny_tdpg(), "B": tiny_tdpg(seed=1)}
-    text = report_of(tmp_path, models, severities=[3], n_episodes=30, progress_bar=False)
+    text = report_of(tmp_path, models, severities=[3], n_episodes=30)
     assert "about this model" in text
     assert "With 1 and 1 model no difference can be clear" in text
     assert "Which is more robust" not in text
@@ -242,12 +243,42 @@ def test_the_statistics_that_lie_beside_a_model_are_used(name, statistics, tmp_p
 
 def test_images_get_a_gallery_and_a_scene(tmp_path):
     model = tiny_tdpg("BallCatch-v0", n_episodes=4, cost_limit=20.0)
-    settings = dict(perturbations=["noise", "camera_pose"], severities=[5], progress_bar=False)
+    settings = dict(perturbations=["noise", "camera_pose"], severities=[5])
     text = report_of(tmp_path, {"A": model}, "BallCatch-v0", **settings)
     assert "figures/examples.png" in text
     assert "| camera_pose | the environment changes | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
     assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
+
+
+PARTS = spaces.Dict(place=spaces.Box(-1, 1, (2,), np.float32), camera=spaces.Box(0, 255, (3, 36, 36), np.uint8))
+
+
+def test_a_dict_and_a_plant_are_perturbed(tmp_path, registry):
+    gym.register("Toy-v0", ToyEnv, kwargs=dict(observation_space=PARTS, horizon=6))
+    model = PPO("MultiInputPolicy", gym.make("Toy-v0"), n_steps=6, batch_size=6, seed=0, device="cpu")
+    names = ["noise", "vector_bias", "freeze", "group_failure", "actuator_gain", "actuator_delay"]
+    text = report_of(tmp_path, {"A": model}, "Toy-v0", perturbations=names, severities=[5], n_episodes=4)
+    levels = pd.read_csv(tmp_path / "levels.csv").set_index("perturbation")
+    assert levels["kind"].tolist() == ["unperturbed", *["sensor"] * 4, *["plant"] * 2]
+    assert (levels.loc[names, "iqm"] != levels.loc["unperturbed", "iqm"]).any()
+    assert "| actuator_delay | Apply the action of some steps ago, and 0 until then | steps | 5 |" in text
+    assert "figures/examples.png" in text
+
+
+def test_models_of_stacked_observations_are_perturbed_before_the_stack(tmp_path):
+    short = dict(max_episode_steps=5)
+    env = VecFrameStack(make_vec_env("Pendulum-v1", 1, env_kwargs=short), 3)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, seed=0, device="cpu")
+    settings = dict(perturbations=["vector_bias", "freeze"], severities=[5], env_kwargs=short, deterministic=True)
+    report_of(tmp_path, {"A": model}, "Pendulum-v1", **settings)
+    records = pd.read_csv(tmp_path / "episodes.csv.xz").set_index("perturbation")["cost"]
+    sensor = partial(PerturbedVecEnv, perturbation="vector_bias", severity=5, seed=0)
+    expected = evaluate_scenarios(
+        model, [Scenario("biased", "Pendulum-v1", short, sensor=sensor)], 3, deterministic=True
+    )
+    np.testing.assert_allclose(records["vector_bias"], expected["cost"])
+    assert (records["vector_bias"].to_numpy() != records["unperturbed"].to_numpy()).all()
 
 
 BAD = {
@@ -286,7 +317,7 @@ def test_a_training_seed_counts_once(folder, tmp_path, capsys):
 
 
 def test_a_folder_and_a_perturbation_may_be_texts(tmp_path):
-    text = report_of(str(tmp_path), perturbations="vector_bias", severities=[2], progress_bar=False)
+    text = report_of(str(tmp_path), perturbations="vector_bias", severities=[2])
     assert (tmp_path / "report.md").read_text() == text
 
 

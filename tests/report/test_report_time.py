@@ -33,20 +33,21 @@ def test_long_episodes_are_fewer(kind, horizon, n_episodes):
 
 
 def report_of(out, models=None, env_id="Lava-v0", **settings):
-    settings = dict(perturbations=["vector_bias"], severities=[1, 5], scenarios=(), n_episodes=3) | settings
-    return robustness_report({"A": tiny_tdpg()} if models is None else models, env_id, out=out, **settings)
+    defaults = dict(perturbations=["vector_bias"], severities=[1, 5], scenarios=(), n_episodes=3, progress_bar=False)
+    models = {"A": tiny_tdpg()} if models is None else models
+    return robustness_report(models, env_id, out=out, **(defaults | settings))
 
 
 def test_a_budget_of_steps_sets_the_episodes(tmp_path):
-    assert "every model runs 12 episodes" in report_of(tmp_path, n_episodes=None, n_steps=60, progress_bar=False)
+    assert "every model runs 12 episodes" in report_of(tmp_path, n_episodes=None, n_steps=60)
     with pytest.raises(ValueError, match="n_steps=0 must be an integer of at least 1"):
         report_of(tmp_path / "none", n_steps=0)
 
 
 def test_the_time_is_estimated_before_the_rows_run(tmp_path, capsys):
-    report_of(tmp_path)
+    report_of(tmp_path, progress_bar=True)
     assert re.match(r"3 rows of 3 episodes of each model: about \d+ seconds with 1 process;", capsys.readouterr().err)
-    report_of(tmp_path)
+    report_of(tmp_path, progress_bar=True)
     assert "about" not in capsys.readouterr().err  # nothing is left to run
 
 
@@ -62,7 +63,7 @@ def test_the_page_of_an_interrupted_report_has_what_is_finished(tmp_path, monkey
 
     monkeypatch.setattr(plan, "run_row", interrupted)
     monkeypatch.setattr(report_main, "PAUSE", 0)
-    settings = dict(perturbations=["vector_bias", "vector_noise"], progress_bar=False)
+    settings = dict(perturbations=["vector_bias", "vector_noise"])
     with pytest.raises(KeyboardInterrupt):
         report_of(tmp_path, **settings)
     page, html = ((tmp_path / f"report.{suffix}").read_text() for suffix in ("md", "html"))
@@ -82,7 +83,7 @@ def test_unfinished_pages_take_a_small_share_of_the_time(tmp_path, monkeypatch):
     written, write = [], report_main.to_html
     monkeypatch.setattr(report_main, "to_html", lambda *args, **how: written.append(how) or write(*args, **how))
     names = ["vector_bias", "vector_noise", "vector_scale"]
-    report_of(tmp_path, perturbations=names, severities=[5], progress_bar=False)
+    report_of(tmp_path, perturbations=names, severities=[5])
     # The first one has a perturbation, and the other rows take less time than four pages.
     assert written == [dict(reload=True), dict(reload=False)]
 
@@ -100,13 +101,13 @@ def few_information_episodes(monkeypatch):
 def test_the_estimates_of_the_information_show_their_progress(tmp_path, capsys, few_information_episodes):
     free = PPO("MlpPolicy", "Lava-v0", n_steps=10, batch_size=10, device="cpu")  # has none
     models = {str(number): model for number, model in enumerate((tiny_tdpg(), free, tiny_tdpg(seed=1)))}
-    page = report_of(tmp_path, models, information=True)
+    page = report_of(tmp_path, models, information=True, progress_bar=True)
     shown = capsys.readouterr().err
     assert re.search(r"100%.* 6/6 .*estimate", shown)
     assert "information, 2" in shown
     for words in ("What the policies know", "about the state", "shuffled pairs", "PPO has no task-relevant variables"):
         assert words in page
-    report_of(tmp_path, models, information=True, progress_bar=False)
+    report_of(tmp_path, models, information=True)
     assert capsys.readouterr().err == ""
 
 
@@ -141,6 +142,6 @@ class FirstEpisodeEnv(CountdownEnv):
 
 def test_there_is_a_page_where_the_information_cannot_be_measured(tmp_path, registry, few_information_episodes):
     gym.register("Countdown-v0", FirstEpisodeEnv, kwargs=dict(name=0, lengths=(2,)))
-    text = report_of(tmp_path, {"A": tiny_tdpg("Countdown-v0")}, "Countdown-v0", information=True, progress_bar=False)
+    text = report_of(tmp_path, {"A": tiny_tdpg("Countdown-v0")}, "Countdown-v0", information=True)
     assert "not measured: the frame has no component" in text
     assert (tmp_path / "report.html").exists()
