@@ -9,7 +9,7 @@ from sb3_tdpg.problem import read_problem
 
 class InformationCallback(TDPGCallback):
     """
-    Log a confidence interval of the information, in addition to the estimate that the policy is trained with.
+    Log a confidence interval (95 %) of the information, in addition to the estimate that the policy is trained with.
 
     The interval is computed from the epoch's rollouts, which were made with the current policy. It works without the
     penalty and does not change the training. It logs ``mi/lower`` and ``mi/upper``, the limits summed over time;
@@ -18,18 +18,14 @@ class InformationCallback(TDPGCallback):
     Components are named as in the environment's ``state_names``, without the unit, or ``x0``, ``x1``, ...
 
     :param eval_freq: Epochs from one interval to the next, beginning with the first.
-    :param confidence: Probability, at least, that the interval of a time step contains the truth.
-    :param components: Whether to measure the components of the state, too; each takes as long as the interval.
     :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.
     """
 
-    def __init__(self, eval_freq: int = 10, *, confidence: float = 0.95, components: bool = True) -> None:
+    def __init__(self, eval_freq: int = 10) -> None:
         super().__init__()
         if eval_freq < 1:
             raise ValueError(f"eval_freq={eval_freq} must be at least 1 (epochs)")
         self.eval_freq = eval_freq
-        self.confidence = confidence
-        self.components = components
         self.interval: InformationInterval | None = None  # the latest
 
     def _on_training_start(self) -> None:
@@ -48,7 +44,7 @@ class InformationCallback(TDPGCallback):
         if model.epoch % self.eval_freq != 0:
             return
         batch = model.rollout_buffer.episode_batch().information_batch(model.pools_information)
-        self.interval = information_interval(batch, confidence=self.confidence, seed=model.epoch)
+        self.interval = information_interval(batch, seed=model.epoch)
         # As mi/total: of an episode, also where one estimate is made for its steps.
         n_steps = model.rollout_buffer.mean_length if model.pools_information else 1.0
         for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
@@ -56,9 +52,7 @@ class InformationCallback(TDPGCallback):
             for t, value in enumerate(getattr(self.interval, limit).tolist()):
                 if np.isfinite(value):
                     self.logger.record(f"mi/{limit}_t{t:02d}", value, exclude=("stdout", "log", "json", "csv"))
-        if self.components:
-            estimates, _ = component_estimates(batch, seed=model.epoch)
-            names = read_problem(self.training_env).state_names
-            for name, values in zip(names, estimates.T, strict=True):
-                if np.isfinite(values).any():
-                    self.logger.record(f"mi/knows_{name.split(' (')[0]}", float(np.nanmean(values.clip(min=0))))
+        estimates, _ = component_estimates(batch, seed=model.epoch)
+        for name, values in zip(read_problem(self.training_env).state_names, estimates.T, strict=True):
+            if np.isfinite(values).any():
+                self.logger.record(f"mi/knows_{name.split(' (')[0]}", float(np.nanmean(values.clip(min=0))))

@@ -58,11 +58,6 @@ class InformationInterval:
     """Probability, at least, that the interval of a step contains the truth."""
 
     @property
-    def width(self) -> np.ndarray:
-        """``(T,)``, nats"""
-        return self.upper - self.lower
-
-    @property
     def total(self) -> tuple[float, float]:
         """Sums of the lower and of the upper limits over the time steps that have limits; see :attr:`n_left_out`."""
         return float(np.nansum(self.lower)), float(np.nansum(self.upper))

@@ -12,41 +12,36 @@ import pandas as pd
 
 from sb3_tdpg.evaluation.tables import one_or_all, require_columns, summary_table
 
+LEVEL = 0.95  # of the intervals
+N_BOOTSTRAP = 2000
 
-def aggregate_seeds(
-    records_by_seed: pd.DataFrame, *, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
-) -> pd.DataFrame:
+
+def aggregate_seeds(records_by_seed: pd.DataFrame) -> pd.DataFrame:
     """
     Summarise each model in each scenario over its training seeds: the quality of the method, not of one policy.
 
-    The summary is the interquartile mean of the seeds' mean costs, with a percentile bootstrap interval over seeds.
+    The summary is the interquartile mean of the seeds' mean costs, with a percentile bootstrap interval of 95 % over
+    seeds.
 
     :param records_by_seed: Records with a column ``train_seed``
         (``evaluate_scenarios(..., labels=dict(train_seed=3))``).
-    :param level: Coverage of the interval.
-    :param n_bootstrap: Number of resamples.
-    :param seed: Seed of the resampling.
     :return: one row for each model and scenario: ``n_seeds``, ``iqm``, ``low``, ``high``, ``min``, ``max``,
         ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
         seed), ``level``, ``seed`` and ``deterministic``
     """
     require_columns(records_by_seed, ["train_seed"])
-    if not 0 < level < 1:
-        raise ValueError(f"level={level} must lie between 0 and 1")
     rows = []
     for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
         means, stds = group[["mean", "std"]].to_numpy().T
-        (point,), (low,), (high,) = interquartile_means(means[:, None], level=level, n_bootstrap=n_bootstrap, seed=seed)
+        (point,), (low,), (high,) = interquartile_means(means[:, None])
         seeds = dict(n_seeds=len(means), iqm=point, low=low, high=high, min=means.min(), max=means.max())
         how = {name: one_or_all(group[name]) for name in ("seed", "deterministic")}
-        more = dict(episode_std=_interquartile_mean(stds), level=level, n=one_or_all(group["n"]))
+        more = dict(episode_std=_interquartile_mean(stds), level=LEVEL, n=one_or_all(group["n"]))
         rows.append(dict(model=model, scenario=scenario, **seeds, **more, **how))
     return pd.DataFrame(rows)
 
 
-def probability_of_improvement(
-    records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any
-) -> tuple[float, ...]:
+def probability_of_improvement(records_by_seed: pd.DataFrame, model: str, control: str) -> tuple[float, ...]:
     """
     Estimate the probability that a seed of one method has a lower mean cost than a seed of another method.
 
@@ -54,22 +49,20 @@ def probability_of_improvement(
 
     :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
     :param control: Label of the method to compare with.
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the probability, 0.5 for no difference, and the ends of its interval
     """
     means = _seed_means(records_by_seed, (model, control))
     costs, of_control = (means[label].to_numpy()[:, None] for label in (model, control))
-    return tuple(estimate.item() for estimate in probabilities_of_improvement(costs, of_control, **bootstrap))
+    return tuple(estimate.item() for estimate in probabilities_of_improvement(costs, of_control))
 
 
-def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, **bootstrap: Any) -> tuple[float, ...]:
+def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str) -> tuple[float, ...]:
     """
     Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
 
     Pairing removes the differences between seeds where both methods start from one policy and meet the same episodes.
 
     :param control: Label of the method to compare with; it must have the same seeds.
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
     """
     means = _seed_means(records_by_seed, (model, control))
@@ -77,18 +70,18 @@ def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str, *
     if seeds != of_control:
         raise ValueError(f"the seeds of {model!r} are {seeds}, those of {control!r} {of_control}: they must match")
     differences = (means[model] - means[control]).to_numpy()[:, None]
-    return tuple(estimate.item() for estimate in _bootstrap(lambda x: x.mean(axis=0), differences, **bootstrap))
+    return tuple(estimate.item() for estimate in _bootstrap(lambda x: x.mean(axis=0), differences))
 
 
-def interquartile_means(scores: np.ndarray, **bootstrap: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def interquartile_means(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Compute the interquartile mean over seeds for many rows at once; see :func:`~sb3_tdpg.evaluation.aggregate_seeds`.
 
     :param scores: ``(seeds, rows)``; each row is resampled on its own.
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
+    :param seed: Seed of the resampling.
     :return: the means and the ends of their intervals, each ``(rows,)``
     """
-    return _bootstrap(_interquartile_mean, scores, **bootstrap)
+    return _bootstrap(_interquartile_mean, scores, seed=seed)
 
 
 def _interquartile_mean(x: np.ndarray) -> np.ndarray:
@@ -98,14 +91,13 @@ def _interquartile_mean(x: np.ndarray) -> np.ndarray:
 
 
 def probabilities_of_improvement(
-    costs: np.ndarray, of_control: np.ndarray, **bootstrap: Any
+    costs: np.ndarray, of_control: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Estimate, row by row, the probability that a seed has a lower cost than a seed of the control; ties count half.
 
     :param costs: ``(seeds, rows)``; each row is resampled on its own.
     :param of_control: ``(seeds of the control, rows)``
-    :param bootstrap: ``level``, ``n_bootstrap`` and ``seed`` as in ``aggregate_seeds``.
     :return: the probabilities and the ends of their intervals, each ``(rows,)``
     """
 
@@ -113,7 +105,7 @@ def probabilities_of_improvement(
         x, y = x[:, None], y[None]
         return ((x < y) + 0.5 * (x == y)).mean(axis=(0, 1))
 
-    return _bootstrap(share, costs, of_control, **bootstrap)
+    return _bootstrap(share, costs, of_control)
 
 
 def _seed_means(records_by_seed: pd.DataFrame, models: Sequence[str]) -> pd.Series:
@@ -127,7 +119,7 @@ def _seed_means(records_by_seed: pd.DataFrame, models: Sequence[str]) -> pd.Seri
 
 
 def _bootstrap(
-    statistic: Callable[..., Any], *scores: np.ndarray, level: float = 0.95, n_bootstrap: int = 2000, seed: int = 0
+    statistic: Callable[..., Any], *scores: np.ndarray, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Resample the seeds of arrays ``(seeds, rows)``; return a statistic and the ends of its percentile interval."""
     try:
@@ -140,7 +132,7 @@ def _bootstrap(
     try:
         of_scores = {"scores": scores if len(scores) > 1 else scores[0]}
         points, intervals = library.get_interval_estimates(
-            of_scores, statistic, reps=n_bootstrap, confidence_interval_size=level
+            of_scores, statistic, reps=N_BOOTSTRAP, confidence_interval_size=LEVEL
         )
     finally:
         np.random.set_state(state)  # noqa: NPY002

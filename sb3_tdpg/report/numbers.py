@@ -7,17 +7,15 @@ Dimension key: S models of a method, R rows, E episodes, G groups of rows (a per
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.statistics import interquartile_means
+from sb3_tdpg.evaluation.statistics import LEVEL, interquartile_means
 from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 
 CLEAR = 0.05
 """A difference is clear up to this p-value."""
-LEVEL = 0.95  # of the intervals
 MAX_EXACT = 8  # models: up to here the test is exact, as SciPy does without equal costs
 
 
@@ -72,7 +70,7 @@ def p_value(costs: np.ndarray, of_others: np.ndarray) -> float:
     return float(mannwhitneyu(costs, of_others, method=method).pvalue)
 
 
-def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 0) -> Numbers:
+def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
     """
     Aggregate the records of ``run_row``.
 
@@ -82,14 +80,12 @@ def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 
     or 1 (failures): it is about this model, not about the method.
 
     :param records: The records of all rows.
-    :param n_bootstrap: Number of bootstrap samples.
     :param seed: Seed of the bootstrap.
     """
     rows = records[["perturbation", "severity", "kind"]].drop_duplicates(ignore_index=True)
     groups = _groups(rows)
     keys = pd.DataFrame(list(groups), columns=["perturbation", "kind"])
     plain = rows.index[rows["kind"] == "unperturbed"]
-    how = dict(level=LEVEL, n_bootstrap=n_bootstrap, seed=seed)
 
     levels, summaries, by_seed, by_row = [], [], {}, {}
     for label, of_model in records.groupby("model", sort=False):
@@ -98,9 +94,9 @@ def make_numbers(records: pd.DataFrame, *, n_bootstrap: int = 2000, seed: int = 
         cost = np.stack([cube[:, group].mean(axis=1) for group in groups.values()], axis=1)  # (S, G, E)
         added = cost - cube[:, plain].mean(axis=1, keepdims=True)
         is_share = bool(np.isin(cube, (0.0, 1.0)).all())
-        intervals = {**_interval_columns(cost, how, is_share), **_interval_columns(added, how, prefix="added")}
+        intervals = {**_interval_columns(cost, seed, is_share), **_interval_columns(added, seed, prefix="added")}
         summaries.append(pd.DataFrame(dict(model=label, **keys, n_seeds=len(cube), **intervals)))
-        intervals = _interval_columns(cube, how, is_share)
+        intervals = _interval_columns(cube, seed, is_share)
         levels.append(pd.DataFrame(dict(model=label, **rows, n_seeds=len(cube), **intervals)))
         by_row[str(label)] = dict(cost=cube.mean(axis=2))
         by_seed[str(label)] = dict(cost=cost.mean(axis=2), added=added.mean(axis=2))
@@ -155,13 +151,11 @@ def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
     return groups
 
 
-def _interval_columns(
-    cube: np.ndarray, how: Mapping[str, Any], is_share: bool = False, prefix: str = ""
-) -> dict[str, np.ndarray]:
+def _interval_columns(cube: np.ndarray, seed: int, is_share: bool = False, prefix: str = "") -> dict[str, np.ndarray]:
     """Aggregate ``(S, G, E)`` over models: a column with the number, and two with the ends of its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
     one = len(cube) == 1
-    columns = _mean_of_one(cube[0], is_share) if one else interquartile_means(cube.mean(axis=2), **how)
+    columns = _mean_of_one(cube[0], is_share) if one else interquartile_means(cube.mean(axis=2), seed)
     return dict(zip(names, columns, strict=True))
 
 

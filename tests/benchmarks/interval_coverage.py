@@ -30,7 +30,7 @@ def measure(nats: float, dim: int, n_episodes: int, n_draws: int, seed: int) -> 
     """Return a row of the table."""
     rng = np.random.default_rng((seed, round(1000 * nats), dim, n_episodes))
     interval = information_interval(gaussian_channels(nats, dim, n_episodes, n_draws, rng), seed=seed)
-    above, below, width = interval.lower > nats, interval.upper < nats, interval.width
+    above, below, width = interval.lower > nats, interval.upper < nats, interval.upper - interval.lower
     counts = (f"{1 - (above | below).mean():.1%}".replace("%", " %"), str(above.sum()), str(below.sum()))
     means = (interval.lower.mean(), interval.upper.mean(), width.mean(), np.quantile(width, 0.95))
     return (str(n_episodes), str(dim), f"{nats:g}", *counts, *(f"{x:.2f}" for x in means), f"{width.max():.3f}")

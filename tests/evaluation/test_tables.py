@@ -11,6 +11,7 @@ from sb3_tdpg.evaluation import (
     comparison_markdown,
     paired_difference,
     probability_of_improvement,
+    statistics,
     summary_table,
 )
 
@@ -62,13 +63,15 @@ def test_the_aggregate_over_seeds_ignores_an_outlier_but_shows_it():
     assert aggregate_seeds(records).equals(aggregate_seeds(records))
 
 
-def test_the_bootstrap_interval_covers_the_truth_about_as_often_as_it_says():
+def test_the_bootstrap_interval_covers_the_truth_about_as_often_as_it_says(monkeypatch):
+    monkeypatch.setattr(statistics, "LEVEL", 0.9)
+    monkeypatch.setattr(statistics, "N_BOOTSTRAP", 300)
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(100):
         records = some_records({"A": {"x": [0.0]}}, train_seed=0).loc[[0] * 20]
         records = records.assign(train_seed=range(20), cost=rng.standard_normal(20))
-        (row,) = aggregate_seeds(records, level=0.9, n_bootstrap=300).to_dict("records")
+        (row,) = aggregate_seeds(records).to_dict("records")
         hits += row["low"] <= 0.0 <= row["high"]
     assert 78 <= hits <= 98
 

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -24,7 +23,6 @@ from sb3_tdpg import TDPG
 from sb3_tdpg.callbacks import TDPGProgressBar
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
-from sb3_tdpg.evaluation import aggregate_seeds
 from sb3_tdpg.experiments.runs import Run, complete_run, complete_runs, read_progress
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.paper.lava_tables import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
@@ -219,7 +217,7 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
     pytest.importorskip("matplotlib")
     # In this process: the workers would not see the small epochs of this module.
     monkeypatch.setattr("sb3_tdpg.paper.lava_tables.complete_runs", complete_runs_here)
-    monkeypatch.setattr("sb3_tdpg.paper.lava_tables.aggregate_seeds", partial(aggregate_seeds, n_bootstrap=10))
+    monkeypatch.setattr("sb3_tdpg.evaluation.statistics.N_BOOTSTRAP", 10)
     tmp_path, published = tmp_path / "out", tmp_path / "docs" / "lava"
     summary = reproduce_lava(
         tmp_path, n_seeds=2, n_paper_seeds=1, n_eval_episodes=4, n_timesteps=200, publish=published

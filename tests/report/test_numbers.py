@@ -30,7 +30,7 @@ def made_up(n_seeds, control=10.0, method=8.0, spread=0.1, rows=ROWS):
 
 
 def numbers_of(*args, **kwargs):
-    return make_numbers(made_up(*args, **kwargs), n_bootstrap=50)
+    return make_numbers(made_up(*args, **kwargs))
 
 
 def page_of(numbers):
@@ -72,12 +72,12 @@ def test_what_overlaps_is_not_bold():
     """The test is clear and the intervals, which are about the middle half of the models, overlap a little."""
     records = made_up(5)
     records.loc[(records["model"] == "B") & (records["train_seed"] == 4), "cost"] += 4
-    numbers = make_numbers(records, n_bootstrap=2000)
+    numbers = make_numbers(records)
     of_b = numbers.groups.query("model == 'B' and perturbation == 'x'").iloc[0]
     of_a = numbers.groups.query("model == 'A' and perturbation == 'x'").iloc[0]
     assert of_b["iqm"] < of_a["low"] < of_b["high"]
     assert not numbers.groups["lowest"].any()
-    assert make_numbers(made_up(5), n_bootstrap=50).groups["lowest"].tolist() == [False] * 3 + [True] * 3
+    assert make_numbers(made_up(5)).groups["lowest"].tolist() == [False] * 3 + [True] * 3
 
 
 @pytest.mark.parametrize(("ours", "theirs", "least"), [
@@ -119,7 +119,7 @@ def test_every_figure_has_a_dot_for_each_model():
 def test_the_dots_of_a_comparison_are_shares_of_the_first_methods_models():
     records = made_up(4, control=8.0, rows=ROWS[:1])
     records.loc[(records["model"] == "B") & (records["train_seed"] == 0), "cost"] = 8.15  # below two of four
-    (axes,) = comparison_figure(make_numbers(records, n_bootstrap=50)).axes
+    (axes,) = comparison_figure(make_numbers(records)).axes
     (dots,) = [line for line in axes.lines if line.get_marker() == "." and len(line.get_xdata()) == 4]
     assert sorted(dots.get_xdata()) == [0.125, 0.375, 0.5, 0.625]
 
