@@ -94,7 +94,6 @@ def information_report(
     n_episodes: int = 500,
     seed: int = 0,
     *,
-    names: Sequence[str] | None = None,
     at_end: Callable[[], Any] = lambda: None,
 ) -> InformationReport:
     """
@@ -104,14 +103,12 @@ def information_report(
     :param env: Any number of environments.
     :param n_episodes: Number of episodes N; with fewer environments they are run in rounds.
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
-    :param names: Names of the components of the state; default: the environment's ``state_names``, or ``x0``, ...
     :param at_end: Called at the end of each of the three ``ESTIMATES``.
-    :raises ValueError: if model, environment or names do not fit, or there are too few episodes for an interval.
+    :raises ValueError: if model and environment do not fit, or there are too few episodes for an interval.
     """
     if not isinstance(model.policy, TRVPolicy):
         raise ValueError(f"the model is of {type(model).__name__}, without task-relevant variables: pass a TDPG model")
     check_env_fits(model, env)
-    names = read_problem(env).state_names if names is None else names
     if n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes} must be at least 1")
     n_rounds = -(-n_episodes // env.num_envs)
@@ -121,7 +118,7 @@ def information_report(
     batch = batch.select(th.arange(n_episodes))
     interval = information_interval(batch, seed=seed)
     at_end()
-    known = state_knowledge(batch, names, seed=seed)
+    known = state_knowledge(batch, read_problem(env).state_names, seed=seed)
     at_end()
     badge = trust_checks(batch, interval, seed=seed)
     at_end()

@@ -77,20 +77,19 @@ def test_names_must_be_as_many_as_components():
 def test_the_report_on_a_policy_has_frames_a_badge_and_figures(tmp_path):
     model = tiny_tdpg(PROBLEM)
     env = make_episodes_env(PROBLEM, n_episodes=40)
-    report = information_report(model, env, n_episodes=50, seed=3, names=("d", "v"))
+    report = information_report(model, env, n_episodes=50, seed=3)
     assert len(set(report.costs.tolist())) == 50, "the episodes of the two rounds differ"
     assert report.frame["t"].tolist() == list(range(model.horizon))
     assert (report.frame["n_episodes"] == 50).all()
     assert (report.frame["lower"] <= report.frame["upper"]).all()
     assert "summed over time" in str(report)
     assert report.badge.passed
-    assert set(report.knowledge["component"]) == {"d", "v"}
-    assert report.knowledge.loc[report.knowledge["component"] == "v", "nats"].isna().tolist()[0], "v_0 = 0"
+    assert report.knowledge.loc[report.knowledge["component"] == "v (m/step)", "nats"].isna().tolist()[0], "v_0 = 0"
     for name, figure in report.figures().items():
         save_figure(figure, tmp_path / f"{name}.png")
     assert (tmp_path / "timeline.png").exists()
     assert (tmp_path / "knowledge.png").exists()
-    again = information_report(model, env, n_episodes=50, seed=3, names=("d", "v"))
+    again = information_report(model, env, n_episodes=50, seed=3)
     pd.testing.assert_frame_equal(report.frame, again.frame)
     env.close()
 
@@ -108,15 +107,12 @@ def test_a_component_is_never_known_better_than_the_whole_state(monkeypatch):
     assert "components FAILED" in str(report)
 
 
-@pytest.mark.parametrize(("of_env", "given", "shown"), [
-    (LavaEnv.state_names, None, {"d (m)", "v (m/step)"}),
-    (("place", "speed"), None, {"place", "speed"}),
-    (None, None, {"x0", "x1"}),
-    (LavaEnv.state_names, ("a", "b"), {"a", "b"}),
-], ids=["the environment's", "others of the environment's", "numbers", "those given"])  # fmt: skip
-def test_the_report_calls_the_components_as_it_is_told_or_as_the_environment_does(of_env, given, shown, monkeypatch):
-    monkeypatch.setattr(LavaEnv, "state_names", of_env)
-    report = information_report(tiny_tdpg(PROBLEM), lava_env(50), n_episodes=50, seed=0, names=given)
+@pytest.mark.parametrize(("names", "shown"), [
+    (LavaEnv.state_names, {"d (m)", "v (m/step)"}), (("place", "speed"), {"place", "speed"}), (None, {"x0", "x1"}),
+], ids=["the environment's", "others", "numbers"])  # fmt: skip
+def test_the_report_calls_the_components_as_the_environment_does(names, shown, monkeypatch):
+    monkeypatch.setattr(LavaEnv, "state_names", names)
+    report = information_report(tiny_tdpg(PROBLEM), lava_env(50), n_episodes=50, seed=0)
     assert set(report.knowledge["component"]) == shown
     labels = report.figures()["knowledge"].axes[0].get_yticklabels()
     assert {label.get_text() for label in labels} == shown
