@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sb3_tdpg.cli import main, parse_keywords
 from sb3_tdpg.evaluation.animation import Episode, save_animation
 from sb3_tdpg.evaluation.enjoy import enjoy
+from sb3_tdpg.evaluation.loading import load_model
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 
 pytest.importorskip("matplotlib")
@@ -311,11 +312,12 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
 # -- other algorithms ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "RecurrentPPO", "DQN"])
+@pytest.mark.parametrize("algorithm", ["A2C", "DQN", "PPO", "RecurrentPPO", "TRPO"])
 def test_models_of_other_algorithms_are_played(algorithm, own, tmp_path, capsys):
     make = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
     policy = "MlpLstmPolicy" if algorithm == "RecurrentPPO" else "MlpPolicy"
     make(policy, "Own-v0", seed=0, device="cpu").save(own)
+    assert type(load_model(own, "Own-v0", {})) is make
     film = tmp_path / "film.gif"
     episodes = enjoy(own, "Own-v0", n_episodes=3, record=film)
     costs = [episode.costs.sum() for episode in episodes]

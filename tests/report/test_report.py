@@ -12,7 +12,7 @@ from gymnasium import spaces
 from perturbed_problems import ClockEnv
 from scipy.stats import mannwhitneyu, trim_mean
 from small_problems import ToyEnv, error_line, tiny_tdpg
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -209,21 +209,6 @@ def test_models_are_grouped_by_label_or_folder(tmp_path):
         parse_models([f"A={tmp_path}/c/ppo_s.zip", f"B={tmp_path}/c/ppo_s.zip"])
 
 
-def test_models_of_other_algorithms_are_recognised(tmp_path):
-    from sb3_contrib import TRPO, RecurrentPPO
-
-    for algorithm, policy in (
-        (PPO, "MlpPolicy"), (A2C, "MlpPolicy"), (TRPO, "MlpPolicy"), (RecurrentPPO, "MlpLstmPolicy")
-    ):  # fmt: skip
-        sizes = {} if algorithm is A2C else dict(batch_size=10)
-        algorithm(policy, "Lava-v0", n_steps=10, **sizes, seed=0, device="cpu").save(tmp_path / algorithm.__name__)
-        assert type(load_model(tmp_path / f"{algorithm.__name__}.zip", "Lava-v0", {})) is algorithm
-    files = [str(tmp_path / f"{name}.zip") for name in ("RecurrentPPO", "PPO")]
-    out = tmp_path / "report"
-    arguments = ["report", *files, "--env", "Lava-v0", "--perturbations", "vector_dropout", "--severities", "4"]
-    assert main([*arguments, "--episodes", "4", "--out", str(out), "--jobs", "1"]) == 0
-
-
 @pytest.mark.filterwarnings("ignore:You are trying to run PPO")
 @pytest.mark.parametrize(("name", "statistics"), [
     ("Lava-v0", "Lava-v0/vecnormalize.pkl"),
@@ -338,13 +323,6 @@ def test_a_folder_of_something_else_is_refused(content, folder, tmp_path, capsys
     line = error_line(capsys, "report", folder / "pg-seed0" / "model.zip", "--env", "Lava-v0", "--out", tmp_path)
     assert line.endswith("config.json is there already and is not that of a report: choose another folder")
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
-
-
-def test_a_folder_that_cannot_be_made_is_told_in_a_line(folder, tmp_path, capsys):
-    file = tmp_path / "file"
-    file.touch()
-    model = folder / "pg-seed0" / "model.zip"
-    assert str(file) in error_line(capsys, "report", model, "--env", "Lava-v0", "--out", file)
 
 
 def rows_of(*scenarios):
