@@ -3,7 +3,7 @@
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map, save_figure, training_curves
 from sb3_tdpg.evaluation.information import InformationReport, information_report, interval_frame, state_knowledge
 from sb3_tdpg.evaluation.interval import InformationInterval, information_interval
-from sb3_tdpg.evaluation.records import Trajectories, evaluate_scenarios, rollout_states
+from sb3_tdpg.evaluation.records import evaluate_scenarios, rollout_states
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table
 from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
@@ -11,7 +11,6 @@ from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
 __all__ = [
     "InformationInterval",
     "InformationReport",
-    "Trajectories",
     "TrustBadge",
     "TrustCheck",
     "add_ratio",

@@ -41,13 +41,6 @@ TINY = 1e-30
 ESTIMATES = ("interval", "knowledge", "checks")  # the parts of an information report, in this order
 
 
-class EncodedEpisodes(NamedTuple):
-    """N episodes as the encoder saw them."""
-
-    batch: InformationBatch  # (T, N, ...), on the CPU; episodes that ended early are not alive afterwards
-    costs: np.ndarray  # (N,), of the whole episode
-
-
 class InformationBounds(NamedTuple):
     """Sums over the time steps of an episode, in nats."""
 
@@ -186,12 +179,14 @@ def interval_frame(interval: InformationInterval) -> pd.DataFrame:
     return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
 
-def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisodes:
+def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> tuple[InformationBatch, np.ndarray]:
     """
     Run one episode in each environment, and keep the true states and the TRVs with their densities.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
     :param env: N environments.
+    :return: the samples ``(T, N, ...)``, on the CPU, of episodes that are not alive after their end, and their costs,
+        ``(N,)``
     """
     problem = read_problem(env)
     steps, costs = [], np.zeros(env.num_envs)
@@ -202,13 +197,13 @@ def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> EncodedEpisode
         encoded = (x.cpu() for x in (step.encoded.trvs, step.encoded.means, step.encoded.stds))
         steps.append((th.as_tensor(step.states, dtype=th.float32), *encoded, th.as_tensor(alive)))
         costs -= step.rewards * alive
-    return EncodedEpisodes(InformationBatch(*(th.stack(parts) for parts in zip(*steps, strict=True))), costs)
+    return InformationBatch(*(th.stack(parts) for parts in zip(*steps, strict=True))), costs
 
 
 def rollout_information(model: Any, scenario: Scenario, n_episodes: int = 1000, *, seed: int = 0) -> InformationBatch:
     """Run :func:`encode_episodes` in the environment of a scenario, with ``n_episodes`` episodes side by side."""
     with contextlib.closing(scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)) as env:
-        return encode_episodes(model, env, seed=seed).batch
+        return encode_episodes(model, env, seed=seed)[0]
 
 
 def information_bounds(batch: InformationBatch) -> InformationBounds:

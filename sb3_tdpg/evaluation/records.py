@@ -8,7 +8,7 @@ import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -116,20 +116,14 @@ def run_episodes(
     return records.reset_index(drop=True).rename_axis("episode").reset_index()
 
 
-class Trajectories(NamedTuple):
-    """N episodes of one model in one scenario."""
-
-    states: np.ndarray  # (T + 1, N, X)
-    costs: np.ndarray  # (N,), of the whole episode
-
-
 def rollout_states(
-    model: Any, scenario: Scenario, n_episodes: int = 60, *, seed: int = 0, deterministic: bool = False
-) -> Trajectories:
+    model: Any, scenario: Scenario, n_episodes: int = 60, *, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Run episodes of a fixed horizon side by side and keep the true states ``info["state"]``.
 
     :param scenario: A scenario whose environment has a horizon and reports its state.
+    :return: the states, ``(T + 1, N, X)``, and the costs of the whole episodes, ``(N,)``
     :raises ValueError: if the model does not fit, or an episode ends before the horizon.
     """
     check_models_fit({type(model).__name__: model}, [scenario])
@@ -137,7 +131,7 @@ def rollout_states(
     costs = np.zeros(n_episodes)
     with contextlib.closing(scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)) as env:
         problem = read_problem(env)
-        steps = rollout(model, env, seeds=evaluation_seeds(seed), deterministic=deterministic, problem=problem)
+        steps = rollout(model, env, seeds=evaluation_seeds(seed), problem=problem)
         for step in islice(steps, problem.horizon):
             if step.dones.any() and len(states) < problem.horizon - 1:
                 ended = f"an episode ended after {len(states) + 1} of {problem.horizon} steps"
@@ -145,7 +139,7 @@ def rollout_states(
             states.append(step.states)
             costs -= step.rewards
         states.append(np.stack([info["state"] for info in step.infos]))
-    return Trajectories(np.stack(states), costs)
+    return np.stack(states), costs
 
 
 def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:

@@ -193,8 +193,8 @@ class _Measuring(BaseCallback):
         trained_in, fresh = unwrap_vec_normalize(self.training_env), unwrap_vec_normalize(self.env)
         if trained_in is not None and fresh is not None and trained_in.norm_obs:
             fresh.obs_rms = trained_in.obs_rms
-        episodes = encode_episodes(self.model, self.env, seed=self.trial.number)
-        self.last = (float(episodes.costs.mean()), max(0.0, information_bounds(episodes.batch).upper))
+        batch, costs = encode_episodes(self.model, self.env, seed=self.trial.number)
+        self.last = (float(costs.mean()), max(0.0, information_bounds(batch).upper))
         for name, value in zip((COST, INFORMATION), self.last, strict=True):
             self.trial.set_user_attr(name, value)
         return self.last

@@ -78,7 +78,7 @@ def test_a_row_does_not_depend_on_which_other_rows_are_evaluated(tdpg, ppo, reco
 
 
 def test_all_models_start_a_scenario_from_the_same_initial_states(tdpg, ppo):
-    starts = [rollout_states(model, LAVA[0], 10, seed=5).states[0] for model in (tdpg, ppo)]
+    starts = [rollout_states(model, LAVA[0], 10, seed=5)[0][0] for model in (tdpg, ppo)]
     np.testing.assert_array_equal(*starts)
     assert len(np.unique(starts[0][:, 0])) == 10
 
@@ -87,7 +87,7 @@ def test_an_evaluation_does_not_replay_the_episodes_of_a_training_with_the_same_
     training_env = make_episodes_env("Lava-v0", 10, seed=5)
     training_env.reset()
     starts = [info["state"][0] for info in training_env.reset_infos]
-    assert not np.isin(rollout_states(tdpg, LAVA[0], 10, seed=5).states[0, :, 0], starts).any()
+    assert not np.isin(rollout_states(tdpg, LAVA[0], 10, seed=5)[0][0, :, 0], starts).any()
 
 
 def test_the_costs_are_those_of_evaluate_policy(tdpg):

@@ -100,12 +100,12 @@ def test_what_is_measured_is_on_fresh_episodes_and_leaves_the_training_alone():
     watched = tiny_tdpg(seed=3, beta=1.0).learn(600, measuring)
     for a, b in zip(trained.policy.parameters(), watched.policy.parameters(), strict=True):
         assert (a == b).all()
-    measured = encode_episodes(watched, env, seed=trial.number)
+    batch, costs = encode_episodes(watched, env, seed=trial.number)
     cost, information = measuring.measure()
-    assert cost == measured.costs.mean()
-    assert information == pytest.approx(information_bounds(measured.batch).upper)
+    assert cost == costs.mean()
+    assert information == pytest.approx(information_bounds(batch).upper)
     assert trial.user_attrs == dict(cost=cost, information=information)
-    assert len(measured.costs) == 50
+    assert len(costs) == 50
     assert len(trial.study.get_trials()[trial.number].intermediate_values) == 5
 
 
@@ -122,9 +122,9 @@ def test_a_policy_is_measured_with_the_statistics_of_its_training():
 def test_episodes_that_end_early_count_until_then():
     env = make_vec_env("CartPole-v1", n_envs=6, seed=0)
     model = tiny_tdpg("CartPole-v1", n_episodes=6, beta=1.0)
-    episodes = encode_episodes(model, env)
-    lengths = episodes.batch.alive.sum(dim=0).numpy()
-    assert (lengths == -episodes.costs).all()  # a reward of 1 a step
+    batch, costs = encode_episodes(model, env)
+    lengths = batch.alive.sum(dim=0).numpy()
+    assert (lengths == -costs).all()  # a reward of 1 a step
     assert lengths.min() < 100
     env.close()
 
