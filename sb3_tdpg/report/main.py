@@ -61,12 +61,10 @@ def robustness_report(
     """
     Run every model under every perturbation, and write a page that says which method is more robust, and where.
 
-    ``out`` then contains ``report.md`` and ``report.html`` (one file with its pictures), ``figures/``,
-    ``episodes.csv.xz`` (every episode), ``levels.csv``, ``perturbations.csv`` and ``comparisons.csv`` (the numbers of
-    the page, see :class:`~sb3_tdpg.report.numbers.Numbers`), ``config.json`` (settings, versions, commit) and
-    ``rows/``, from which an interrupted call continues. While rows are missing, the page is written again and again
-    with those that are finished. A later call may ask for other perturbations or severities: finished rows are not run
-    again.
+    ``out`` then contains ``report.md``, ``report.html`` (one file with its pictures) and the files that
+    docs/guide/report.md names. While rows are missing, the page is written again and again with those that are
+    finished. An interrupted call continues, and a later call may ask for other perturbations or severities: finished
+    rows are not run again.
 
     :param models: Models by method: one model or a list with one model for each training seed. A model is a file
         (:class:`~pathlib.Path` or text) or a model of TDPG, Stable-Baselines3 or sb3-contrib. All methods are compared
