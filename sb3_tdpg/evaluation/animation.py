@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from sb3_tdpg.common.files import replaced_atomically
-from sb3_tdpg.evaluation.figures import INK, PALETTE, tidy
+from sb3_tdpg.evaluation.figures import INK, PALETTE, import_matplotlib, tidy
 
 MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below
 # Of a video of this width, in pixels; a wider one has larger letters, since a phone shows all widths alike.
@@ -44,14 +44,11 @@ class Episode(NamedTuple):
 
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
-    """Raise a ``ValueError`` if the file extension is unknown, or matplotlib or ffmpeg is missing."""
+    """Raise an error if the file extension is unknown (``ValueError``), or matplotlib or ffmpeg is missing."""
     ending = Path(path).suffix
     if ending not in (".gif", ".mp4"):
         raise ValueError(f"{path}: the extension {ending!r} is not a video format: use .gif or .mp4")
-    try:
-        import matplotlib.animation  # noqa: F401
-    except ImportError as e:
-        raise ValueError("a video needs matplotlib: pip install sb3_tdpg[plots]") from e
+    import_matplotlib()
     if ending == ".mp4" and _ffmpeg() is None:
         raise ValueError(f"{path}: an .mp4 needs ffmpeg: install it, pip install imageio-ffmpeg, or use .gif")
 
