@@ -15,14 +15,7 @@ from small_problems import ToyEnv, error_line, tiny_tdpg, toy_vec_env
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_tdpg import (
-    TDPG,
-    BatchedVecEnv,
-    InformationCallback,
-    SelectionCallback,
-    TrainingCheckpointCallback,
-    TRVPolicy,
-)
+from sb3_tdpg import TDPG, BatchedVecEnv, InformationCallback, SelectionCallback, TrainingCheckpointCallback, TRVPolicy
 from sb3_tdpg.envs.lava import LavaEnv
 
 IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)

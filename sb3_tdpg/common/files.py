@@ -37,10 +37,7 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
             if time.time() - left.stat().st_mtime > SECONDS_UNTIL_LOCKED:
                 shutil.rmtree(left)
     # In a folder of its own: a compressed file contains its name, which must not vary.
-    with (
-        TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder,
-        ExitStack() as stack,
-    ):
+    with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder, ExitStack() as stack:
         with suppress(OSError):  # not every system can lock a folder
             stack.enter_context(_locked(Path(folder)))
         partial = Path(folder, path.name)

@@ -8,13 +8,7 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import (
-    VecEnv,
-    VecFrameStack,
-    VecNormalize,
-    VecTransposeImage,
-    is_vecenv_wrapped,
-)
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem

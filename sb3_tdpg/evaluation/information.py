@@ -82,12 +82,7 @@ class InformationReport:
 
 
 def information_report(
-    model: Any,
-    env: VecEnv,
-    n_episodes: int = 500,
-    seed: int = 0,
-    *,
-    at_end: Callable[[], Any] = lambda: None,
+    model: Any, env: VecEnv, n_episodes: int = 500, seed: int = 0, *, at_end: Callable[[], Any] = lambda: None
 ) -> InformationReport:
     """
     Run fresh episodes and estimate what the policy's TRVs know about the state at each time step.
