@@ -9,13 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from . import checks
-from .base import POMDPEnv
 from .panda_arm import FINGER_OPEN, HOME, Configuration, Watch
 from .panda_bullet import LIFTED, MOTIONS, GraspSimulation, Motion, Outcome
 from .panda_camera import IMAGE_SIZE, DepthCamera
 from .panda_scene import PandaScene
 from .panda_view import PandaView
-from .pool import WorkPool
+from .pool import SharedEnv
 
 NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
 ACTION_SCALE = 0.1
@@ -59,7 +58,7 @@ class GraspWorld:
             getattr(self, name).close()
 
 
-class PandaGraspEnv(POMDPEnv):
+class PandaGraspEnv(SharedEnv):
     r"""
     Grasp a mug on a table, and lift it.
 
@@ -93,8 +92,6 @@ class PandaGraspEnv(POMDPEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
-    shares_work = True
-    resources = frozenset({"_world", "_pool", "_view"})
 
     def __init__(
         self,
@@ -138,30 +135,13 @@ class PandaGraspEnv(POMDPEnv):
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
         self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
-    # The Bullet worlds are made at their first use, and so in the process that uses them.
-
-    @cached_property
-    def _world(self) -> GraspWorld:
-        return GraspWorld(*self._world_arguments())
-
-    @cached_property
-    def _pool(self) -> WorkPool:
-        return WorkPool(self.n_processes, GraspWorld, *self._world_arguments())
+    def _make_world(self) -> tuple[Any, ...]:
+        return GraspWorld, self.scene, MOTIONS[self.motion], self.solver_iterations
 
     @cached_property
     def _view(self) -> PandaView:
-        scene, _, _ = self._world_arguments()
-        return PandaView(scene, gui=self.render_mode == "human")
-
-    def _world_arguments(self) -> tuple[PandaScene, Motion, int | None]:
         self.check_open()
-        return self.scene, MOTIONS[self.motion], self.solver_iterations
-
-    def _shared(self, method: str, *arrays: np.ndarray) -> Any:
-        """Call a method of the world with arrays of n mugs, in several processes or in this one."""
-        if self.n_processes > 1 and len(arrays[0]) > 1:
-            return self._pool.call(method, *arrays)
-        return getattr(self._world, method)(*arrays)
+        return PandaView(self.scene, gui=self.render_mode == "human")
 
     def initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, self.state_space.shape[0]))
@@ -174,11 +154,9 @@ class PandaGraspEnv(POMDPEnv):
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         poses = NOMINAL_GRASP + ACTION_SCALE * action
         mugs, camera = state[:, :4], state[:, 4:]
-        if self.render_mode is not None and len(state) == 1:
-            self._film = []
-            outcomes = self._world.grasps(mugs, poses, self._film.append)
-        else:
-            outcomes = self._shared("grasps", mugs, poses)
+        self._film = []
+        watch = self._film.append if self.render_mode is not None and len(state) == 1 else None
+        outcomes = self._shared("grasps", mugs, poses, watch=watch)
         next_state = np.concatenate([np.array([state for state, _ in outcomes]), camera], axis=1)
         heights, success = next_state[:, 2].tolist(), (next_state[:, 2] > LIFTED).tolist()
         self._details = [

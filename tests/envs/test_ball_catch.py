@@ -227,7 +227,7 @@ def test_two_environments_in_one_process_do_not_disturb_each_other():
     _, alone, _ = run_episode(BallCatchEnv(renderer="pybullet"), controls)
     env = BallCatchEnv(renderer="pybullet")
     other = BallCatchEnv(renderer="pybullet", texture="blue_tiles", ball_color=(1, 1, 0))
-    assert env._renderer.client.client_id != other._renderer.client.client_id
+    assert env._world.client.client_id != other._world.client.client_id
     observation, _ = env.reset(seed=0)
     beside = [observation]
     other.reset(seed=9)
@@ -242,14 +242,14 @@ def test_two_environments_in_one_process_do_not_disturb_each_other():
 def test_thousands_of_resets_leak_neither_memory_nor_clients():
     resource = pytest.importorskip("resource")
     env = BallCatchEnv(renderer="pybullet")
-    bodies = env._renderer.client.getNumBodies()
+    bodies = env._world.client.getNumBodies()
     for _ in range(200):
         env.reset()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB
     for _ in range(2000):
         env.reset()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 10_000
-    assert env._renderer.client.getNumBodies() == bodies == 3
+    assert env._world.client.getNumBodies() == bodies == 3
 
 
 def test_rendering_shows_the_scene_beside_the_camera_image_and_does_not_disturb_the_episode():

@@ -203,7 +203,7 @@ def test_processes_give_the_same_episodes_and_end_with_the_environment(env_id, k
             info.get("episode", {}).pop("t", None)  # the time that has passed
         np.testing.assert_equal(*steps)
     assert vars(alone.env).get("_pool") is None
-    assert vars(shared.env)["_pool"] is not None and "_simulation" not in vars(shared.env)
+    assert vars(shared.env)["_pool"] is not None and "_world" not in vars(shared.env)
     for env in (alone, shared):
         env.close()
         env.close()

@@ -71,7 +71,7 @@ def test_the_cost_is_one_up_to_a_height_of_five_centimetres(shared):
 def test_a_mug_up_to_five_centimetres_above_the_table_is_no_success(shared, monkeypatch):
     heights = np.array([0.0, 0.03, 0.05, 0.0501])
     ends = np.c_[np.zeros((4, 2)), heights, np.zeros(4)]
-    monkeypatch.setattr(shared, "_shared", lambda method, mugs, poses: [(end, 0) for end in ends])
+    monkeypatch.setattr(shared, "_shared", lambda *_, **__: [(end, 0) for end in ends])
     shared.dynamics(np.zeros((4, 4)), np.zeros((4, 4)))
     assert [more["success"] for more in shared._details] == [False, False, False, True]
     assert [more["is_success"] for more in shared._details] == [False, False, False, True]

@@ -68,7 +68,7 @@ def test_a_squeeze_also_centres_the_part_and_leaves_it_flat_on_the_table(env):
 
 
 def test_the_jaws_are_longer_than_the_part_and_open_by_77_millimetres(env):
-    simulation = env._simulation
+    simulation = env._world
     simulation._put_part((0.0, 2.0, 0.5), 0.0)  # out of the way
     simulation._put_arm(simulation._low)
     for along in (-0.044, -0.035, 0.0, 0.035, 0.044):
@@ -157,7 +157,7 @@ def test_closing_gives_the_worlds_of_the_physics_and_of_the_pictures_back():
     env = PandaSqueezeEnv(render_mode="rgb_array")
     env.reset(seed=0)
     env.render()
-    worlds = (env._simulation, env._view)
+    worlds = (env._world, env._view)
     env.close()
     for world in worlds:
         with pytest.raises(RuntimeError, match="closed"):
@@ -171,7 +171,7 @@ def test_closing_gives_the_worlds_of_the_physics_and_of_the_pictures_back():
 def test_the_slot_forgives_its_tolerance_and_no_more(tolerance):
     env = PandaSqueezeEnv(tolerance=tolerance)
     angles = tolerance * np.array([-1.3, -1.1, -0.95, -0.5, 0.0, 0.5, 0.95, 1.1, 1.3])
-    inserted = [outcome.success for outcome in env._simulation.inserts(angles)]
+    inserted = [outcome.success for outcome in env._world.inserts(angles)]
     assert inserted == (np.abs(angles) < tolerance).tolist()
     env.close()
 
@@ -214,16 +214,16 @@ def test_episodes_are_the_same_from_a_seed_in_any_environment_and_differ_between
 def test_squeezes_do_not_depend_on_their_order(env):
     rng = np.random.default_rng(0)
     given = rng.uniform(-1.5, 1.5, 40), rng.uniform(-3.0, 3.0, 40), rng.uniform(-0.003, 0.003, (40, 2))
-    expected = [outcome.yaw for outcome in env._simulation.squeezes(*given)]
+    expected = [outcome.yaw for outcome in env._world.squeezes(*given)]
     order = rng.permutation(40)
     for k in order:
-        env._simulation.insert(0.3 * k)
-        (outcome,) = env._simulation.squeezes(*(array[k : k + 1] for array in given))
+        env._world.insert(0.3 * k)
+        (outcome,) = env._world.squeezes(*(array[k : k + 1] for array in given))
         assert outcome.yaw == expected[k]
 
 
 def test_half_a_turn_of_the_hand_changes_nothing_and_the_wrist_stays_within_its_range(env):
-    simulation = env._simulation
+    simulation = env._world
     for yaw in np.linspace(-math.pi, math.pi, 25):
         low, high = simulation._turned(yaw)
         assert abs(low[6]) < 1.6 and abs(high[6]) < 1.6
