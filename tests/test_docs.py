@@ -263,17 +263,6 @@ def test_numbers_of_the_paper_that_the_code_cites_are_in_the_map():
         assert not unknown, f"{path}: {unknown}"
 
 
-@pytest.mark.parametrize("folder", ["sb3_tdpg", "envs", "docs", "tests"])
-def test_no_latex_label_of_the_paper_is_cited(folder):
-    # Readers of the PDF cannot see the labels.
-    paths = [
-        path for ending in ("py", "md") for path in (ROOT / folder).rglob(f"*.{ending}") if "_build" not in path.parts
-    ]
-    label = re.compile(r"\b(eq|alg|thm|tab|fig|ssec):(?=[a-zA-Z])")
-    cited = [path for path in paths if path != Path(__file__) and label.search(path.read_text(encoding="utf-8"))]
-    assert not cited
-
-
 def test_the_table_of_defaults_is_that_of_the_presets():
     spec = importlib.util.spec_from_file_location("make_defaults", ROOT / "docs" / "make_defaults.py")
     make_defaults = importlib.util.module_from_spec(spec)

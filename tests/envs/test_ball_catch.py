@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_tdpg  # noqa: F401  (registers the environments)
 from sb3_tdpg import make_episodes_env
@@ -72,12 +71,6 @@ def test_a_robot_that_drives_straight_to_the_landing_point_pays_for_its_controls
     env = BallCatchEnv(robot_range=(-2.0, -2.0))
     _, _, costs = run_episode(env, [1.5] * 25)
     np.testing.assert_allclose(costs, 0.015, atol=1e-9)
-
-
-def test_an_action_out_of_bounds_counts_as_the_bound():
-    states, _, costs = run_episode(BallCatchEnv(robot_range=(0, 0), max_action=3.0, dt=0.1), [50.0])
-    assert states[1, 0] == pytest.approx(0.3)
-    assert costs[0] == pytest.approx(0.03)
 
 
 def test_an_episode_starts_with_the_robot_anywhere_in_its_range_and_the_ball_at_its_launch():
@@ -203,23 +196,6 @@ def test_noise_of_a_batch_differs_between_its_images_and_follows_the_seed():
 
 
 # -- the interface -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_subprocesses_give_the_same_numbers_as_a_loop():
-    def episode(vec_env_cls):
-        env = vec_env_cls([lambda: gym.make("sb3_tdpg:BallCatch-v0", pixel_noise_std=0.1, horizon=3)] * 2)
-        env.seed(3)
-        images, rewards = [env.reset()], []
-        for _ in range(4):  # into the second episode
-            observation, reward, _, _ = env.step(np.full((2, 1), 0.5, np.float32))
-            images.append(observation)
-            rewards.append(reward)
-        env.close()
-        return np.array(images), np.array(rewards, np.float32)  # SubprocVecEnv has them in double precision
-
-    for in_loop, in_processes in zip(episode(DummyVecEnv), episode(SubprocVecEnv), strict=True):
-        np.testing.assert_array_equal(in_processes, in_loop)
 
 
 def test_two_environments_in_one_process_do_not_disturb_each_other():

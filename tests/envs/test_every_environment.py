@@ -259,6 +259,8 @@ REFUSED = {
         (dict(action_cost=np.nan), "action_cost=nan must be finite"),
         (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
         (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
+        (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
+        (dict(start_beta=(0.0, 1.0)), r"start_beta=\(0.0, 1.0\) must be two positive numbers"),
         (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
     ],
     BallCatchEnv: [
@@ -297,6 +299,7 @@ REFUSED = {
         (dict(friction=-1.0), "friction=-1.0 must be finite and not negative"),
         (dict(solver_iterations=0), "solver_iterations=0 must be None or an integer of at least 1"),
         (dict(solver_iterations=1.5), "solver_iterations=1.5 must be None or an integer"),
+        (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
         (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
         (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
         (dict(depth_noise_std=np.nan), "depth_noise_std=nan must be finite"),

@@ -256,12 +256,3 @@ def test_a_watched_episode_has_the_same_outcome_and_pictures_that_differ(env):
     watched.close()
     with pytest.raises(ValueError, match="must be 'rgb_array' for a video"):
         next(env.film())
-
-
-def test_a_closed_environment_says_so():
-    env = PandaSqueezeEnv()
-    env.close()
-    env.close()
-    env.reset(seed=0)
-    with pytest.raises(RuntimeError, match="has been closed"):
-        env.step(np.zeros(1))
