@@ -9,11 +9,11 @@ import numpy as np
 from . import checks
 from .base import BatchStep
 from .panda_arm import Configuration
+from .panda_view import SqueezeView
 from .pool import SharedEnv
 from .squeeze_bullet import SqueezeSimulation
 from .squeeze_insert import SqueezeInsertEnv
 from .squeeze_scene import SqueezeScene
-from .squeeze_view import SqueezeView
 
 MAX_CENTRING_ERROR = 0.0035  # m: further off, a jaw may come down on the part
 

@@ -40,12 +40,9 @@ class WorkPool:
         self._executor = ProcessPoolExecutor(
             n_processes, context, initializer=_begin, initargs=(os.getpid(), make_worker, *arguments)
         )
-        self._is_closed = False
 
     def call(self, method: str, *arrays: np.ndarray) -> Any:
         """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the arrays or lists."""
-        if self._is_closed:
-            raise RuntimeError("this environment has been closed: make a new one")
         n_parts = min(len(arrays[0]), SHARES * self._n_processes)
         parts = [np.array_split(array, n_parts) for array in arrays]
         with warnings.catch_warnings():
@@ -56,7 +53,6 @@ class WorkPool:
 
     def close(self) -> None:
         """End the processes."""
-        self._is_closed = True
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
@@ -81,11 +77,11 @@ class SharedEnv(POMDPEnv):
 
     @cached_property
     def _pool(self) -> WorkPool:
-        self.check_open()
         return WorkPool(self.n_processes, *self._make_world())
 
     def _shared(self, method: str, *arrays: np.ndarray, **here: Any) -> Any:
         """Call a method with arrays of N episodes, in several processes, or with further keywords in this one."""
+        self.check_open()
         if self.n_processes > 1 and len(arrays[0]) > 1:
             return self._pool.call(method, *arrays)
         return getattr(self._world, method)(*arrays, **here)

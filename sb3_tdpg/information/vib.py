@@ -6,6 +6,7 @@ import math
 
 import torch as th
 
+from sb3_tdpg.envs import checks
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 Prior = tuple[th.Tensor, th.Tensor, th.Tensor]  # means and variances, (T, K, Z), and logarithms of the weights, (T, K)
@@ -48,8 +49,7 @@ class VariationalBottleneck(InformationEstimator):
     ) -> None:
         super().__init__(horizon, state_dim, trv_dim)
         for name, value in (("n_components", n_components), ("em_steps", em_steps)):
-            if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"mi_kwargs: {name}={value} must be an integer of at least 1")
+            checks.count(f"mi_kwargs: {name}", value)
         self.n_components = n_components
         self.em_steps = em_steps
         self.register_buffer("prior_mean", th.zeros(horizon, n_components, trv_dim))

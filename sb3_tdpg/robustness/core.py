@@ -5,12 +5,13 @@ Dimension key: N environments, n of them at a time.
 """
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from sb3_tdpg.buffers import each_part
 from sb3_tdpg.robustness.registry import KEEP, NOTHING, Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
@@ -22,14 +23,6 @@ Observations = Any
 
 Drawn = dict[str, np.ndarray]
 States = np.ndarray | None
-
-
-def each_part(function: Callable[..., Any], *observations: Observations) -> Observations:
-    """Apply a function to arrays, or to the parts of dicts with the same keys."""
-    first, *_ = observations
-    if isinstance(first, dict):
-        return {key: function(*(each[key] for each in observations)) for key in first}
-    return function(*observations)
 
 
 def take(observations: Observations, which: Any) -> Observations:
