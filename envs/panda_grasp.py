@@ -31,18 +31,18 @@ WORKSPACE = np.array([0.5, 0.0])  # m, its middle
 class GraspWorld:
     """Simulation and camera of one process; each is made when it is first used."""
 
-    def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None) -> None:
-        self._simulation_arguments = (scene, motion, solver_iterations)
+    def __init__(self, scene: PandaScene, motion: Motion) -> None:
+        self.scene, self.motion = scene, motion
 
     @cached_property
     def simulation(self) -> GraspSimulation:
         """The robot, the table and the mug."""
-        return GraspSimulation(*self._simulation_arguments)
+        return GraspSimulation(self.scene, self.motion)
 
     @cached_property
     def camera(self) -> DepthCamera:
         """The depth camera."""
-        return DepthCamera(self._simulation_arguments[0])
+        return DepthCamera(self.scene)
 
     def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
         """Carry out one grasp for each mug, ``(N, 4)``, at its pose, ``(N, 4)``; ``watch`` as in ``grasp``."""
@@ -84,7 +84,6 @@ class PandaGraspEnv(SharedEnv):
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
-    :param solver_iterations: Iterations of the contact solver in a time step; ``None``: 50 (fast) or 150 (reference).
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch; the results are the same.
@@ -103,7 +102,6 @@ class PandaGraspEnv(SharedEnv):
         mug_scale: float = 1.0,
         frame_offset: float = 0.012,
         friction: float = 0.5,
-        solver_iterations: int | None = None,
         motion: str = "fast",
         depth_noise_std: float = 0.0,
         n_processes: int = 1,
@@ -121,9 +119,6 @@ class PandaGraspEnv(SharedEnv):
         )
         self.camera_range = _check_camera(camera_range, camera_shift)
         self.camera_shift = float(camera_shift)
-        if solver_iterations is not None:
-            checks.count("solver_iterations", solver_iterations, or_none="None or ")
-        self.solver_iterations = solver_iterations
         self.motion = checks.one_of("motion", motion, MOTIONS)
         self.depth_noise_std = checks.not_negative("depth_noise_std", depth_noise_std, " (it is sigma, in m)")
         self.n_processes = checks.count("n_processes", n_processes)
@@ -136,7 +131,7 @@ class PandaGraspEnv(SharedEnv):
         self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
     def _make_world(self) -> tuple[Any, ...]:
-        return GraspWorld, self.scene, MOTIONS[self.motion], self.solver_iterations
+        return GraspWorld, self.scene, MOTIONS[self.motion]
 
     @cached_property
     def _view(self) -> PandaView:

@@ -123,7 +123,7 @@ class Perturber(Members):
         self.parts: dict[str, Perturber] = {}  # of a Dict that has no timing in common
         if isinstance(sensor.space, spaces.Dict) and perturbation.kind != "any":
             for key, each in sensor.parts.items():
-                if perturbation.applies_to(each.space, each.horizon):
+                if perturbation.objection(each.space, each.horizon) is None:
                     name = f"{part} {key}".strip()
                     self.parts[key] = Perturber(perturbation, severity, each, n, seed=seed, part=name)
         super().__init__(n, perturbation.name, part, seed=seed, children=self.parts.values())
