@@ -218,12 +218,6 @@ def numbers_of_the_paper(text):
     return found
 
 
-def test_numbers_of_the_paper_are_found_in_a_list_as_well_as_alone():
-    text = "Equations 12, 13 and 14 of Theorem II.1, in Table I and Figure 3"
-    expected = {"Equation 12", "Equation 13", "Equation 14", "Theorem II.1", "Table I", "Figure 3"}
-    assert numbers_of_the_paper(text) == expected
-
-
 def test_the_map_of_the_paper_has_a_row_for_every_number_and_no_other_and_each_names_a_test():
     before_the_deviations = PAPER_MAP.read_text(encoding="utf-8").partition("## Where this implementation deviates")[0]
     rows = [line for line in before_the_deviations.splitlines() if line.startswith("| ") and "| tests |" not in line]

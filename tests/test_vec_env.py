@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from sb3_tdpg import BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
 from sb3_tdpg.envs.scenarios import LAVA_TABLE_READING
 from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 
@@ -21,30 +22,31 @@ def lava_vec_env(n=N, **kwargs):
     return BatchedVecEnv(LavaEnv(**kwargs), n)
 
 
-@pytest.mark.parametrize("make", [
-    lambda: LavaEnv(sensor_noise_std=0.0, horizon=3),
-    lambda: LavaEnv(sensor_noise_std=0.0, horizon=3, **LAVA_TABLE_READING),
-    lambda: BallCatchEnv(renderer="pybullet", horizon=3),
-    lambda: BallCatchEnv(horizon=3),
-], ids=["text", "table", "pybullet", "fast"])  # fmt: skip
-def test_every_row_is_what_the_single_environment_gives_for_the_same_state_and_action(make):
+@pytest.mark.parametrize(("make", "n"), [
+    (lambda: LavaEnv(sensor_noise_std=0.0, horizon=3), 20),
+    (lambda: LavaEnv(sensor_noise_std=0.0, horizon=3, **LAVA_TABLE_READING), 20),
+    (lambda: BallCatchEnv(renderer="pybullet", horizon=3), 20),
+    (lambda: BallCatchEnv(horizon=3), 20),
+    (PandaGraspEnv, 4),
+], ids=["text", "table", "pybullet", "fast", "grasp"])  # fmt: skip
+def test_every_row_is_what_the_single_environment_gives_for_the_same_state_and_action(make, n):
     rng = np.random.default_rng(0)
-    vec_env, singles = BatchedVecEnv(make(), 20), [make() for _ in range(20)]
+    vec_env, singles = BatchedVecEnv(make(), n), [make() for _ in range(n)]
     vec_env.seed(1)
     observations = vec_env.reset()
     for single, info, observation in zip(singles, vec_env.reset_infos, observations, strict=True):
         single.reset()
         single._state = info["state"][None].copy()
         np.testing.assert_array_equal(observation, single.sensor(single._state)[0])
-    for t in range(3):
-        actions = rng.uniform(-4, 4, (20, 1)).astype(np.float32)
+    horizon = vec_env.env.horizon
+    for t in range(horizon):
+        actions = rng.uniform(-4, 4, (n, *vec_env.action_space.shape)).astype(np.float32)
         observations, rewards, dones, infos = vec_env.step(actions)
         for i, single in enumerate(singles):
             observation, reward, terminated, truncated, info = single.step(actions[i])
-            np.testing.assert_array_equal(infos[i]["state"], info["state"])
-            assert infos[i]["cost"] == info["cost"]
+            np.testing.assert_equal({name: infos[i][name] for name in info}, info)
             assert rewards[i] == np.float32(reward)
-            assert dones[i] == terminated == (t == 2)
+            assert dones[i] == terminated == (t == horizon - 1)
             assert not truncated
             last = infos[i]["terminal_observation"] if dones[i] else observations[i]
             np.testing.assert_array_equal(last, observation)

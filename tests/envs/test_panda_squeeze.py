@@ -196,21 +196,6 @@ def test_a_part_is_inserted_below_three_millimetres():
 # -- an outcome depends on nothing else ------------------------------------------------------------------------------
 
 
-def test_episodes_are_the_same_from_a_seed_in_any_environment_and_differ_between_seeds(env):
-    other = PandaSqueezeEnv()
-
-    def states(env, seed):
-        env.reset(seed=seed)
-        return np.array([info["state"] for info in episode(env, 30.0, -100.0, 10.0, 0.0)])
-
-    expected = states(env, 5)
-    squeeze(env, parts(13.0), 20.0)
-    np.testing.assert_array_equal(states(env, 5), expected)
-    np.testing.assert_array_equal(states(other, 5), expected)
-    assert (states(env, 6) != expected).any(axis=1).all()
-    other.close()
-
-
 def test_squeezes_do_not_depend_on_their_order(env):
     rng = np.random.default_rng(0)
     given = rng.uniform(-1.5, 1.5, 40), rng.uniform(-3.0, 3.0, 40), rng.uniform(-0.003, 0.003, (40, 2))
@@ -235,18 +220,13 @@ def test_half_a_turn_of_the_hand_changes_nothing_and_the_wrist_stays_within_its_
         assert abs(math.cos(yaw) * along[0] + math.sin(yaw) * along[1]) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_a_watched_episode_has_the_same_outcome_and_pictures_that_differ(env):
+def test_a_film_shows_the_last_squeeze_and_the_insertion(env):
     watched = PandaSqueezeEnv(render_mode="rgb_array")
-    outcomes = []
-    for each in (env, watched):
-        each.reset(seed=2)
-        if each is watched:
-            pictures = [each.render()]
-            with pytest.raises(ValueError, match=r"no squeeze to show before step\(\)"):
-                next(each.film())
-        for info in (episode(each, 0.0)[0], *episode(each, 0.0, 0.0, 0.0)):
-            outcomes.append(info["state"])
-    np.testing.assert_array_equal(outcomes[:4], outcomes[4:])
+    watched.reset(seed=2)
+    pictures = [watched.render()]
+    with pytest.raises(ValueError, match=r"no squeeze to show before step\(\)"):
+        next(watched.film())
+    episode(watched, 0.0, 0.0, 0.0, 0.0)
     assert 20 < len(watched._film) < 60  # of one squeeze and the insertion, not of the episode
     pictures += [watched.render(), *list(watched.film())[::16]]
     assert all(picture.shape == (256, 384, 3) and picture.dtype == np.uint8 for picture in pictures)
