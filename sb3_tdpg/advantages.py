@@ -30,14 +30,9 @@ def episode_mean_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Subtract the batch mean from the cost of the whole episode, as in the paper.
+    Subtract the batch mean from the cost of the whole episode, as in the paper: ``(T, N)``.
 
-    :param costs: ``(T, N)``
-    :param states: ``(T, N, X)``, unused
-    :param alive: ``(T, N)``
-    :param gamma: discount
-    :param gae_lambda: unused: there is no value function
-    :return: ``(T, N)``
+    The arguments are those of :func:`regression_advantages`; states and ``gae_lambda`` are unused.
     """
     episode_cost = cost_to_go(costs, gamma)[0]
     return (episode_cost - episode_cost.mean()).expand_as(costs)
@@ -123,13 +118,9 @@ class ValueFunction(nn.Module):
         Fit the network to an epoch, and estimate its advantages (GAE) with the new values.
 
         The values of the last epoch would be those of another policy. The new ones have seen the costs that they are
-        compared with: a bias that is small where an epoch has many episodes.
+        compared with: a bias that is small where an epoch has many episodes. The arguments are those of
+        :func:`regression_advantages`.
 
-        :param costs: ``(T, N)``
-        :param states: x_t, ``(T, N, X)``
-        :param alive: ``(T, N)``
-        :param gamma: discount
-        :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
         :return: ``(T, N)``
         """
         with th.no_grad():
