@@ -11,9 +11,7 @@ from gymnasium import spaces
 
 from . import checks
 from .ball_scene import IMAGE_SIZE, BallScene
-from .base import POMDPEnv
-from .noise import NOISE_MODES, noisy_pixels
-from .pool import WorkPool
+from .pool import SharedEnv
 from .textures import TRAINING_TEXTURE, load_texture
 
 Range = tuple[float, float]  # lowest and highest
@@ -21,10 +19,26 @@ PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highe
 
 # By name, so that PyBullet is imported only where it draws.
 RENDERERS = {"pybullet": ("ball_bullet", "BulletRenderer"), "fast": ("ball_fast", "FastRenderer")}
+NOISE_MODES = ("minmax", "clip")
 NOISE_CHUNK = 64  # images to which noise is added at once: bounds the memory
 
 
-class BallCatchEnv(POMDPEnv):
+def noisy_pixels(images: np.ndarray, std: float, mode: str, rng: np.random.Generator) -> np.ndarray:
+    """
+    Add Gaussian noise to every pixel of images in [0, 1], ``(N, C, H, W)`` float32, and bring them back to [0, 1].
+
+    ``"minmax"``, as in the paper, subtracts the minimum of each image, then divides by its maximum; ``"clip"`` clips.
+    """
+    noisy: np.ndarray = std * rng.standard_normal(images.shape, dtype=np.float32) + images
+    if mode == "minmax":
+        noisy -= noisy.min(axis=(1, 2, 3), keepdims=True)
+        noisy /= noisy.max(axis=(1, 2, 3), keepdims=True)
+    else:
+        np.clip(noisy, 0, 1, out=noisy)
+    return noisy
+
+
+class BallCatchEnv(SharedEnv):
     r"""
     Drive along a line, in front of a brick wall, to the place where a ball lands.
 
@@ -64,8 +78,6 @@ class BallCatchEnv(POMDPEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
-    shares_work = True
-    resources = frozenset({"_renderer", "_pool", "_view"})
     state_names = ("d (m)", "b_x (m)", "b_y (m)", "v_x (m/s)", "v_y (m/s)")
 
     def __init__(
@@ -125,15 +137,8 @@ class BallCatchEnv(POMDPEnv):
         n_processes = checks.count("n_processes", n_processes)
         self.n_processes = n_processes if renderer == "pybullet" else 1
 
-    @cached_property
-    def _renderer(self) -> Any:
-        self.check_open()
-        return self._renderer_class(self.scene)
-
-    @cached_property
-    def _pool(self) -> WorkPool:
-        self.check_open()
-        return WorkPool(self.n_processes, self._renderer_class, self.scene)
+    def _make_world(self) -> tuple[Any, ...]:
+        return self._renderer_class, self.scene
 
     @cached_property
     def _view(self) -> Any:
@@ -156,12 +161,7 @@ class BallCatchEnv(POMDPEnv):
         return np.stack([next_d, next_x, next_y, speed_x, speed_y - self.dt * self.gravity], axis=1)
 
     def sensor(self, state: np.ndarray) -> np.ndarray:
-        seen = self._seen_from(state)
-        if self.n_processes == 1 or len(state) == 1:
-            images = self._renderer.images(seen)
-        else:
-            images = self._pool.call("images", seen)
-        return self._with_noise(images, self.np_random)
+        return self._with_noise(self._shared("images", self._seen_from(state)), self.np_random)
 
     def _seen_from(self, state: np.ndarray) -> np.ndarray:
         """Return the state that the camera image shows."""
@@ -196,7 +196,7 @@ class BallCatchEnv(POMDPEnv):
         if self.render_mode == "human":
             time.sleep(self.dt)
             return None
-        images = self._renderer.images(self._seen_from(state))
+        images = self._world.images(self._seen_from(state))
         # The noise is a new sample, so that rendering does not change an episode.
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)

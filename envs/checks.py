@@ -30,10 +30,10 @@ def between(name: str, value: float, low: float, high: float, unit: str, *, stri
     return float(value)
 
 
-def count(name: str, value: Any, hint: str = "", *, or_none: str = "") -> int:
+def count(name: str, value: Any, hint: str = "") -> int:
     """Return an integer of at least 1."""
     if not (isinstance(value, (int, np.integer)) and value >= 1):
-        raise ValueError(f"{name}={value!r} must be {or_none}an integer of at least 1{hint}")
+        raise ValueError(f"{name}={value!r} must be an integer of at least 1{hint}")
     return int(value)
 
 

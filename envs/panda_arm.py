@@ -118,7 +118,6 @@ class ArmSimulation(BulletWorld):
         client.resetBaseVelocity(self._body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def _put_arm(self, joints: Joints, fingers: float = FINGER_OPEN) -> None:
-        """Set the joints of the arm and of the fingers."""
         for joint, angle in zip((*ARM_JOINTS, *FINGER_JOINTS), (*joints, fingers, fingers), strict=True):
             self.client.resetJointState(self._robot, joint, angle, 0.0)
 

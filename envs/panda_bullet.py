@@ -48,12 +48,11 @@ class GraspSimulation(ArmSimulation):
     """
     Robot, table and mug in a Bullet world of their own, without visual shapes.
 
-    Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone. A
-    number of ``solver_iterations`` of Bullet's contact solver in a time step replaces that of the motion.
+    Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone.
     """
 
-    def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None = None) -> None:
-        super().__init__(solver_iterations or motion.solver_iterations)
+    def __init__(self, scene: PandaScene, motion: Motion) -> None:
+        super().__init__(motion.solver_iterations)
         self.scene, self.motion, client = scene, motion, self.client
         self._ends_early = motion.is_fast
         self._robot = int(client.loadURDF(ROBOT_FILE, useFixedBase=True, flags=self._unseen))

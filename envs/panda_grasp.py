@@ -9,13 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from . import checks
-from .base import POMDPEnv
 from .panda_arm import FINGER_OPEN, HOME, Configuration, Watch
 from .panda_bullet import LIFTED, MOTIONS, GraspSimulation, Motion, Outcome
 from .panda_camera import IMAGE_SIZE, DepthCamera
 from .panda_scene import PandaScene
 from .panda_view import PandaView
-from .pool import WorkPool
+from .pool import SharedEnv
 
 NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
 ACTION_SCALE = 0.1
@@ -32,18 +31,18 @@ WORKSPACE = np.array([0.5, 0.0])  # m, its middle
 class GraspWorld:
     """Simulation and camera of one process; each is made when it is first used."""
 
-    def __init__(self, scene: PandaScene, motion: Motion, solver_iterations: int | None) -> None:
-        self._simulation_arguments = (scene, motion, solver_iterations)
+    def __init__(self, scene: PandaScene, motion: Motion) -> None:
+        self.scene, self.motion = scene, motion
 
     @cached_property
     def simulation(self) -> GraspSimulation:
         """The robot, the table and the mug."""
-        return GraspSimulation(*self._simulation_arguments)
+        return GraspSimulation(self.scene, self.motion)
 
     @cached_property
     def camera(self) -> DepthCamera:
         """The depth camera."""
-        return DepthCamera(self._simulation_arguments[0])
+        return DepthCamera(self.scene)
 
     def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
         """Carry out one grasp for each mug, ``(N, 4)``, at its pose, ``(N, 4)``; ``watch`` as in ``grasp``."""
@@ -59,7 +58,7 @@ class GraspWorld:
             getattr(self, name).close()
 
 
-class PandaGraspEnv(POMDPEnv):
+class PandaGraspEnv(SharedEnv):
     r"""
     Grasp a mug on a table, and lift it.
 
@@ -85,7 +84,6 @@ class PandaGraspEnv(POMDPEnv):
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
-    :param solver_iterations: Iterations of the contact solver in a time step; ``None``: 50 (fast) or 150 (reference).
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch; the results are the same.
@@ -93,8 +91,6 @@ class PandaGraspEnv(POMDPEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
-    shares_work = True
-    resources = frozenset({"_world", "_pool", "_view"})
 
     def __init__(
         self,
@@ -106,7 +102,6 @@ class PandaGraspEnv(POMDPEnv):
         mug_scale: float = 1.0,
         frame_offset: float = 0.012,
         friction: float = 0.5,
-        solver_iterations: int | None = None,
         motion: str = "fast",
         depth_noise_std: float = 0.0,
         n_processes: int = 1,
@@ -124,9 +119,6 @@ class PandaGraspEnv(POMDPEnv):
         )
         self.camera_range = _check_camera(camera_range, camera_shift)
         self.camera_shift = float(camera_shift)
-        if solver_iterations is not None:
-            checks.count("solver_iterations", solver_iterations, or_none="None or ")
-        self.solver_iterations = solver_iterations
         self.motion = checks.one_of("motion", motion, MOTIONS)
         self.depth_noise_std = checks.not_negative("depth_noise_std", depth_noise_std, " (it is sigma, in m)")
         self.n_processes = checks.count("n_processes", n_processes)
@@ -138,30 +130,13 @@ class PandaGraspEnv(POMDPEnv):
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
         self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
 
-    # The Bullet worlds are made at their first use, and so in the process that uses them.
-
-    @cached_property
-    def _world(self) -> GraspWorld:
-        return GraspWorld(*self._world_arguments())
-
-    @cached_property
-    def _pool(self) -> WorkPool:
-        return WorkPool(self.n_processes, GraspWorld, *self._world_arguments())
+    def _make_world(self) -> tuple[Any, ...]:
+        return GraspWorld, self.scene, MOTIONS[self.motion]
 
     @cached_property
     def _view(self) -> PandaView:
-        scene, _, _ = self._world_arguments()
-        return PandaView(scene, gui=self.render_mode == "human")
-
-    def _world_arguments(self) -> tuple[PandaScene, Motion, int | None]:
         self.check_open()
-        return self.scene, MOTIONS[self.motion], self.solver_iterations
-
-    def _shared(self, method: str, *arrays: np.ndarray) -> Any:
-        """Call a method of the world with arrays of n mugs, in several processes or in this one."""
-        if self.n_processes > 1 and len(arrays[0]) > 1:
-            return self._pool.call(method, *arrays)
-        return getattr(self._world, method)(*arrays)
+        return PandaView(self.scene, gui=self.render_mode == "human")
 
     def initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, self.state_space.shape[0]))
@@ -174,11 +149,9 @@ class PandaGraspEnv(POMDPEnv):
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         poses = NOMINAL_GRASP + ACTION_SCALE * action
         mugs, camera = state[:, :4], state[:, 4:]
-        if self.render_mode is not None and len(state) == 1:
-            self._film = []
-            outcomes = self._world.grasps(mugs, poses, self._film.append)
-        else:
-            outcomes = self._shared("grasps", mugs, poses)
+        self._film = []
+        watch = self._film.append if self.render_mode is not None and len(state) == 1 else None
+        outcomes = self._shared("grasps", mugs, poses, watch=watch)
         next_state = np.concatenate([np.array([state for state, _ in outcomes]), camera], axis=1)
         heights, success = next_state[:, 2].tolist(), (next_state[:, 2] > LIFTED).tolist()
         self._details = [

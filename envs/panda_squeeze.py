@@ -9,16 +9,16 @@ import numpy as np
 from . import checks
 from .base import BatchStep
 from .panda_arm import Configuration
-from .pool import WorkPool
+from .panda_view import SqueezeView
+from .pool import SharedEnv
 from .squeeze_bullet import SqueezeSimulation
 from .squeeze_insert import SqueezeInsertEnv
 from .squeeze_scene import SqueezeScene
-from .squeeze_view import SqueezeView
 
 MAX_CENTRING_ERROR = 0.0035  # m: further off, a jaw may come down on the part
 
 
-class PandaSqueezeEnv(SqueezeInsertEnv):
+class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
     r"""
     Squeeze a part with the arm until its orientation is known, then press it into a slot that is hardly wider.
 
@@ -51,8 +51,6 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
-    shares_work = True
-    resources = frozenset({"_simulation", "_pool", "_view"})
 
     def __init__(
         self,
@@ -80,30 +78,17 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
         self.n_processes = checks.count("n_processes", n_processes)
         self._film: list[Configuration] = []  # of the last step, if there is a render_mode
 
-    # The Bullet worlds are made at their first use, and so in the process that uses them.
-
-    @cached_property
-    def _simulation(self) -> SqueezeSimulation:
-        return SqueezeSimulation(self._open_scene())
-
-    @cached_property
-    def _pool(self) -> WorkPool:
-        return WorkPool(self.n_processes, SqueezeSimulation, self._open_scene())
+    def _make_world(self) -> tuple[Any, ...]:
+        return SqueezeSimulation, self.scene
 
     @cached_property
     def _view(self) -> SqueezeView:
-        return SqueezeView(self._open_scene())
-
-    def _open_scene(self) -> SqueezeScene:
         self.check_open()
-        return self.scene
+        return SqueezeView(self.scene)
 
-    def _shared(self, method: str, *arrays: np.ndarray) -> Any:
-        """Call a method of the simulation with arrays of N parts, in several processes or in this one."""
-        if self.n_processes > 1 and len(arrays[0]) > 1:
-            return self._pool.call(method, *arrays)
+    def _shared(self, method: str, *arrays: np.ndarray, **here: Any) -> Any:
         watch = self._film.append if self.render_mode is not None and len(arrays[0]) == 1 else None
-        return getattr(self._simulation, method)(*arrays, watch=watch)
+        return super()._shared(method, *arrays, watch=watch)
 
     def initial_state(self, n: int) -> np.ndarray:
         self._film = []
@@ -132,7 +117,7 @@ class PandaSqueezeEnv(SqueezeInsertEnv):
         state = self._current_state()
         if self._film:
             return self._view.picture(self._film[-1])
-        return self._view.picture(self._simulation.at_rest(float(self.yaw(state)[0])))
+        return self._view.picture(self._world.at_rest(float(self.yaw(state)[0])))
 
     def film(self) -> Iterator[np.ndarray]:
         """

@@ -1,4 +1,4 @@
-"""The grasping scene from the side, for pictures, videos and PyBullet's window; never an observation."""
+"""The scenes of the arm from the side, for pictures, videos and PyBullet's window; never an observation."""
 
 import os
 from collections.abc import Callable
@@ -8,6 +8,7 @@ import numpy as np
 from .bullet import UNTURNED, BulletClient, BulletWorld, beside
 from .panda_arm import ARM_JOINTS, FINGER_JOINTS, Configuration
 from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
+from .squeeze_scene import SqueezeScene, add_part, add_slot, load_robot
 
 HEIGHT, WIDTH = 256, 384  # pixels of the view
 FOV = 46.0  # degrees
@@ -79,6 +80,25 @@ class PandaView(ArmView):
     def picture(self, depth: np.ndarray) -> np.ndarray:
         """Draw the scene beside a depth image, ``(1, 128, 128)`` in m: ``(256, 644, 3)`` uint8."""
         return beside(self.scene_picture(HEIGHT, WIDTH), depth_picture(depth))
+
+
+class SqueezeView(ArmView):
+    """Robot, table, part and slot."""
+
+    middle = (0.5, 0.085, 0.06)
+    viewpoint = (0.46, 150.0, -30.0)
+    near = 0.05
+
+    def __init__(self, scene: SqueezeScene) -> None:
+        super().__init__(load_robot)
+        add_slot(self.client, scene)
+        self._part = add_part(self.client)
+
+    def picture(self, configuration: Configuration) -> np.ndarray:
+        """Draw the scene, ``(256, 384, 3)`` uint8."""
+        self.place(configuration)
+        self.client.resetBasePositionAndOrientation(self._part, configuration.position, configuration.orientation)
+        return self.scene_picture(HEIGHT, WIDTH)
 
 
 def depth_picture(depth: np.ndarray) -> np.ndarray:

@@ -6,12 +6,16 @@ import signal
 import threading
 import time
 import warnings
+from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import cached_property
 from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
+
+from .base import POMDPEnv
 
 SHARES = 8  # parts of a batch for each process, so that all end at about the same time
 
@@ -36,12 +40,9 @@ class WorkPool:
         self._executor = ProcessPoolExecutor(
             n_processes, context, initializer=_begin, initargs=(os.getpid(), make_worker, *arguments)
         )
-        self._is_closed = False
 
     def call(self, method: str, *arrays: np.ndarray) -> Any:
         """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the arrays or lists."""
-        if self._is_closed:
-            raise RuntimeError("this environment has been closed: make a new one")
         n_parts = min(len(arrays[0]), SHARES * self._n_processes)
         parts = [np.array_split(array, n_parts) for array in arrays]
         with warnings.catch_warnings():
@@ -52,8 +53,38 @@ class WorkPool:
 
     def close(self) -> None:
         """End the processes."""
-        self._is_closed = True
         self._executor.shutdown(wait=False, cancel_futures=True)
+
+
+class SharedEnv(POMDPEnv):
+    """An environment whose work on a batch is that of a Bullet world, and may be shared by several processes."""
+
+    shares_work = True
+    resources = frozenset({"_world", "_pool", "_view"})
+    n_processes: int
+
+    # Worlds are made at their first use, and so in the process that uses them.
+
+    @abstractmethod
+    def _make_world(self) -> tuple[Any, ...]:
+        """Return a class that draws or simulates, and the arguments of its constructor."""
+
+    @cached_property
+    def _world(self) -> Any:
+        self.check_open()
+        make, *arguments = self._make_world()
+        return make(*arguments)
+
+    @cached_property
+    def _pool(self) -> WorkPool:
+        return WorkPool(self.n_processes, *self._make_world())
+
+    def _shared(self, method: str, *arrays: np.ndarray, **here: Any) -> Any:
+        """Call a method with arrays of N episodes, in several processes, or with further keywords in this one."""
+        self.check_open()
+        if self.n_processes > 1 and len(arrays[0]) > 1:
+            return self._pool.call(method, *arrays)
+        return getattr(self._world, method)(*arrays, **here)
 
 
 _worker: Any  # of a process of a pool

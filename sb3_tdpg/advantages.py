@@ -7,7 +7,7 @@ Dimension key: T horizon, N episodes, X state, F features.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
@@ -20,6 +20,7 @@ from sb3_tdpg.losses import cost_to_go
 N_CENTRES = 20
 # For a regression that all time steps share: it has more samples, and they are further apart.
 N_SHARED_CENTRES = 100
+N_PASSES, BATCH_SIZE = 10, 64  # of a value network, over the steps of an epoch
 
 AdvantageFunction = Callable[..., th.Tensor]
 """``(costs, states, alive, gamma, gae_lambda) -> advantages``, see the functions below."""
@@ -29,14 +30,9 @@ def episode_mean_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Subtract the batch mean from the cost of the whole episode, as in the paper.
+    Subtract the batch mean from the cost of the whole episode, as in the paper: ``(T, N)``.
 
-    :param costs: ``(T, N)``
-    :param states: ``(T, N, X)``, unused
-    :param alive: ``(T, N)``
-    :param gamma: discount
-    :param gae_lambda: unused: there is no value function
-    :return: ``(T, N)``
+    The arguments are those of :func:`regression_advantages`; states and ``gae_lambda`` are unused.
     """
     episode_cost = cost_to_go(costs, gamma)[0]
     return (episode_cost - episode_cost.mean()).expand_as(costs)
@@ -95,35 +91,20 @@ class ValueFunction(nn.Module):
 
     :param state_dim: X
     :param horizon: T
-    :param hidden_sizes: Hidden layers.
-    :param learning_rate: Step size of Adam.
-    :param n_epochs: Passes over the steps of an epoch.
-    :param batch_size: Steps of a minibatch.
     :param with_changes: Whether the network also sees the changes of the state since the last step, as far as they add
         information (:class:`~sb3_tdpg.common.running_norms.Changes`): for observations that stand in for the state.
     """
 
-    def __init__(
-        self,
-        state_dim: int,
-        horizon: int,
-        hidden_sizes: Sequence[int] = (64, 64),
-        learning_rate: float = 1e-3,
-        n_epochs: int = 10,
-        batch_size: int = 64,
-        with_changes: bool = False,
-    ) -> None:
+    def __init__(self, state_dim: int, horizon: int, with_changes: bool = False) -> None:
         super().__init__()
         self.horizon = horizon
-        self.n_epochs = n_epochs
-        self.batch_size = batch_size
         self.norm = RunningNorm(state_dim)
         self.changes = Changes(state_dim) if with_changes else None
         n_inputs = state_dim * (1 + with_changes) + 1
-        self.network = nn.Sequential(*create_mlp(n_inputs, 1, list(hidden_sizes), nn.Tanh))
+        self.network = nn.Sequential(*create_mlp(n_inputs, 1, [64, 64], nn.Tanh))
         self.register_buffer("offset", th.zeros(()))
         self.register_buffer("scale", th.ones(()))
-        self.optimizer = th.optim.Adam(self.network.parameters(), lr=learning_rate, fused=True)
+        self.optimizer = th.optim.Adam(self.network.parameters(), lr=1e-3, fused=True)
 
     offset: th.Tensor
     scale: th.Tensor
@@ -137,13 +118,9 @@ class ValueFunction(nn.Module):
         Fit the network to an epoch, and estimate its advantages (GAE) with the new values.
 
         The values of the last epoch would be those of another policy. The new ones have seen the costs that they are
-        compared with: a bias that is small where an epoch has many episodes.
+        compared with: a bias that is small where an epoch has many episodes. The arguments are those of
+        :func:`regression_advantages`.
 
-        :param costs: ``(T, N)``
-        :param states: x_t, ``(T, N, X)``
-        :param alive: ``(T, N)``
-        :param gamma: discount
-        :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
         :return: ``(T, N)``
         """
         with th.no_grad():
@@ -191,8 +168,8 @@ class ValueFunction(nn.Module):
                 self.changes.update(self.norm(states), alive)
             self._rescale(y)
             x, z = self._inputs(states, gamma)[living], (y - self.offset) / self.scale
-        for _ in range(self.n_epochs):
-            for part in th.randperm(len(x), device=x.device).split(self.batch_size):
+        for _ in range(N_PASSES):
+            for part in th.randperm(len(x), device=x.device).split(BATCH_SIZE):
                 loss = (self.network(x[part])[:, 0] - z[part]).square().mean()
                 self.optimizer.zero_grad()
                 loss.backward()

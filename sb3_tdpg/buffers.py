@@ -24,9 +24,10 @@ STORED = ("observations", "states", "noise", "trvs", "means", "stds", "actions",
 Observations = th.Tensor | dict[str, th.Tensor]
 
 
-def each(x: Any, function: Callable[[Any], Any]) -> Any:
-    """Apply a function to an array, or to every array of a dict."""
-    return {key: function(value) for key, value in x.items()} if isinstance(x, dict) else function(x)
+def each_part(function: Callable[..., Any], *arrays: Any) -> Any:
+    """Apply a function to arrays, or to the parts of dicts with the same keys."""
+    first, *_ = arrays
+    return {key: function(*(x[key] for x in arrays)) for key in first} if isinstance(first, dict) else function(*arrays)
 
 
 class EpisodeBatch(NamedTuple):
@@ -50,7 +51,7 @@ class EpisodeBatch(NamedTuple):
 
     def select(self, columns: th.Tensor | slice) -> EpisodeBatch:
         """Select episodes or segments by their columns."""
-        return EpisodeBatch(*(each(x, lambda v: v[:, columns]) for x in self))
+        return EpisodeBatch(*(each_part(lambda v: v[:, columns], x) for x in self))
 
     def partition(self, n_parts: int) -> Sequence[th.Tensor | slice]:
         """Divide the columns at random into nearly equal parts; a single part is all of them, in their order."""
@@ -71,7 +72,7 @@ class EpisodeBatch(NamedTuple):
             padded = th.cat([x, x.new_zeros(padding, *x.shape[1:])]) if padding > 0 else x
             return padded.unflatten(0, (n_parts, n_steps)).transpose(0, 1).flatten(1, 2)
 
-        parts = EpisodeBatch(*(each(x, cut) for x in self))
+        parts = EpisodeBatch(*(each_part(cut, x) for x in self))
         return parts.select(parts.alive[0].nonzero()[:, 0])
 
     def information_batch(self, pooled: bool = False) -> InformationBatch:
@@ -143,7 +144,7 @@ class EpisodeBuffer(RolloutBuffer):
             return np.zeros((self.buffer_size, self.n_envs, *dim), np.float32)
 
         space = self.observation_space
-        self.observations = each(space.spaces if isinstance(space, spaces.Dict) else space, zeros)
+        self.observations = each_part(zeros, space.spaces if isinstance(space, spaces.Dict) else space)
         self.states = vectors(self.state_dim)
         self.noise, self.trvs, self.means, self.stds = (vectors(self.trv_dim) for _ in range(4))
         self.stds += 1.0
@@ -172,7 +173,7 @@ class EpisodeBuffer(RolloutBuffer):
     def _double(self) -> None:
         """Make room for as many episodes again."""
         for name in STORED:
-            setattr(self, name, each(getattr(self, name), lambda x: np.concatenate([x, np.zeros_like(x)], axis=1)))
+            setattr(self, name, each_part(lambda x: np.concatenate([x, np.zeros_like(x)], axis=1), getattr(self, name)))
         self.stds[:, self.stds.shape[1] // 2 :] = 1.0
 
     def clear_episodes(self, episodes: np.ndarray) -> None:
@@ -197,7 +198,7 @@ class EpisodeBuffer(RolloutBuffer):
         def tensor(x: np.ndarray) -> th.Tensor:
             return self.to_torch(x[:length, :n_episodes], copy=False)
 
-        stored = {name: each(getattr(self, name), tensor) for name in STORED}
+        stored = {name: each_part(tensor, getattr(self, name)) for name in STORED}
         trvs = stored["trvs"]
         prev_trvs = th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
         return EpisodeBatch(**stored, advantages=th.zeros_like(stored["costs"]), prev_trvs=prev_trvs)

@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_tdpg.advantages import get_baseline
 from sb3_tdpg.auto_weight import share_of
+from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.information import get_estimator_class
 
 ENCODER_GRADIENTS = ("score", "pathwise")
@@ -216,12 +217,6 @@ def check_beta_argument(beta: Any, cost_limit: Any) -> None:
             f"cost_limit={cost_limit!r} must be a finite number other than 0 (the weight is adapted in fractions of "
             "it), or a share of the improvement to keep between 0 and 100 %, as text: '95%'"
         )
-
-
-def check_count(name: str, value: Any) -> None:
-    """Raise a ``ValueError`` unless the value is an integer of at least 1."""
-    if not (isinstance(value, (int, np.integer)) and value >= 1):
-        raise ValueError(f"{name}={value!r} must be an integer of at least 1")
 
 
 def check_beta(beta: float) -> float:

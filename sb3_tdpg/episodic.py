@@ -27,7 +27,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.advantages import ValueFunction
-from sb3_tdpg.buffers import EpisodeBuffer, each
+from sb3_tdpg.buffers import EpisodeBuffer, each_part
 from sb3_tdpg.checks import nearest_multiples, refuse_others
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
@@ -235,7 +235,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             }
             columns = episodes.column[running]
             rollout_buffer.add_step(
-                t[running], columns, **{k: each(v, lambda x: x[running]) for k, v in stored.items()}
+                t[running], columns, **{k: each_part(lambda x: x[running], v) for k, v in stored.items()}
             )
             states = self._problem.next_states(env, new_obs, dones, infos)
             trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)

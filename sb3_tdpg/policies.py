@@ -24,10 +24,9 @@ from torch import nn
 from torch.distributions import Normal
 from torch.nn import functional as F
 
-from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each
+from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each_part
 from sb3_tdpg.checks import (
     check_action_mean,
-    check_count,
     check_floors,
     check_memory,
     check_net_arch,
@@ -36,6 +35,7 @@ from sb3_tdpg.checks import (
 )
 from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, BatchedLinear, TimeMLP, bounded_variance
 from sb3_tdpg.common.running_norms import Changes
+from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_extractor, fill_in_trvs
 
@@ -204,7 +204,6 @@ class TRVPolicy(BasePolicy):
         return cast(BatchedLinear, self.action_head.mlp.layers[0]).bias.device
 
     def _n_action_parameters(self) -> int:
-        """Return the number of outputs of the action head."""
         distribution: Any = self.action_dist
         if isinstance(distribution, DiagGaussianDistribution):
             # The mean, and the log-variance where it depends on the TRVs.
@@ -329,7 +328,7 @@ class TRVPolicy(BasePolicy):
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Extract the features of every observation: ``(T, N, F)``."""
-        flat = each(batch.observations, partial(flat_steps, self.features_extractor))
+        flat = each_part(partial(flat_steps, self.features_extractor), batch.observations)
         return self._features(flat).unflatten(0, batch.alive.shape)
 
     def episode_action_density(self, trvs: th.Tensor) -> Distribution:

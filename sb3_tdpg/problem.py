@@ -119,7 +119,6 @@ def horizon_of(env: VecEnv | gym.Env) -> Any:
 
 
 def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
-    """Read the names of the components of the state, which are optional."""
     names = attribute_of(env, "state_names")
     if names is None:
         return tuple(f"x{k}" for k in range(state_dim))

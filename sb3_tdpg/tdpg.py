@@ -30,7 +30,6 @@ from sb3_tdpg.checks import (
     check_arguments,
     check_batch_size,
     check_beta,
-    check_count,
     check_n_envs,
     check_segments,
     refuse_others,
@@ -39,6 +38,7 @@ from sb3_tdpg.checks import (
     with_keywords,
 )
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.episodic import EpisodicAlgorithm, check_policy
 from sb3_tdpg.features import pooled_steps
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
@@ -395,7 +395,6 @@ class TDPG(EpisodicAlgorithm):
         return advantages
 
     def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
-        """Return the columns of each minibatch."""
         n_columns = batch.costs.shape[1]
         size = n_columns if self.policy.time_varying else batch.alive.sum().item()
         n_parts = 1 if self.batch_size is None else math.ceil(size / self.batch_size)

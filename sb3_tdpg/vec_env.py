@@ -22,9 +22,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_tdpg.checks import check_count
 from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
+from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.presets import DEFAULTS, preset_of
 from sb3_tdpg.problem import horizon_of
 
@@ -144,7 +144,6 @@ def _spec(env_id: str) -> EnvSpec:
 
 
 def _creator(spec: EnvSpec) -> Any:
-    """Return the class or function that makes the environment."""
     return spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
 
 

@@ -73,11 +73,6 @@ def test_the_previous_trvs_are_those_of_the_step_before_and_zero_at_the_start(bu
     assert fill(buffer, lambda t: t + 1.0).prev_trvs[:, 0, 0].tolist() == [0, 1, 2]
 
 
-def test_the_cost_of_an_episode_is_the_sum_of_its_steps(buffer):
-    fill(buffer, lambda t: 10.0**t)
-    np.testing.assert_array_equal(buffer.episode_costs, [111.0] * N)
-
-
 def test_the_information_batch_has_a_mask_only_if_an_episode_ended_early(buffer):
     for t in range(T):
         buffer.add_step(np.full(N - 1, t), np.arange(N - 1), **rows(N - 1, 1.0))

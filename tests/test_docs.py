@@ -218,12 +218,6 @@ def numbers_of_the_paper(text):
     return found
 
 
-def test_numbers_of_the_paper_are_found_in_a_list_as_well_as_alone():
-    text = "Equations 12, 13 and 14 of Theorem II.1, in Table I and Figure 3"
-    expected = {"Equation 12", "Equation 13", "Equation 14", "Theorem II.1", "Table I", "Figure 3"}
-    assert numbers_of_the_paper(text) == expected
-
-
 def test_the_map_of_the_paper_has_a_row_for_every_number_and_no_other_and_each_names_a_test():
     before_the_deviations = PAPER_MAP.read_text(encoding="utf-8").partition("## Where this implementation deviates")[0]
     rows = [line for line in before_the_deviations.splitlines() if line.startswith("| ") and "| tests |" not in line]
@@ -261,17 +255,6 @@ def test_numbers_of_the_paper_that_the_code_cites_are_in_the_map():
     for path, text in zip(sources, texts, strict=True):
         unknown = numbers_of_the_paper(text.replace("equation", "Equation")) - PAPER_NUMBERS
         assert not unknown, f"{path}: {unknown}"
-
-
-@pytest.mark.parametrize("folder", ["sb3_tdpg", "envs", "docs", "tests"])
-def test_no_latex_label_of_the_paper_is_cited(folder):
-    # Readers of the PDF cannot see the labels.
-    paths = [
-        path for ending in ("py", "md") for path in (ROOT / folder).rglob(f"*.{ending}") if "_build" not in path.parts
-    ]
-    label = re.compile(r"\b(eq|alg|thm|tab|fig|ssec):(?=[a-zA-Z])")
-    cited = [path for path in paths if path != Path(__file__) and label.search(path.read_text(encoding="utf-8"))]
-    assert not cited
 
 
 def test_the_table_of_defaults_is_that_of_the_presets():

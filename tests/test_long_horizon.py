@@ -62,12 +62,6 @@ def test_an_epoch_of_steps_has_whole_episodes_and_stops_as_soon_as_there_are_eno
     assert not batch.prev_trvs[0].any()
 
 
-def test_the_length_of_an_epoch_does_not_depend_on_that_of_the_episodes():
-    env = DummyVecEnv([lambda: CountdownEnv(0, [4, 2, 1])] * 2)
-    model = TDPG("TRVPolicy", env, epoch_steps=100, seed=0).learn(100)
-    assert 100 <= model.rollout_buffer.alive.sum() < 100 + 2 * model.horizon
-
-
 @pytest.mark.parametrize("n_envs", [3, 8])
 def test_any_number_of_environments_fits_the_defaults(n_envs):
     assert TDPG("TRVPolicy", make_vec_env("CartPole-v1", n_envs)).n_episodes is None
@@ -145,7 +139,7 @@ def test_the_value_network_learns_the_cost_to_come_on_any_scale(scale):
 
 
 def test_a_new_scale_of_the_targets_does_not_move_the_values():
-    value = ValueFunction(2, 10, n_epochs=0)
+    value = ValueFunction(2, 10)
     states = th.randn(10, 30, 2)
     before = value(states, 0.9)
     value._rescale(1000 + 100 * th.randn(300))

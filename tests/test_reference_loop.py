@@ -200,6 +200,7 @@ def test_batched_critics_equal_the_loop_after_the_fit() -> None:
     before = unbatch(make_model(Case()).estimator.critic)
     assert_same_networks(recorded.critics, recorded.loop.critics, before=before)
     np.testing.assert_allclose(recorded.information, recorded.loop_information, rtol=0, atol=TOLERANCE)
+    assert recorded.information.max() > 0.05, "the penalty is clamped to nothing: the comparisons say nothing of it"
 
 
 @pytest.mark.parametrize("case", [
@@ -223,11 +224,6 @@ def test_batched_update_of_the_policy_equals_the_loop(case: Case) -> None:
         for ours, theirs in zip(gradients_of(network.mlp), zip(*per_step, strict=True), strict=True):
             expected = th.stack(theirs)
             th.testing.assert_close(ours, expected, rtol=0, atol=TOLERANCE * expected.abs().max().item())
-
-
-def test_the_case_with_a_penalty_has_one() -> None:
-    information = run_both(Case()).information
-    assert information is not None and information.max() > 0.05, "clamped to nothing, the comparison says nothing"
 
 
 def test_every_topic_of_the_benchmark_is_run():

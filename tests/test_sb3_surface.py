@@ -20,7 +20,7 @@ from small_problems import (
     toy_vec_env,
     train_epochs,
 )
-from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import HParam, configure
 from stable_baselines3.common.utils import LinearSchedule
@@ -141,13 +141,6 @@ def test_evaluation_in_mid_rollout_does_not_disturb_the_training(tmp_path):
     plain, evaluated = (train_epochs(tiny_tdpg(), 3, callback=callback) for callback in (None, evaluation))
     assert_same_parameters(parameters(plain.policy), parameters(evaluated.policy))
     TDPG.load(tmp_path / "best_model", device="cpu")
-
-
-def test_checkpoints_can_be_loaded(tmp_path):
-    train_epochs(tiny_tdpg(), 2, callback=CheckpointCallback(5, str(tmp_path), verbose=0))
-    files = sorted(tmp_path.glob("*.zip"))
-    assert len(files) == 2
-    TDPG.load(files[0], device="cpu")
 
 
 def test_a_callback_can_stop_the_training_in_mid_rollout_and_the_model_learns_on():

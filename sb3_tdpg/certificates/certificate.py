@@ -60,7 +60,6 @@ class Certificate(NamedTuple):
     beta: float  #: the best or the given one; inf: the bound is the largest cost, 0: it is the mean
     risk: float  #: entropic risk at beta, with the allowance for the sampling error
     kl: float  #: divergence of the shift in nats
-    confidence: float | None  #: None: without allowance for the sampling error
 
 
 def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:
@@ -145,19 +144,19 @@ def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = N
     """
     if not kl >= 0:
         raise ValueError(f"kl={kl} must be at least 0")
-    values, weights, confidence = distribution
+    values, weights, _ = distribution
     if beta is not None:
         if not (np.isfinite(beta) and beta > 0):
             raise ValueError(f"beta={beta} must be finite and positive, or None to search for the best one")
         risk = _risk(values, weights, beta)
-        return Certificate(risk + kl / beta, beta, risk, kl, confidence)
+        return Certificate(risk + kl / beta, beta, risk, kl)
     largest, width = float(values[-1]), float(values[-1]) - float(values[0])
     if kl == 0 or width == 0:
         mean = float(weights @ values)
-        return Certificate(mean, 0.0, mean, kl, confidence)
+        return Certificate(mean, 0.0, mean, kl)
     # The divergence of the distribution with all its weight on the largest value.
     if kl >= -math.log(max(float(weights[values == largest].sum()), 1e-300)):
-        return Certificate(largest, math.inf, largest, kl, confidence)
+        return Certificate(largest, math.inf, largest, kl)
 
     def objective(log_s: float) -> float:
         s = width * math.exp(log_s)
@@ -166,7 +165,7 @@ def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = N
     best = minimize_scalar(objective, bounds=(-15.0, 15.0), method="bounded", options=dict(xatol=1e-3))
     found = 1 / (width * math.exp(float(best.x)))
     bound = min(float(best.fun), largest)
-    return Certificate(bound, found, bound - kl / found, kl, confidence)
+    return Certificate(bound, found, bound - kl / found, kl)
 
 
 def certificate(

@@ -23,8 +23,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_tdpg.checks import check_count
 from sb3_tdpg.common.threads import set_threads, usable_cores
+from sb3_tdpg.envs.checks import count as check_count
 
 CLOSE_TIMEOUT = 10.0  # s, after which an actor is killed although its environments are not closed
 

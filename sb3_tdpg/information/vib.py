@@ -6,7 +6,10 @@ import math
 
 import torch as th
 
+from sb3_tdpg.envs import checks
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
+
+EM_STEPS = 30  # of expectation-maximisation, in each fit of several components
 
 Prior = tuple[th.Tensor, th.Tensor, th.Tensor]  # means and variances, (T, K, Z), and logarithms of the weights, (T, K)
 
@@ -37,21 +40,14 @@ class VariationalBottleneck(InformationEstimator):
     d / N for d TRVs and each component.
 
     :param n_components: Number of Gaussians K in the prior of a time step.
-    :param em_steps: Steps of expectation-maximisation in each fit; unused with one component.
-    :raises ValueError: if a number is below 1.
+    :raises ValueError: if it is not an integer of at least 1.
     """
 
     bound = "upper"
 
-    def __init__(
-        self, horizon: int, state_dim: int, trv_dim: int, *, n_components: int = 1, em_steps: int = 30
-    ) -> None:
+    def __init__(self, horizon: int, state_dim: int, trv_dim: int, *, n_components: int = 1) -> None:
         super().__init__(horizon, state_dim, trv_dim)
-        for name, value in (("n_components", n_components), ("em_steps", em_steps)):
-            if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"mi_kwargs: {name}={value} must be an integer of at least 1")
-        self.n_components = n_components
-        self.em_steps = em_steps
+        self.n_components = checks.count("mi_kwargs: n_components", n_components)
         self.register_buffer("prior_mean", th.zeros(horizon, n_components, trv_dim))
         self.register_buffer("prior_var", th.ones(horizon, n_components, trv_dim))
         self.register_buffer("prior_log_weight", th.full((horizon, n_components), -math.log(n_components)))
@@ -76,7 +72,7 @@ class VariationalBottleneck(InformationEstimator):
         prior = one = _moments(means, variances, weight[:, :, None])  # one Gaussian: (T, 1, Z)
         if self.n_components > 1:
             prior = _moments(means, variances, self._slices(means, alive) * weight[:, :, None], pseudo=one)
-            for _ in range(self.em_steps):
+            for _ in range(EM_STEPS):
                 responsibility = th.softmax(_log_joint(means, variances, prior), dim=2)
                 prior = _moments(means, variances, responsibility * weight[:, :, None], pseudo=one)
         self.prior_mean[enough], self.prior_var[enough], self.prior_log_weight[enough] = prior

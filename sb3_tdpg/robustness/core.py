@@ -5,12 +5,13 @@ Dimension key: N environments, n of them at a time.
 """
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from sb3_tdpg.buffers import each_part
 from sb3_tdpg.robustness.registry import KEEP, NOTHING, Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
@@ -22,14 +23,6 @@ Observations = Any
 
 Drawn = dict[str, np.ndarray]
 States = np.ndarray | None
-
-
-def each_part(function: Callable[..., Any], *observations: Observations) -> Observations:
-    """Apply a function to arrays, or to the parts of dicts with the same keys."""
-    first, *_ = observations
-    if isinstance(first, dict):
-        return {key: function(*(each[key] for each in observations)) for key in first}
-    return function(*observations)
 
 
 def take(observations: Observations, which: Any) -> Observations:
@@ -130,7 +123,7 @@ class Perturber(Members):
         self.parts: dict[str, Perturber] = {}  # of a Dict that has no timing in common
         if isinstance(sensor.space, spaces.Dict) and perturbation.kind != "any":
             for key, each in sensor.parts.items():
-                if perturbation.applies_to(each.space, each.horizon):
+                if perturbation.objection(each.space, each.horizon) is None:
                     name = f"{part} {key}".strip()
                     self.parts[key] = Perturber(perturbation, severity, each, n, seed=seed, part=name)
         super().__init__(n, perturbation.name, part, seed=seed, children=self.parts.values())

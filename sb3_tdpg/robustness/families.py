@@ -14,9 +14,10 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from sb3_tdpg.buffers import each_part
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.problem import attribute_of, horizon_of
-from sb3_tdpg.robustness.core import Drawn, Members, Observations, Perturber, States, each_part, put, take
+from sb3_tdpg.robustness.core import Drawn, Members, Observations, Perturber, States, put, take
 from sb3_tdpg.robustness.registry import N_SEVERITIES, Perturbation, find_applicable
 from sb3_tdpg.robustness.scale import default_scale
 from sb3_tdpg.robustness.sensor import UNKNOWN_HORIZON, Sensor

@@ -15,8 +15,10 @@ from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from torch.distributions import Distribution, kl_divergence
 
+from sb3_tdpg.buffers import each_part
 from sb3_tdpg.callbacks import TDPGCallback
-from sb3_tdpg.robustness.core import each_part, take
+from sb3_tdpg.envs.checks import count as check_count
+from sb3_tdpg.robustness.core import take
 from sb3_tdpg.robustness.families import Family
 from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, held_family
 
@@ -67,8 +69,7 @@ class NuisancePhase(TDPGCallback):
 
     def __init__(self, nuisance: Any = "auto", n_steps: int = 24, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not (isinstance(n_steps, (int, np.integer)) and n_steps >= 1):
-            raise ValueError(f"n_steps={n_steps!r} must be an integer of at least 1")
+        check_count("n_steps", n_steps)
         self.nuisance, self.n_steps = nuisance, n_steps
 
     def _init_callback(self) -> None:

@@ -107,12 +107,6 @@ class Perturbation:
             return "it changes colours, and in a depth image (floats of one channel) there are none"
         return None
 
-    def applies_to(
-        self, space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None
-    ) -> bool:
-        """Check whether this perturbation applies; see :meth:`objection`."""
-        return self.objection(space, horizon, action_space) is None
-
 
 PERTURBATIONS: dict[str, Perturbation] = {}  # by name, filled by :mod:`sb3_tdpg.robustness.effects`
 
@@ -155,7 +149,7 @@ def find_applicable(
 
 def applicable(space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None) -> list[str]:
     """Return the names of the perturbations that apply; see :meth:`Perturbation.objection`."""
-    return [name for name, row in PERTURBATIONS.items() if row.applies_to(space, horizon, action_space)]
+    return [name for name, row in PERTURBATIONS.items() if row.objection(space, horizon, action_space) is None]
 
 
 def severity_table(kind: str | None = None) -> pd.DataFrame:

@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_tdpg.buffers import each_part
 from sb3_tdpg.evaluation.rollout import rollout
-from sb3_tdpg.robustness.core import each_part
 from sb3_tdpg.robustness.sensor import finite_range, kind_of, parts_of
 
 N_OBSERVATIONS = 500

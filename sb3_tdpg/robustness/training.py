@@ -6,7 +6,6 @@ Dimension key: n images or episodes, C channels, H and W rows and columns, D com
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch as th
@@ -20,10 +19,17 @@ PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
 PATTERN_GROUP = 16  # images whose patterns have cells of one size
 
 
-@dataclass(frozen=True)
-class ImageMixture:
+def images(
+    *,
+    held: bool = False,
+    color: float = 0.35,
+    pattern: float = 0.7,
+    patch: float = 0.5,
+    contrast: float = 0.7,
+    noise: float = 0.1,
+) -> Perturbation:
     r"""
-    A mixture of random changes of images, applied in this order to y in [0, 1]:
+    Return a mixture of random changes of images, applied in this order to y in [0, 1].
 
     1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, with rows
        divided by their sums (or by 0.3, if that is more);
@@ -37,6 +43,8 @@ class ImageMixture:
     The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound the information about
     everything in the image, so what an encoder keeps of these changes counts as information.
 
+    :param held: Whether an episode keeps what was drawn at its beginning, but for the noise; else every image has its
+        own.
     :param color: Strength of the mixing; 0 leaves the colours unchanged.
     :param pattern: Largest opacity of the pattern, at most 1.
     :param patch: Largest side of the opaque rectangle, at most 1.
@@ -44,20 +52,13 @@ class ImageMixture:
     :param noise: Largest standard deviation of the noise.
     :raises ValueError: if a strength is out of its range.
     """
+    strengths = dict(color=color, pattern=pattern, patch=patch, contrast=contrast, noise=noise)
+    for name, value in strengths.items():
+        largest = np.inf if name in ("color", "noise") else 1.0
+        if not 0 <= value <= largest:
+            raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
 
-    color: float = 0.35
-    pattern: float = 0.7
-    patch: float = 0.5
-    contrast: float = 0.7
-    noise: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            largest = np.inf if name in ("color", "noise") else 1.0
-            if not 0 <= value <= largest:
-                raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
-
-    def draw(self, rng: np.random.Generator, n: int, shape: Sequence[int]) -> dict[str, np.ndarray]:
+    def changes(rng: np.random.Generator, n: int, shape: Sequence[int]) -> dict[str, np.ndarray]:
         """Draw n changes of images ``(C, H, W)``: everything but the noise at each pixel."""
         channels, height, width = shape
 
@@ -65,68 +66,60 @@ class ImageMixture:
             return rng.random((n, 1, 1, 1), dtype=np.float32)
 
         mixing = np.eye(channels, dtype=np.float32)
-        mixing = mixing + np.float32(self.color) * rng.standard_normal((n, channels, channels), dtype=np.float32)
-        amount = np.float32(self.pattern) * uniform() * (uniform() < 0.7)
+        mixing = mixing + np.float32(color) * rng.standard_normal((n, channels, channels), dtype=np.float32)
+        amount = np.float32(pattern) * uniform() * (uniform() < 0.7)
         return dict(
             mixing=mixing / mixing.sum(axis=2, keepdims=True).clip(min=0.3),
-            pattern=self._patterns(rng, n, channels, height, width),
-            amount=np.maximum(amount, self._patches(rng, n, height, width)),
-            scale=1 - np.float32(self.contrast) * uniform(),
+            pattern=patterns(rng, n, channels, height, width),
+            amount=np.maximum(amount, _rectangles(rng, n, height, width, patch)),
+            scale=1 - np.float32(contrast) * uniform(),
             offset=uniform(),
-            noise=np.float32(self.noise) * uniform(),
+            noise=np.float32(noise) * uniform(),
         )
 
-    def _patterns(self, rng: np.random.Generator, n: int, channels: int, height: int, width: int) -> np.ndarray:
-        """Draw random coloured cells: ``(n, C, H, W)``."""
-        patterns = np.empty((n, channels, height, width), np.float32)
-        for start in range(0, n, PATTERN_GROUP):
-            group = patterns[start : start + PATTERN_GROUP]
-            size, mode = rng.choice(PATTERN_SIZES), rng.choice(["nearest", "bilinear"])
-            cells = th.from_numpy(rng.random((len(group), channels, size, size), dtype=np.float32))
-            group[:] = interpolate(cells, size=(height, width), mode=str(mode)).numpy()
-        return patterns
-
-    def _patches(self, rng: np.random.Generator, n: int, height: int, width: int) -> np.ndarray:
-        """Draw rectangles with sides uniform up to ``patch`` of the image's: ``(n, 1, H, W)``, 1 inside."""
-
-        def interval(length: int) -> np.ndarray:
-            size = self.patch * rng.random((n, 1))
-            start = (1 - size) * rng.random((n, 1))
-            at = (np.arange(length) + 0.5) / length
-            return (at >= start) & (at < start + size)
-
-        inside = interval(height)[:, None, :, None] & interval(width)[:, None, None, :]
-        return inside.astype(np.float32)
-
-    def apply(self, images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np.ndarray:
-        """Change each image ``(n, C, H, W)``, float32 in [0, 1], as drawn, with new noise."""
-        of = {name: th.from_numpy(values) for name, values in drawn.items() if name != "t"}  # several times as fast
-        y = (of["mixing"] @ th.from_numpy(images).flatten(2)).unflatten(2, images.shape[2:])
-        y = th.lerp(y, of["pattern"], of["amount"])
-        y = of["scale"] * y + (1 - of["scale"]) * of["offset"]
-        own = th.Generator().manual_seed(int(rng.integers(2**63)))
-        return y.add_(th.randn(y.shape, generator=own).mul_(of["noise"])).numpy()
-
-
-def images(*, held: bool = False, **strengths: float) -> Perturbation:
-    """
-    Return an :class:`ImageMixture` as a perturbation.
-
-    :param held: Whether an episode keeps what was drawn at its beginning, but for the noise; else every image has its
-        own.
-    :param strengths: See :class:`ImageMixture`.
-    """
-    mixture = ImageMixture(**strengths)
-
     def draw(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
-        return mixture.draw(rng, n, sensor.shape)
+        return changes(rng, n, sensor.shape)
 
     def apply(y: np.ndarray, value: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-        return mixture.apply(y, episode if held else mixture.draw(rng, len(y), y.shape[1:]), rng)
+        return _changed(y, episode if held else changes(rng, len(y), y.shape[1:]), rng)
 
     return Perturbation(
         "images", "image", "strength", (1.0,) * N_SEVERITIES, apply, draw if held else None, on_depth=False
     )
+
+
+def patterns(rng: np.random.Generator, n: int, channels: int, height: int, width: int) -> np.ndarray:
+    """Draw random coloured cells: ``(n, C, H, W)``."""
+    result = np.empty((n, channels, height, width), np.float32)
+    for start in range(0, n, PATTERN_GROUP):
+        group = result[start : start + PATTERN_GROUP]
+        size, mode = rng.choice(PATTERN_SIZES), rng.choice(["nearest", "bilinear"])
+        cells = th.from_numpy(rng.random((len(group), channels, size, size), dtype=np.float32))
+        group[:] = interpolate(cells, size=(height, width), mode=str(mode)).numpy()
+    return result
+
+
+def _rectangles(rng: np.random.Generator, n: int, height: int, width: int, largest: float) -> np.ndarray:
+    """Draw rectangles with sides uniform up to this share of the image's: ``(n, 1, H, W)``, 1 inside."""
+
+    def interval(length: int) -> np.ndarray:
+        size = largest * rng.random((n, 1))
+        start = (1 - size) * rng.random((n, 1))
+        at = (np.arange(length) + 0.5) / length
+        return (at >= start) & (at < start + size)
+
+    inside = interval(height)[:, None, :, None] & interval(width)[:, None, None, :]
+    return inside.astype(np.float32)
+
+
+def _changed(images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np.ndarray:
+    """Change each image ``(n, C, H, W)``, float32 in [0, 1], as drawn, with new noise."""
+    of = {name: th.from_numpy(values) for name, values in drawn.items() if name != "t"}  # several times as fast
+    y = (of["mixing"] @ th.from_numpy(images).flatten(2)).unflatten(2, images.shape[2:])
+    y = th.lerp(y, of["pattern"], of["amount"])
+    y = of["scale"] * y + (1 - of["scale"]) * of["offset"]
+    own = th.Generator().manual_seed(int(rng.integers(2**63)))
+    return y.add_(th.randn(y.shape, generator=own).mul_(of["noise"])).numpy()
 
 
 def noise_range(low: float = 0.01, high: float | Sequence[float] = 1.0) -> Perturbation:

@@ -12,7 +12,8 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_tdpg.robustness.core import each_part, put, take
+from sb3_tdpg.buffers import each_part
+from sb3_tdpg.robustness.core import put, take
 from sb3_tdpg.robustness.families import Family
 
 Scale = float | np.ndarray | Mapping[str, Any] | None

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 
 import numpy as np
 import pandas as pd
@@ -10,13 +9,13 @@ import pytest
 import torch as th
 from scipy.integrate import quad
 from scipy.stats import beta as beta_distribution
-from small_problems import ToyEnv, tiny_tdpg, train_epochs, words
+from small_problems import ToyEnv, tiny_tdpg, train_epochs
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch.distributions import Normal, kl_divergence
 
 from sb3_tdpg.certificates import shifts
 from sb3_tdpg.certificates.certificate import cost_distribution, worst_mean
-from sb3_tdpg.certificates.models import load_models
+from sb3_tdpg.certificates.declared import load_models
 from sb3_tdpg.certificates.shifts import (
     Budget,
     Shift,
@@ -85,19 +84,6 @@ def test_no_episode_costs_more_than_the_bound_and_some_come_near(reading):
         step = env.step_batch(state, random.choice([-3.0, 0.0, 3.0], (200_000, 1)), is_last=t == env.horizon - 1)
         state, costs = step.state, costs + step.cost
     assert 0.5 * env.cost_bound < costs.max() <= env.cost_bound
-
-
-@pytest.mark.parametrize(
-    "given, message",
-    [
-        (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
-        (dict(start_beta=(0.0, 1.0)), re.escape("start_beta=(0.0, 1.0) must be two positive numbers")),
-    ],
-    ids=words,
-)
-def test_bad_keywords_are_told(given, message):
-    with pytest.raises(ValueError, match=message):
-        LavaEnv(**given)
 
 
 # -- divergences ----------------------------------------------------------------------------------------------------

@@ -53,6 +53,7 @@ def test_the_renderers_agree_in_500_states_with_each_texture(texture):
     (dict(ball_color=(1.0, 0.5, 0.2), ball_radius=0.5), 0.995),
     (dict(camera_height=0.7), 0.995),
     (dict(camera_pitch=-20.0), 0.99),
+    (dict(camera_pitch=40.0, camera_height=2.5), 0.99),  # the strongest perturbation of the scene
     (dict(camera_pitch=70.0), 0.995),
     (dict(fov=40.0), 0.995),
     (dict(fov=120.0), 0.98),  # the sides of the floor are in view

@@ -184,14 +184,6 @@ def test_a_second_reset_begins_new_episodes():
     np.testing.assert_array_equal(env.reset(), [[0, 1, 0], [1, 1, 0]])
 
 
-def test_perturbations_can_be_nested():
-    both = run(perturbed(perturbed(PROBLEMS["colour"](2), "hue"), "occlusion"))
-    hue_only = run(perturbed(PROBLEMS["colour"](2), "hue"))
-    inside = (both.observations != hue_only.observations).any(axis=2).mean(axis=(2, 3))
-    assert (inside > 0.1).all()
-    assert (inside < 0.2).all()  # a square of 40 % of a side
-
-
 # -- bad input -------------------------------------------------------------------------------------------------------
 
 

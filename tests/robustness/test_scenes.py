@@ -32,18 +32,6 @@ def test_a_scene_reaches_the_image_in_every_episode_and_touches_neither_state_no
     assert (np.diff(distances) > 0).all(), distances
 
 
-@pytest.mark.parametrize("scene", [
-    *scene_perturbations("BallCatch-v0")["camera_pose"], scene_perturbations("BallCatch-v0")["texture"][2],
-], ids=str)  # fmt: skip
-def test_both_renderers_of_the_ball_draw_the_same_scene(scene):
-    images = []
-    for renderer in ("fast", "pybullet"):
-        env = make_episodes_env("BallCatch-v0", 20, env_kwargs=dict(renderer=renderer, **scene), seed=0)
-        images.append(env.reset().astype(int))
-        env.close()
-    assert (np.abs(images[0] - images[1]).max(axis=1) <= 2).mean() > 0.99
-
-
 def test_an_environment_without_scenes_has_none_and_the_module_may_stand_before_an_id():
     assert scene_perturbations("Pendulum-v1") == {}
     assert scene_perturbations("sb3_tdpg:BallCatch-v0") == scene_perturbations("BallCatch-v0")

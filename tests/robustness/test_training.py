@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from perturbed_problems import perturbed
-from small_problems import toy_vec_env
 
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.robustness.core import Perturber
 from sb3_tdpg.robustness.sensor import Sensor
-from sb3_tdpg.robustness.training import PATTERN_GROUP, PATTERN_SIZES, ImageMixture, images
+from sb3_tdpg.robustness.training import PATTERN_GROUP, PATTERN_SIZES, images, patterns
 
 IMAGES = spaces.Box(0, 255, (3, 64, 64), np.uint8)
 OFF = dict(color=0.0, pattern=0.0, patch=0.0, contrast=0.0, noise=0.0)
@@ -75,11 +73,6 @@ def test_a_patch_is_an_opaque_rectangle():
         assert not mask[: rows[0]].any()
 
 
-def test_channels_may_come_last():
-    result = PerturbedVecEnv(toy_vec_env(observation_space=spaces.Box(0, 255, (20, 16, 3), np.uint8)), "images").reset()
-    assert (result.shape, result.dtype) == ((4, 20, 16, 3), np.uint8)
-
-
 def test_three_images_of_ten_get_no_pattern():
     unchanged = (changed(np.full((3000, 3, 16, 16), 100, np.uint8), pattern=1.0) == 100).all(axis=(1, 2, 3)).mean()
     assert 0.26 < unchanged < 0.34
@@ -96,9 +89,8 @@ def test_the_strength_of_the_noise_is_drawn_for_each_image():
 def test_images_that_are_drawn_together_have_patterns_of_several_sizes():
     """Of changes that are held for an episode all episodes of an epoch are drawn together."""
     n = 12 * PATTERN_GROUP + 3
-    patterns = ImageMixture().draw(np.random.default_rng(0), n, (1, 64, 64))["pattern"]
-    assert patterns.shape == (n, 1, 64, 64)
-    n_colours = np.array([len(np.unique(pattern)) for pattern in patterns])
+    drawn = patterns(np.random.default_rng(0), n, 1, 64, 64)
+    n_colours = np.array([len(np.unique(pattern)) for pattern in drawn])
     with_edges = {size**2 for size in PATTERN_SIZES} & set(n_colours)
     assert len(with_edges) >= 3
     for start in range(0, n, PATTERN_GROUP):  # side by side of one size; bilinear colours coincide here and there
