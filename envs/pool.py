@@ -57,7 +57,7 @@ class WorkPool:
 
 
 class SharedEnv(POMDPEnv):
-    """An environment whose work on a batch is that of a Bullet world, and may be shared by several processes."""
+    """An environment in which an object, such as a Bullet world, does the work of a batch; processes may share it."""
 
     shares_work = True
     resources = frozenset({"_world", "_pool", "_view"})

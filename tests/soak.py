@@ -54,8 +54,8 @@ def grasp() -> Iterator[None]:
 
 
 def ball() -> Iterator[None]:
-    """300 episodes of ball catching on PyBullet."""
-    yield from _episodes("BallCatch-v0", 300)
+    """300 episodes of ball catching with PyBullet."""
+    yield from _episodes("BallCatch-v0", 300, renderer="pybullet")
 
 
 def _episodes(env_id: str, n_episodes: int) -> Iterator[None]:

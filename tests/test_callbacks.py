@@ -256,6 +256,14 @@ def test_a_cost_that_is_nan_stops_the_training_and_leaves_the_last_good_paramete
     assert not same_parameters(parameters(model.policy), good)
 
 
+def test_a_nan_that_the_environment_itself_returns_is_caught_too():
+    model = tiny_tdpg(toy_vec_env(n_envs=4, nan_cost_in_episode=9))
+    with pytest.raises(TrainingDivergedError, match="Check the environment's costs"):
+        train_epochs(model, 10)
+    assert model.epoch >= 1
+    assert all(value.isfinite().all() for value in parameters(model.policy).values())
+
+
 @pytest.mark.parametrize("field", ["observations", "states"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_nan_in_an_observation_or_a_state_never_reaches_the_parameters(field, value):

@@ -76,6 +76,11 @@ def test_beta_may_fall_linearly_too(tmp_path):
     assert loaded.mi_coef == pytest.approx(10.0)
 
 
+def test_another_schedule_is_refused_with_the_mend():
+    with pytest.raises(ValueError, match=r"'cos_1e-3' must be a number, a function, or a text such as 'lin_1e-3'"):
+        lava(learning_rate="cos_1e-3")
+
+
 def test_an_unknown_block_is_refused_with_the_list():
     with pytest.raises(KeyError, match=r"no block 'Lava-v9'; it has .*Lava-v0-pg"):
         load_hyperparams("Lava-v9")

@@ -198,6 +198,14 @@ def test_more_episodes_than_environments_are_run_one_after_the_other():
     assert (model.rollout_buffer.states[0, :, 1] == 0).all()
 
 
+def test_pendulum_trains_from_its_id():
+    model = tiny_tdpg("Pendulum-v1", n_episodes=4, n_envs=2)
+    assert model.horizon == 200
+    train_epochs(model, 1)
+    assert model.rollout_buffer.alive.all()
+    assert model.env.num_envs == 2
+
+
 def test_a_time_limit_is_the_horizon():
     env = DummyVecEnv([lambda: TimeLimit(ToyEnv(horizon=100, declares_horizon=False), 3)] * 2)
     assert not hasattr(env.envs[0].unwrapped, "horizon")
@@ -226,6 +234,14 @@ def test_policy_gradient_has_critics_and_never_trains_them():
     assert model.information is None
     assert_same_parameters(before, parameters(model.estimator))
     assert not model.estimator.is_warm
+
+
+def test_tdpg_fits_its_critics_without_being_asked():
+    model = tiny_tdpg(mi_estimator="mine")
+    before = parameters(model.estimator)
+    train_epochs(model, 1)
+    assert not same_parameters(before, parameters(model.estimator))
+    assert model.information.shape == (5,)
 
 
 @pytest.mark.parametrize(("before", "change", "after"), [
@@ -268,6 +284,13 @@ def test_beta_may_follow_the_progress():
     coefficients = []
     train_epochs(model, 4, callback=AtEveryEpoch(lambda m: coefficients.append(m.mi_coef)))
     np.testing.assert_allclose(coefficients, 75 * (np.arange(1, 5) / 4 + 0.0001), rtol=1e-6)  # as in train()
+
+
+def test_a_schedule_may_begin_with_policy_gradient():
+    model = tiny_tdpg(beta=lambda progress: math.inf if progress > 0.5 else 0.1)
+    information = []
+    train_epochs(model, 4, callback=AtEveryEpoch(lambda m: information.append(m.information)))
+    assert [x is None for x in information] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("schedule", ["beta", "learning_rate"])

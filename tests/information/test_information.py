@@ -107,6 +107,13 @@ def test_an_upper_bound_holds_where_the_encoder_sees_a_noisy_observation_only(na
     assert bound == pytest.approx(about_observation, abs=0.06)
 
 
+@pytest.mark.parametrize("dim", [1, 2, 8])
+def test_logdet_is_exact_for_gaussians_up_to_its_small_bias(dim):
+    gains = [[1.0] * dim, [5.0] * dim]
+    estimate = LogDet(2, dim, dim)(gaussian_batch(50_000, gains)).numpy()
+    np.testing.assert_allclose(estimate, gaussian_information(gains), rtol=0.01)
+
+
 def test_logdet_is_half_the_log_determinant_of_the_total_covariance_less_the_mean_log_std():
     batch = random_batch(horizon=2, n=30)
     means, stds = batch.means.double().numpy(), batch.stds.double().numpy()

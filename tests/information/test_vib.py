@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import torch as th
 from information_problems import (
+    GAINS,
     batch_of,
+    gaussian_batch,
+    gaussian_information,
     half_dead,
     modes_batch,
     random_batch,
@@ -60,12 +63,25 @@ def test_the_fitted_gaussian_has_the_moments_of_the_trvs_and_no_other_gaussian_i
             buffer -= step
 
 
+def test_one_gaussian_is_tight_where_the_marginal_is_one_without_correlations():
+    estimator = fitted(gaussian_batch(50_000, GAINS))
+    fresh = gaussian_batch(50_000, GAINS)
+    np.testing.assert_allclose(estimator(fresh), gaussian_information(GAINS), atol=0.02)
+
+
 def test_with_correlated_trvs_it_is_looser_than_logdet_by_what_they_tell_of_each_other():
     correlated = th.randn(1, 20_000, 1).expand(1, 20_000, 2)
     batch = batch_of(2 * correlated, th.ones(1, 20_000, 2))
     both, one = 0.5 * math.log(9.0), 0.5 * math.log(5.0)  # of the pair, and of one of the two TRVs
     assert LogDet(1, 2, 2)(batch).item() == pytest.approx(both, abs=0.03)
     assert fitted(batch)(batch).item() == pytest.approx(2 * one, abs=0.03)
+
+
+def test_with_one_step_and_no_correlations_it_is_logdet_of_each_trv():
+    batch = random_batch()
+    each = [LogDet(4, 2, 1)(InformationBatch(batch.states, *(x[..., i : i + 1] for x in batch[1:4]))) for i in range(2)]
+    # The log-det bound divides the covariance of the means by N - 1.
+    th.testing.assert_close(fitted(batch)(batch), sum(each), atol=0.02, rtol=0)
 
 
 def test_with_several_modes_several_gaussians_are_tight_and_one_is_loose():

@@ -12,8 +12,8 @@ from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.robustness import Perturbation, PerturbedVecEnv
-from sb3_tdpg.robustness.core import take
-from sb3_tdpg.robustness.families import Family, OneOf, SceneMembers
+from sb3_tdpg.robustness.core import Members, take
+from sb3_tdpg.robustness.families import Family, FunctionMembers, OneOf, SceneMembers
 
 N = 40
 SOME = np.array([27, 3, 12, 31, 8, 19, 0, 35])
@@ -137,6 +137,19 @@ def test_one_member_is_the_same_for_all_episodes(space, draw):
     assert (one == one[:1]).all()
     np.testing.assert_array_equal(one[:3], seen(1, 3))  # however many
     assert any((seen(seed) != one).any() for seed in (2, 3, 4))
+
+
+def test_an_episode_that_begins_draws_its_family_anew():
+    n = 400
+    up, down = (FunctionMembers(lambda y, rng, by=by: y + by, n) for by in (1, -1))
+    members = OneOf([up, down, Members(n)], n, 0)
+    plain, begun = np.zeros((n, 1), np.float32), np.arange(n) % 2 == 1
+    before = members(plain)[:, 0]
+    assert [(before == offset).mean() for offset in (1, -1, 0)] == pytest.approx([1 / 3] * 3, abs=0.06)
+    members.begin(np.flatnonzero(begun))
+    changed = members(plain)[:, 0] != before
+    assert not changed[~begun].any()
+    assert 0.55 < changed[begun].mean() < 0.8
 
 
 def test_a_name_alone_stands_for_all_severities_and_no_two_episodes_draw_the_same_numbers():
