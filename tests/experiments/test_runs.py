@@ -293,13 +293,6 @@ def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_the_reproduction_runs_in_worker_processes(tmp_path):
-    arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]
-    assert main([*arguments, "--n-timesteps", "2500", "--n-eval-episodes", "4"]) == 0
-    assert len(list(tmp_path.glob("runs/*/*/episodes.csv"))) == 2 * len(METHODS) + len(methods("paper"))
-
-
 def test_every_method_of_the_reproduction_has_goals_on_both_readings():
     assert set(GOALS) == set(READINGS)
     assert all(set(goals) == set(METHODS) for goals in GOALS.values())
