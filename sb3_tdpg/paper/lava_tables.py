@@ -50,6 +50,7 @@ TITLES = {
     "text": "Cost definition: text",
     "paper": "The paper's own settings (cost definition: table)",
 }
+RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
 SEED_COLUMNS = dict(model="method", train_seed="seed", attempts="trainings", selected="limits met")
 COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ratio")
 
@@ -138,7 +139,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
     groups, seed_tables = {}, []
     for group, of_group in tasks.items():
         records = common.read_records(of_group)
-        write_frame_atomically(records[common.RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
+        write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
         groups[TITLES[group]] = dict(

@@ -96,7 +96,7 @@ class Records:
     """
 
     def __init__(self, trainings: Sequence[Training], root: Path) -> None:
-        self.runs = [(each, root / each.folder_name, ()) for each in trainings]
+        self.runs: list[Any] = [(each, root / each.folder_name, ()) for each in trainings]  # no rows of scenarios
         self.episodes = common.read_records(self.runs)
         times, curves = [], []
         for each, folder, _ in self.runs:
