@@ -15,7 +15,7 @@ from sb3_tdpg.callbacks import TrainingCheckpointCallback
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.lava import LavaEnv
-from sb3_tdpg.experiments.runs import complete_run
+from sb3_tdpg.experiments.runs import Run, complete_run
 
 TINY_CRITIC = dict(hidden_sizes=(8,), batch_size=5, gradient_steps=2, warmup_gradient_steps=4, refit_gradient_steps=4)
 
@@ -243,6 +243,12 @@ def complete_runs_here(tasks, *, n_eval_episodes, jobs=None):
         complete_run(*task, n_eval_episodes=n_eval_episodes)
         waiting.remove(task)
         unfinished.remove(task[1])
+
+
+def give_settings(monkeypatch, more, cls=Run):
+    """Replace settings of all runs: a dict, or a function of the run that returns one."""
+    settings = cls.settings.fget
+    monkeypatch.setattr(cls, "settings", property(lambda run: settings(run) | (more(run) if callable(more) else more)))
 
 
 def error_line(capsys, *command):

@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 # Before NumPy and PyTorch start their threads.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
@@ -58,8 +59,8 @@ def ball() -> Iterator[None]:
     yield from _episodes("BallCatch-v0", 300, renderer="pybullet")
 
 
-def _episodes(env_id: str, n_episodes: int) -> Iterator[None]:
-    env = gym.make(env_id)
+def _episodes(env_id: str, n_episodes: int, **env_kwargs: Any) -> Iterator[None]:
+    env = gym.make(env_id, **env_kwargs)
     env.action_space.seed(0)
     for seed in range(n_episodes):
         env.reset(seed=seed)

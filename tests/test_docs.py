@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 
 # A block after <!-- no-run --> is run elsewhere, with Ray or a stand-in for the Hub (distributed/test_ray_vec_env.py,
-# hub/test_loading.py); what stands in an indented or quoted block is not one.
+# hub/test_transfer.py); what stands in an indented or quoted block is not one.
 BLOCK = re.compile(r"^(?P<skip><!-- no-run -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))

@@ -63,8 +63,7 @@ def methods() -> tuple[Method, ...]:
     for level in LEVELS:
         pg = f"PG to {level:g}"
         stop = {"sb3_tdpg.paper.ball_paper.StopAtCost": dict(cost=level)}
-        overrides = dict(callback=[stop])
-        found.append(Method(pg, "BallCatch-v0-paper-pg", start, overrides=overrides))
+        found.append(Method(pg, "BallCatch-v0-paper-pg", start, overrides=dict(callback=[stop])))
         found += [
             Method(f"TDPG {price} from {level:g}", "BallCatch-v0-paper", pg, overrides=dict(beta=1 / price))
             for price in PRICES
@@ -148,9 +147,5 @@ def _progress(folder: Path) -> Mapping[str, float]:
 def _runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Average over seeds; and count the runs in which an epoch met the limit."""
     groups = runs.groupby("model", sort=False)
-    means = groups[["epochs", "cost", "information"]].mean().round(1).astype(str)
-    return (
-        means.assign(selected=groups["information"].count().astype(str))
-        .reset_index()
-        .rename(columns=dict(model="method"))
-    )
+    table = groups[["epochs", "cost", "information"]].mean().round(1).assign(selected=groups["information"].count())
+    return table.astype(str).reset_index().rename(columns=dict(model="method"))

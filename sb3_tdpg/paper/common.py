@@ -17,9 +17,6 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.experiments.runs import Run, SB3Run, Task
 
-RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
-"""The columns of the records that are kept."""
-
 NO_PENALTY = "TDPG without the penalty"
 """Label of the ablation, which differs from TDPG in the missing penalty only."""
 

@@ -1,7 +1,6 @@
 """Reproduce Table I, the lava problem: a quick demonstration, and the full reproduction with many seeds."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,10 @@ from sb3_tdpg.evaluation import (
     summary_table,
     training_curves,
 )
-from sb3_tdpg.experiments.runs import Run, Task, complete_run, complete_runs, read_progress
+from sb3_tdpg.experiments.runs import complete_run, complete_runs, read_progress
+from sb3_tdpg.paper import common
 from sb3_tdpg.paper.certificates import PAPER_INVERSE_BETAS
-from sb3_tdpg.paper.common import RECORD_COLUMNS, Options, folders_of, met, read_records, write_results
+from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.plots import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
@@ -50,14 +50,24 @@ TITLES = {
     "text": "Cost definition: text",
     "paper": "The paper's own settings (cost definition: table)",
 }
+RECORD_COLUMNS = ["model", "train_seed", "attempts", "selected", "scenario", "episode", "cost", "seed", "deterministic"]
 SEED_COLUMNS = dict(model="method", train_seed="seed", attempts="trainings", selected="limits met")
 COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ratio")
 
 
-def lava_run(method: str, reading: str, seed: int, **overrides: Any) -> Run:
-    """Return a run of a method of :data:`METHODS`; ``overrides`` replace settings of its block."""
-    block = METHODS[method] + ("-table" if reading == "table" else "")
-    return Run(method, "Lava-v0", block, seed, overrides, max_attempts=1 if method == "PG" else MAX_ATTEMPTS)
+def methods(reading: str) -> list[Method]:
+    """List PG and TDPG with each estimator for a definition of the cost; ``"paper"``: with the paper's settings."""
+    if reading == "paper":
+        tdpg = [
+            Method(f"paper's TDPG, 1/beta = {inverse}", "Lava-v0-paper", overrides=dict(beta=1 / inverse))
+            for inverse in PAPER_INVERSE_BETAS
+        ]
+        return [Method("paper's PG", "Lava-v0-paper-pg"), *tdpg]
+    suffix = "-table" if reading == "table" else ""
+    return [
+        Method(label, block + suffix, max_attempts=1 if label == "PG" else MAX_ATTEMPTS)
+        for label, block in METHODS.items()
+    ]
 
 
 def _write_figures(
@@ -81,16 +91,16 @@ def demo(
     :param reading: The cost definition, ``"table"`` or ``"text"``.
     :return: the table
     """
-    overrides = Options(n_timesteps=n_timesteps).overrides
-    runs = [lava_run(method, reading, seed, **overrides) for method in ("PG", "TDPG")]
-    tasks: list[Task] = [(run, out / "runs" / run.folder_name, LAVA) for run in runs]
+    overrides = common.Options(n_timesteps=n_timesteps).overrides
+    pair = [(method, seed) for method in methods(reading)[:2]]
+    tasks = common.make_tasks("Lava-v0", out / "runs", pair, lambda _: LAVA, overrides)
     folders = {run.method: folder for run, folder, _ in tasks}
     with threads(1):
         for task in tasks:
             print(f"{task[0].method}: training and evaluating, {task[1]}")
             complete_run(*task, n_eval_episodes=n_eval_episodes, progress_bar=True)
 
-        records = read_records(tasks)
+        records = common.read_records(tasks)
         models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
         table = comparison_markdown(summary_table(records).drop(columns="train_seed"), LAVA)
         write_frame_atomically(records, out / "episodes.csv")
@@ -98,20 +108,8 @@ def demo(
         _write_figures(out, "", records, folders, models, reading)
         for method, model in models.items():
             model.save(out / f"{method.lower()}.zip")
-    write_run_config(out / "config.json", dict(reading=reading, runs=[run.config for run in runs]))
+    write_run_config(out / "config.json", dict(reading=reading, runs=[run.config for run, *_ in tasks]))
     return table
-
-
-def paper_runs(n_seeds: int) -> list[Run]:
-    """List the runs with the paper's own settings (block ``Lava-v0-paper``): PG, and TDPG with each beta."""
-    runs = []
-    for seed in range(FIRST_SEED, FIRST_SEED + n_seeds):
-        base = Run("paper's PG", "Lava-v0", "Lava-v0-paper-pg", seed)
-        runs.append(base)
-        for inverse_beta in PAPER_INVERSE_BETAS:
-            label = f"paper's TDPG, 1/beta = {inverse_beta}"
-            runs.append(replace(base, method=label, block="Lava-v0-paper", overrides={"beta": 1 / inverse_beta}))
-    return runs
 
 
 def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **options: Any) -> str:
@@ -125,14 +123,12 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
-    given = Options(**options)
-    overrides, seeds = given.overrides, range(FIRST_SEED, FIRST_SEED + n_seeds)
-    runs = {
-        reading: [lava_run(m, reading, seed, **overrides) for m in METHODS for seed in seeds] for reading in READINGS
-    }
-    runs["paper"] = [replace(run, overrides={**run.overrides, **overrides}) for run in paper_runs(n_paper_seeds)]
-    tasks: dict[str, list[Task]] = {
-        group: [(run, out / "runs" / group / run.folder_name, LAVA) for run in of_group]
+    given = common.Options(**options)
+    seeds = range(FIRST_SEED, FIRST_SEED + n_seeds)
+    runs = {reading: [(method, seed) for method in methods(reading) for seed in seeds] for reading in READINGS}
+    runs["paper"] = common.seed_by_seed(methods("paper"), FIRST_SEED, n_paper_seeds)
+    tasks = {
+        group: common.make_tasks("Lava-v0", out / "runs" / group, of_group, lambda _: LAVA, given.overrides)
         for group, of_group in runs.items()
     }
     everything = [task for of_group in tasks.values() for task in of_group]
@@ -142,7 +138,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
 
     groups, seed_tables = {}, []
     for group, of_group in tasks.items():
-        records = read_records(of_group)
+        records = common.read_records(of_group)
         write_frame_atomically(records[RECORD_COLUMNS].round({"cost": 4}), out / f"episodes_{group}.csv.gz")
         by_seed = _seed_table(records)
         seed_tables.append(by_seed.assign(group=group))
@@ -152,12 +148,12 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
             seeds=markdown_table(by_seed.rename(columns={**SEED_COLUMNS, **COLUMNS})),
         )
         if group in READINGS:
-            folders = {method: folders_of(of_group)[method, FIRST_SEED] for method in METHODS}
+            folders = {method: common.folders_of(of_group)[method, FIRST_SEED] for method in METHODS}
             models = {method: TDPG.load(folder / "model.zip", device="cpu") for method, folder in folders.items()}
             one_seed = records[(records["train_seed"] == FIRST_SEED) & records["model"].isin(["PG", "TDPG"])]
             _write_figures(out, f"_{group}", one_seed, folders, models, group)
     write_frame_atomically(pd.concat(seed_tables, ignore_index=True), out / "seeds.csv")
-    return write_results(out, "lava.md", everything, "make reproduce-lava", given.publish, groups=groups)
+    return common.write_results(out, "lava.md", everything, "make reproduce-lava", given.publish, groups=groups)
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
@@ -184,7 +180,7 @@ def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) 
 
 def _verdict(seeds: pd.DataFrame, goals: Mapping[str, float]) -> str:
     names = dict(mean="mean", std="standard deviation", ratio="ratio")
-    verdicts = {column: met(seeds[column].mean() <= goal) for column, goal in goals.items()}
+    verdicts = {column: common.met(seeds[column].mean() <= goal) for column, goal in goals.items()}
     if "ratio" in goals:
         verdicts["ratio"] = f"{(seeds['ratio'] <= goals['ratio']).sum()} of {len(seeds)} seeds"
     return "; ".join(f"{names[column]} <= {goal:g}: {verdicts[column]}" for column, goal in goals.items())

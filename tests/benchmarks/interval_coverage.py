@@ -22,14 +22,15 @@ from information_problems import gaussian_channels  # noqa: E402
 
 from sb3_tdpg.evaluation import information_interval  # noqa: E402
 
+N_DRAWS = 200  # independent samples in each row
 COLUMNS = ("N", "d", "truth", "held", "lower above", "upper below", "mean lower", "mean upper", "mean width",
            "95 % of widths below", "widest")  # fmt: skip
 
 
-def measure(nats: float, dim: int, n_episodes: int, n_draws: int, seed: int) -> tuple[str, ...]:
+def measure(nats: float, dim: int, n_episodes: int, seed: int) -> tuple[str, ...]:
     """Return a row of the table."""
     rng = np.random.default_rng((seed, round(1000 * nats), dim, n_episodes))
-    interval = information_interval(gaussian_channels(nats, dim, n_episodes, n_draws, rng), seed=seed)
+    interval = information_interval(gaussian_channels(nats, dim, n_episodes, N_DRAWS, rng), seed=seed)
     above, below, width = interval.lower > nats, interval.upper < nats, interval.upper - interval.lower
     counts = (f"{1 - (above | below).mean():.1%}".replace("%", " %"), str(above.sum()), str(below.sum()))
     means = (interval.lower.mean(), interval.upper.mean(), width.mean(), np.quantile(width, 0.95))
@@ -39,16 +40,12 @@ def measure(nats: float, dim: int, n_episodes: int, n_draws: int, seed: int) -> 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=200, help="independent samples in each row")
-    parser.add_argument("--episodes", type=int, nargs="+", default=[200, 500], help="N")
-    parser.add_argument("--dims", type=int, nargs="+", default=[2, 8, 16], help="d: of the state and of the TRVs")
-    parser.add_argument("--nats", type=float, nargs="+", default=[0.1, 0.5, 1, 2, 2.9, 5, 8], help="the truth")
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
+    seed = parser.parse_args().seed
     print("|", " | ".join(COLUMNS), "|")
     print("|---" * len(COLUMNS) + "|")
-    for n_episodes, dim, nats in product(arguments.episodes, arguments.dims, arguments.nats):
-        print("|", " | ".join(measure(nats, dim, n_episodes, arguments.draws, arguments.seed)), "|", flush=True)
+    for n_episodes, dim, nats in product((200, 500), (2, 8, 16), (0.1, 0.5, 1, 2, 2.9, 5, 8)):
+        print("|", " | ".join(measure(nats, dim, n_episodes, seed)), "|", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,8 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import subprocess
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 # Before NumPy and PyTorch start their threads.
@@ -24,6 +22,7 @@ sys.path.insert(0, str(REPOSITORY))
 
 import torch as th  # noqa: E402
 
+from sb3_tdpg.common.provenance import how_made, provenance  # noqa: E402
 from tests.benchmarks.speed.critics import bench_critics  # noqa: E402
 from tests.benchmarks.speed.environments import bench_camera, bench_environment  # noqa: E402
 from tests.benchmarks.speed.grasping import GraspTrials, bench_grasp, bench_processes  # noqa: E402
@@ -32,7 +31,6 @@ from tests.benchmarks.speed.long_horizons import bench_long_horizons  # noqa: E4
 from tests.benchmarks.speed.measure import FULL, QUICK, format_table  # noqa: E402
 from tests.benchmarks.speed.training import bench_epoch, bench_training  # noqa: E402
 
-PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
 BENCHES = (
     bench_epoch,
     bench_critics,
@@ -47,21 +45,11 @@ BENCHES = (
 
 
 def describe_machine() -> str:
-    """One line for each of machine, versions, commit."""
+    """Name the processor, the versions and the commit."""
     cpu_info = Path("/proc/cpuinfo")
     lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
     processor = next((line.split(": ")[1] for line in lines if line.startswith("model name")), platform.processor())
-    versions = ", ".join(f"{package} {version(package)}" for package in PACKAGES)
-    git = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
-    return "\n".join(
-        [
-            f"- machine: {processor}, {os.cpu_count()} cores, {platform.system()}",
-            f"- versions: Python {platform.python_version()}, {versions}",
-            f"- commit: {git.stdout.strip() or 'unknown'}; torch threads: {th.get_num_threads()}",
-        ]
-    )
+    return f"{processor}, {os.cpu_count()} cores. {how_made('make bench', provenance())}"
 
 
 def main() -> None:

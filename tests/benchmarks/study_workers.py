@@ -7,7 +7,6 @@ which all workers have imported what they need, so that the time of a short stud
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing as mp
 import os
 import sys
@@ -19,19 +18,19 @@ from typing import Any
 
 # Before NumPy and PyTorch start their threads.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
-REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY))
 
-import optuna  # noqa: E402
+import optuna
 
-from sb3_tdpg.experiments.studies import open_storage, open_study, work  # noqa: E402
-from sb3_tdpg.experiments.training import make_training  # noqa: E402
-from sb3_tdpg.hyperparams import load_hyperparams  # noqa: E402
+from sb3_tdpg.experiments.studies import open_storage, open_study, work
+from sb3_tdpg.experiments.training import make_training
+from sb3_tdpg.hyperparams import load_hyperparams
 
 GOAL = 1.8  # times as fast with two workers
+N_TRIALS = 12
+N_TIMESTEPS = 250_000  # 100 epochs of a training
 
 
-def train(learning_rate: float, n_timesteps: int) -> float:
+def train(learning_rate: float, n_timesteps: int = N_TIMESTEPS) -> float:
     """Train on the lava problem and return the last epoch's cost."""
     block = {**load_hyperparams("Lava-v0-logdet"), "callback": [], "n_timesteps": n_timesteps}
     training = make_training("Lava-v0", block, learning_rate=learning_rate, seed=0, device="cpu")
@@ -39,7 +38,7 @@ def train(learning_rate: float, n_timesteps: int) -> float:
     return float(training.model.rollout_buffer.episode_costs.mean())
 
 
-def run_worker(storage: str, name: str, n_trials: int, n_timesteps: int, barrier: Any) -> None:
+def run_worker(storage: str, name: str, barrier: Any) -> None:
     """Be one worker; the clock runs between the barriers."""
     warnings.simplefilter("ignore")
     train(1e-3, 2500)  # what is imported and compiled in a first training
@@ -48,17 +47,17 @@ def run_worker(storage: str, name: str, n_trials: int, n_timesteps: int, barrier
     barrier.wait()
 
     def objective(trial: optuna.Trial) -> float:
-        return train(trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True), n_timesteps)
+        return train(trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True))
 
-    work(study, objective, n_trials, report=lambda _: None)
+    work(study, objective, N_TRIALS, report=lambda _: None)
     barrier.wait()
 
 
-def seconds_of(n_workers: int, storage: str, n_trials: int, n_timesteps: int) -> float:
+def seconds_of(n_workers: int, storage: str) -> float:
     """Time a study."""
     context = mp.get_context("spawn")
     barrier = context.Barrier(n_workers + 1)
-    arguments = (storage, f"{n_workers} workers {time.time()}", n_trials, n_timesteps, barrier)
+    arguments = (storage, f"{n_workers} workers", barrier)
     workers = [context.Process(target=run_worker, args=arguments) for _ in range(n_workers)]
     for worker in workers:
         worker.start()
@@ -72,23 +71,13 @@ def seconds_of(n_workers: int, storage: str, n_trials: int, n_timesteps: int) ->
 
 
 def main() -> int:
-    """Print the times; 1 if the goal of two workers is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--trials", type=int, default=12)
-    parser.add_argument("--n-timesteps", type=int, default=250_000, help="100 epochs of a training")
-    parser.add_argument("--storage", default=None, help="default: a journal file")
-    options = parser.parse_args()
+    """Print the times; 1 if the goal is missed."""
     with tempfile.TemporaryDirectory() as folder:
-        storage = options.storage or str(Path(folder, "study.log"))
-        one, several = (seconds_of(n, storage, options.trials, options.n_timesteps) for n in (1, options.workers))
-    ratio = one / several
-    print(f"{options.trials} trainings of {options.n_timesteps} steps, load of the machine {os.getloadavg()[0]:.1f}")
-    print(f"1 worker {one:.1f} s, {options.workers} workers {several:.1f} s: {ratio:.2f} times as fast")
-    if options.workers == 2:
-        print(f"goal {GOAL}: {'met' if ratio >= GOAL else 'MISSED'}")
-        return int(ratio < GOAL)
-    return 0
+        one, two = (seconds_of(n, str(Path(folder, "study.log"))) for n in (1, 2))
+    print(f"{N_TRIALS} trainings of {N_TIMESTEPS} steps, load of the machine {os.getloadavg()[0]:.1f}")
+    print(f"1 worker {one:.1f} s, 2 workers {two:.1f} s: {one / two:.2f} times as fast")
+    print(f"goal {GOAL}: {'met' if one / two >= GOAL else 'MISSED'}")
+    return int(one / two < GOAL)
 
 
 if __name__ == "__main__":

@@ -245,16 +245,11 @@ def test_the_command_writes_beside_the_model_and_uses_the_statistics_there(tmp_p
     assert main(["export", "model.zip", *flags]) == 0
     assert capsys.readouterr().out.endswith(f"the policy's step is {made}\n")
     by_model = model.export("by_model" + Path(made).suffix)
-    x = (
-        th.tensor([[2.0, -1.0, 7.0]]),
-        th.zeros(1, model.policy.trv_dim),
-        th.zeros(1, model.policy.trv_dim),
-        th.zeros(1, 1),
-    )
+    nothing = np.zeros(model.policy.trv_dim)
+    feed = inputs_of(model, np.array([2.0, -1.0, 7.0]), nothing, 0, [nothing, 0.0])
     if made.endswith(".pt"):
-        one, other = (th.jit.load(str(path))(*x)[1].detach().numpy() for path in (made, by_model))
+        inputs = [th.as_tensor(value) for value in feed.values()]
+        one, other = (th.jit.load(str(path))(*inputs)[1].detach().numpy() for path in (made, by_model))
     else:
-        names = ExportedStep(model.policy).input_names
-        feed = dict(zip(names, [v.numpy() for v in x], strict=True))
         one, other = (session_of(path).run(None, feed)[1] for path in (made, by_model))
     np.testing.assert_array_equal(one, other)

@@ -232,22 +232,16 @@ def test_attributes_methods_and_pictures_of_the_environments_can_be_reached(make
     assert env.get_attr("name") == [0, 1, 2]
 
 
-def csv_log(vec_env, tmp_path, algorithm):
-    """Train a little; return what was logged, but for times, and the policy."""
-    name = type(vec_env).__name__
-    if algorithm == "PPO":
+def csv_log(vec_env, path, **kwargs):
+    """Train for two epochs; return what was logged, but for times, and the policy."""
+    if kwargs:
+        model = tiny_tdpg(vec_env, **kwargs)
+        n_timesteps = 2 * model.epoch_size
+    else:
         model = PPO("MlpPolicy", vec_env, n_steps=20, batch_size=20, n_epochs=1, seed=0, device="cpu")
-    else:
-        kwargs = dict(beta=float("inf")) if vec_env.observation_space.shape == (1, 128, 128) else {}
-        if kwargs:
-            kwargs.update(n_epochs=1, batch_size=None, policy_kwargs={})
-        model = tiny_tdpg(vec_env, n_episodes=4, **kwargs)
-    path = tmp_path / f"{name}.csv"
-    model.set_logger(Logger(str(tmp_path), [CSVOutputFormat(str(path))]))
-    if algorithm == "PPO":
-        model.learn(80)
-    else:
-        train_epochs(model, 2)
+        n_timesteps = 80
+    model.set_logger(Logger(None, [CSVOutputFormat(str(path))]))
+    model.learn(n_timesteps)
     vec_env.close()
     rows = [line.split(",") for line in path.read_text().splitlines()]
     columns = [i for i, key in enumerate(rows[0]) if not key.startswith("time/") or key == "time/total_timesteps"]
@@ -256,15 +250,18 @@ def csv_log(vec_env, tmp_path, algorithm):
     return [[row[i] for i in columns] for row in rows], parameters(model.policy)
 
 
-@pytest.mark.parametrize("env_id, algorithm", [
-    ("Lava-v0", "TDPG"),
-    pytest.param("Lava-v0", "PPO", marks=pytest.mark.slow),
-    pytest.param("PandaGrasp-v0", "TDPG", marks=pytest.mark.slow),
-])  # fmt: skip
-def test_a_training_gives_the_log_that_it_gives_with_subproc_vec_env(env_id, algorithm, tmp_path):
+GRASPING = dict(n_episodes=4, beta=float("inf"), n_epochs=1, batch_size=None, policy_kwargs={})
+
+
+@pytest.mark.parametrize("env_id, kwargs", [
+    ("Lava-v0", dict(n_episodes=4)),
+    pytest.param("Lava-v0", {}, marks=pytest.mark.slow),
+    pytest.param("PandaGrasp-v0", GRASPING, marks=pytest.mark.slow),
+], ids=["TDPG", "PPO", "grasping"])  # fmt: skip
+def test_a_training_gives_the_log_that_it_gives_with_subproc_vec_env(env_id, kwargs, tmp_path):
     # With the module: the server that SubprocVecEnv's processes are forked from may be that of an earlier test.
     logs, policies = zip(*[
-        csv_log(make_vec_env(f"sb3_tdpg:{env_id}", n_envs=2, seed=1, vec_env_cls=vec_env), tmp_path, algorithm)
+        csv_log(make_vec_env(f"sb3_tdpg:{env_id}", n_envs=2, seed=1, vec_env_cls=vec_env), tmp_path / "log", **kwargs)
         for vec_env in (RayVecEnv, SubprocVecEnv)
     ], strict=True)  # fmt: skip
     assert logs[0] == logs[1]

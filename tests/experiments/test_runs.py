@@ -3,13 +3,9 @@
 import contextlib
 import io
 import json
-import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -17,7 +13,8 @@ from unittest.mock import Mock
 import numpy as np
 import pandas as pd
 import pytest
-from small_problems import assert_same_parameters, complete_runs_here, parameters, stopped_in_epoch
+from programs import start, wait_for
+from small_problems import assert_same_parameters, complete_runs_here, give_settings, parameters, stopped_in_epoch
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.callbacks import TDPGProgressBar
@@ -25,7 +22,7 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.experiments.runs import Run, complete_run, complete_runs, read_progress
 from sb3_tdpg.experiments.training import make_training
-from sb3_tdpg.paper.lava_tables import GOALS, METHODS, READINGS, lava_run, paper_runs, reproduce_lava
+from sb3_tdpg.paper.lava_tables import GOALS, METHODS, READINGS, methods, reproduce_lava
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TINY = ["--n-timesteps", "400", "--n-eval-episodes", "8"]
@@ -35,14 +32,13 @@ CHEAP = dict(n_timesteps=800, n_episodes=20, mi_kwargs=dict(gradient_steps=2, wa
 @pytest.fixture(scope="module", autouse=True)
 def quick():
     """Small epochs, so that a run of a few hundred steps has several."""
-    block = Run.settings.fget
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 20}))
+        give_settings(patch, dict(n_episodes=20))
         yield
 
 
 def tiny_run(seed=0, **overrides):
-    return replace(lava_run("TDPG", "table", seed, **{**CHEAP, **overrides}), max_attempts=1)
+    return Run("TDPG", "Lava-v0", "Lava-v0-table", seed, {**CHEAP, **overrides})
 
 
 def policy_of(folder):
@@ -233,7 +229,7 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
         assert len(records) == len(METHODS) * 2 * len(LAVA) * 4
         assert (tmp_path / f"trajectories_{reading}.png").exists()
     seeds = pd.read_csv(tmp_path / "seeds.csv")
-    assert len(seeds) == 2 * len(METHODS) * 2 + len(paper_runs(1))
+    assert len(seeds) == 2 * len(METHODS) * 2 + len(methods("paper"))
     of_a_seed = "model == 'PG' and train_seed == 301 and "
     records = pd.read_csv(tmp_path / "episodes_text.csv.gz").query(of_a_seed + "scenario == 'Training'")
     found = seeds.query(of_a_seed + "group == 'text'")["mean"].item()
@@ -241,23 +237,13 @@ def test_the_reproduction_goes_from_nothing_to_tables_figures_and_records(tmp_pa
 
 
 def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
-    command = [sys.executable, "-m", "sb3_tdpg", "reproduce", "lava", "--out", str(tmp_path), "--jobs", "2"]
-
-    def hear_ctrl_c():
-        # A job in the background ignores it, and hands that on.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    with subprocess.Popen(
-        command, cwd=REPOSITORY, stderr=subprocess.PIPE, text=True, preexec_fn=hear_ctrl_c
-    ) as process:
-        deadline = time.monotonic() + 120
-        while not list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip")) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)  # a training takes longer
+    process = start(["reproduce", "lava", "--out", str(tmp_path), "--jobs", "2"], tmp_path)
+    wait_for(tmp_path, "runs/*/*/attempt0/checkpoint.zip", process)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)  # a training takes longer
     assert process.returncode == 130
-    assert "the same command continues" in error
-    assert "Traceback" not in error
+    assert "the same command continues" in output
+    assert "Traceback" not in output
     assert list(tmp_path.glob("runs/*/*/attempt0/checkpoint.zip"))
 
 
@@ -266,15 +252,11 @@ def test_ctrl_c_stops_the_workers_and_keeps_what_is_done(tmp_path):
 def test_the_workers_of_a_command_that_is_killed_end_with_it(storage, tmp_path):
     if storage:
         pytest.importorskip("optuna")
-    command = [sys.executable, "-m", "sb3_tdpg", "sweep", "--env", "Lava-v0", "--betas", "inf", "--seeds", "2"]
-    command += ["--jobs", "2", "--cost-limit", "40", "--out", str(tmp_path), *storage]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE) as process:
-        deadline = time.monotonic() + 120
-        while not list(tmp_path.glob("runs/*/attempt0/*")) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        process.kill()
-        process.communicate(timeout=20)  # until nobody is left who could write there; a training takes longer
+    command = ["sweep", "--env", "Lava-v0", "--betas", "inf", "--seeds", "2", "--jobs", "2", "--cost-limit", "40"]
+    process = start([*command, "--out", str(tmp_path), *storage], tmp_path)
+    wait_for(tmp_path, "runs/*/attempt0/*", process)
+    process.kill()
+    process.communicate(timeout=20)  # until nobody is left who could write there; a training takes longer
     assert not list(tmp_path.glob("runs/*/episodes.csv"))
 
 
@@ -307,13 +289,6 @@ def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_
     with pytest.raises(ValueError, match="wait for each other"):
         complete_runs([(waits_for_itself, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_the_reproduction_runs_in_worker_processes(tmp_path):
-    arguments = ["reproduce", "lava", "--out", str(tmp_path), "--n-seeds", "1", "--n-paper-seeds", "1", "--jobs", "2"]
-    assert main([*arguments, "--n-timesteps", "2500", "--n-eval-episodes", "4"]) == 0
-    assert len(list(tmp_path.glob("runs/*/*/episodes.csv"))) == 2 * len(METHODS) + len(paper_runs(1))
 
 
 def test_every_method_of_the_reproduction_has_goals_on_both_readings():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from sb3_contrib import RecurrentPPO
+from small_problems import give_settings
 from stable_baselines3 import PPO
 
 from sb3_tdpg.checks import schedule_of
@@ -18,8 +19,7 @@ from sb3_tdpg.paper.common import Method, training_times
 @pytest.fixture
 def tiny(monkeypatch):
     """Small batches."""
-    settings, small = SB3Run.settings.fget, dict(n_envs=4, batch_size=20, n_epochs=1)
-    monkeypatch.setattr(SB3Run, "settings", property(lambda self: {**settings(self), **small}))
+    give_settings(monkeypatch, dict(n_envs=4, batch_size=20, n_epochs=1), SB3Run)
 
 
 @pytest.mark.parametrize(("algo", "cls"), [("ppo", PPO), ("ppo_lstm", RecurrentPPO)])

@@ -1,14 +1,117 @@
-"""Push to the Hub, pull from it, and the errors of both."""
+"""Load a published model with this plugin, with Stable-Baselines3's package and with rl-zoo3; push and pull."""
 
 import importlib
+import json
+import re
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
+import huggingface_hub
+import numpy as np
+import pandas as pd
 import pytest
+import yaml
 from huggingface_hub import errors
-from published_cards import REPO_ID
+from published_cards import REPO_ID, blocks, costs_of
+from small_problems import assert_same_parameters, lava_env, parameters
 
-from sb3_tdpg.hub import pull_from_hub, push_to_hub
+from sb3_tdpg import TDPG
+from sb3_tdpg.hub import load_from_hub, pull_from_hub, push_to_hub
+from sb3_tdpg.hub.model_card import model_name
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def test_the_code_in_the_card_runs_the_policy(card, on_the_hub, capsys):
+    (code,) = blocks(card, "python")
+    exec(code, {})
+    assert re.fullmatch(r"cost \d+\.\d\d\n", capsys.readouterr().out)
+    ((repo_id, filename, _),) = on_the_hub
+    assert (repo_id, filename) == (REPO_ID, "tdpg-Lava-v0.zip")
+
+
+def test_the_block_of_the_guide_loads_the_model(on_the_hub):
+    guide = (REPOSITORY / "docs" / "guide" / "zoo.md").read_text()
+    (code,) = re.findall(r"<!-- no-run -->\n```python\n(from sb3_tdpg\.hub.*?)^```", guide, re.MULTILINE | re.DOTALL)
+    namespace = {}
+    exec(code.replace("me/tdpg-Lava-v0", REPO_ID), namespace)
+    assert isinstance(namespace["model"], TDPG)
+    assert [repo_id for repo_id, *_ in on_the_hub] == [REPO_ID]
+
+
+def test_a_model_from_the_hub_is_the_one_that_was_trained(runs, on_the_hub, monkeypatch):
+    monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
+    model = load_from_hub(REPO_ID, env=lava_env(), revision="main", token="secret", device="cpu", beta=1 / 50)
+    trained = TDPG.load(runs / "tdpg-seed0" / "model.zip", device="cpu")
+    assert_same_parameters(parameters(model.policy), parameters(trained.policy))
+    assert model.env is not None
+    assert model.mi_coef == pytest.approx(50)
+    asked = dict(revision="main", token="secret", library_name="sb3_tdpg")
+    assert on_the_hub == [(REPO_ID, "tdpg-Lava-v0.zip", asked)]
+
+
+@pytest.mark.parametrize(("names", "message"), [
+    (["README.md", "ppo-Lava-v0.zip"], r"has no tdpg-\*.zip: give filename"),
+    (["tdpg-a.zip", "tdpg-b.zip"], r"has several models \(tdpg-a.zip, tdpg-b.zip\): give filename"),
+])  # fmt: skip
+def test_a_repository_without_one_model_is_refused(names, message, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda api, repo_id, revision: names)
+    with pytest.raises(ValueError, match=message):
+        load_from_hub(REPO_ID, trust_remote_code=True)
+
+
+def test_nothing_is_unpickled_without_trust(monkeypatch):
+    for trust, variable in ((None, None), (None, "False"), (False, "True")):
+        if variable is not None:
+            monkeypatch.setenv("TRUST_REMOTE_CODE", variable)
+        with pytest.raises(ValueError, match="if you trust its author, give trust_remote_code=True"):
+            load_from_hub(REPO_ID, "tdpg-Lava-v0.zip", trust_remote_code=trust)  # offline(): nothing is fetched
+
+
+def test_stable_baselines3s_own_package_loads_the_model(card, on_the_hub, monkeypatch):
+    load_as_sb3_does = pytest.importorskip("huggingface_sb3", exc_type=ModuleNotFoundError).load_from_hub
+    monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
+    model = TDPG.load(load_as_sb3_does(REPO_ID, f"{model_name('Lava-v0')}.zip"), device="cpu")
+    assert model.predict(np.zeros(2, np.float32))[0].shape == (1,)
+
+
+def test_the_zoo_finds_all_files_that_it_asks_for(card, tmp_path, monkeypatch):
+    pytest.importorskip("rl_zoo3", exc_type=ModuleNotFoundError)
+    import rl_zoo3.load_from_hub as zoo
+    from rl_zoo3 import get_saved_hyperparams
+
+    def download(repo_id, filename):
+        assert repo_id == REPO_ID
+        if not (card / filename).exists():
+            assert filename == "vec_normalize.pkl", "it cannot do without any other"
+            raise zoo.HTTPError
+        return str(card / filename)
+
+    monkeypatch.setattr(zoo, "load_from_hub", download)
+    zoo.download_from_hub("tdpg", zoo.EnvironmentName("Lava-v0"), 0, str(tmp_path), "someone")
+    folder = tmp_path / "tdpg" / "Lava-v0_1"
+    TDPG.load(folder / "Lava-v0.zip", device="cpu")
+    assert len(pd.read_csv(folder / "progress_00000000.csv")) == 8
+    settings, _ = get_saved_hyperparams(str(folder / "Lava-v0"), test_mode=True)
+    assert settings["beta"] == pytest.approx(1 / 75)
+    assert settings["normalize"] is False
+    assert yaml.safe_load((folder / "Lava-v0" / "args.yml").read_text())["env_kwargs"] == {}
+
+
+def test_results_json_has_the_format_of_the_zoo(card):
+    results = json.loads((card / "results.json").read_text())
+    assert results.pop("eval_datetime")[:2] == "20"
+    costs = costs_of(card)
+    assert results == dict(
+        mean_reward=pytest.approx(-costs.mean()),
+        std_reward=pytest.approx(costs.std()),
+        is_deterministic=False,
+        n_eval_episodes=30,
+    )
+
+
+# -- push and pull ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

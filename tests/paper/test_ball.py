@@ -6,12 +6,11 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
-from small_problems import complete_runs_here
+from small_problems import complete_runs_here, give_settings
 
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.ball_catch import RENDERERS
 from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_DIAGNOSIS
-from sb3_tdpg.experiments.runs import Run
 from sb3_tdpg.features import TRVCnn
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import ball
@@ -21,12 +20,7 @@ from sb3_tdpg.paper import ball
 def tiny(monkeypatch):
     """Small epochs and the fast renderer, in this process."""
     small = dict(n_episodes=4, mi_kwargs={}, mi_estimator="logdet")
-    block = Run.settings.fget
-    monkeypatch.setattr(
-        Run,
-        "settings",
-        property(lambda run: {**block(run), **(small if run.algo == "tdpg" else {})}),
-    )
+    give_settings(monkeypatch, lambda run: small if run.algo == "tdpg" else {})
     monkeypatch.setitem(RENDERERS, "pybullet", RENDERERS["fast"])
     monkeypatch.setattr(ball, "trv_knowledge", partial(ball.trv_knowledge, n_walls=4))
     monkeypatch.setattr(ball, "WALL_ROWS", ball.WALL_ROWS[:10])
@@ -111,11 +105,8 @@ def test_a_group_is_the_mean_of_its_rows():
 
 
 def test_every_goal_is_of_a_row_and_a_method_of_the_table():
-    names = {row.name for row in (*BALL_CATCH, *ball.group_rows(BALL_CATCH))} | {
-        ball.ALL_WALLS,
-        ball.WORST_WALLS,
-        ball.HELD,
-    }
+    names = {row.name for row in (*BALL_CATCH, *ball.group_rows(BALL_CATCH))}
+    names |= {ball.ALL_WALLS, ball.WORST_WALLS, ball.HELD}
     for method, goals in ball.GOALS.items():
         assert method in {m.label for m in ball.methods("fixed") if m.renderer == "pybullet"}
         assert set(goals) <= names
@@ -159,11 +150,7 @@ def test_a_method_differs_from_the_one_line_in_what_its_name_says(launch):
         for method in others
         if method.algo == "tdpg"
     }
-    assert changed == {
-        "PG": {"beta"},
-        "no nuisance": {"nuisance"},
-        "earlier encoder": {"policy_kwargs"},
-    }
+    assert changed == {"PG": {"beta"}, "no nuisance": {"nuisance"}, "earlier encoder": {"policy_kwargs"}}
     for method in others:
         assert settings_of(method)["n_timesteps"] == one_line["n_timesteps"]
         assert settings_of(method)["env_kwargs"] == one_line["env_kwargs"]

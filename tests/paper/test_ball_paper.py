@@ -3,10 +3,9 @@
 import numpy as np
 import pandas as pd
 import pytest
-from small_problems import complete_runs_here, tiny_tdpg, train_epochs
+from small_problems import complete_runs_here, give_settings, tiny_tdpg, train_epochs
 
 from sb3_tdpg.cli import main
-from sb3_tdpg.experiments.runs import Run
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import ball_paper
 
@@ -14,9 +13,7 @@ from sb3_tdpg.paper import ball_paper
 @pytest.fixture
 def tiny(monkeypatch):
     """Epochs of four episodes, two prices, two levels."""
-    block = Run.settings.fget
-    small = dict(n_episodes=4, batch_size=4, mi_kwargs={}, mi_estimator="logdet")
-    monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), **small}))
+    give_settings(monkeypatch, dict(n_episodes=4, batch_size=4, mi_kwargs={}, mi_estimator="logdet"))
     monkeypatch.setattr(ball_paper, "LEVELS", (1e6, 8.7))
     monkeypatch.setattr(ball_paper, "PRICES", (16, 40))
     monkeypatch.setattr(
@@ -27,13 +24,8 @@ def tiny(monkeypatch):
 @pytest.mark.slow
 def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, monkeypatch):
     # Without a limit every epoch may be selected.
-    block = Run.settings.fget
-    no_limit = [{"sb3_tdpg.callbacks.SelectionCallback": dict(cost_limit=1e6)}]
-    monkeypatch.setattr(
-        Run,
-        "settings",
-        property(lambda run: block(run) | (dict(callback=no_limit) if run.method.startswith("TDPG") else {})),
-    )
+    no_limit = dict(callback=[{"sb3_tdpg.callbacks.SelectionCallback": dict(cost_limit=1e6)}])
+    give_settings(monkeypatch, lambda run: no_limit if run.method.startswith("TDPG") else {})
     arguments = ["--n-seeds", "2", "--n-timesteps", "800", "--publish", str(tmp_path / "docs")]
     assert main(["reproduce", "ball-paper", "--out", str(tmp_path / "out"), *arguments]) == 0
     summary = (tmp_path / "out" / "summary.md").read_text()

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch as th
 from information_problems import gaussian_batch, gaussian_information
-from small_problems import complete_runs_here
+from small_problems import complete_runs_here, give_settings
 
 from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.cli import main
@@ -25,8 +25,7 @@ from sb3_tdpg.paper.plots import failures_by_camera, failures_by_yaw
 @pytest.fixture
 def tiny(monkeypatch):
     """Small epochs, in this process."""
-    block = Run.settings.fget
-    monkeypatch.setattr(Run, "settings", property(lambda run: {**block(run), "n_episodes": 8, "batch_size": 8}))
+    give_settings(monkeypatch, dict(n_episodes=8, batch_size=8))
     monkeypatch.setattr(knowledge, "N_MUGS", 100)
     monkeypatch.setattr(knowledge, "FITTED_MUGS", 60)
     short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in knowledge.CRITICS.items()}

@@ -1,19 +1,17 @@
 """``sb3-tdpg train``, ``enjoy``, ``record-video`` and ``plot``: the programs of rl-zoo3 with TDPG as an algorithm."""
 
 import json
-import os
 import pickle
-import re
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from programs import run, start, wait_for
 from small_problems import assert_same_parameters, error_line, parameters, stopped_in_epoch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import load_results
@@ -28,17 +26,7 @@ LAVA = ["--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1", "-
 # Twenty epochs of 20 episodes, with a checkpoint in the tenth.
 SHORT = [*LAVA, "-params", "n_episodes:20", "-n", "2000"]
 FILES = sorted(Path(hyperparams.__file__).parent.glob("*.yml"))
-PATH = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 CARTPOLE = ["-params", "n_episodes:4", "batch_size:100", "-n", "100", "--eval-freq", "-1"]
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Run in an empty folder, since the zoo writes to logs/ in the working directory."""
-    monkeypatch.chdir(tmp_path)
-    # Its plots would open a window.
-    monkeypatch.setenv("MPLBACKEND", "agg")
-    return tmp_path
 
 
 def folder_of(path, n=1, algo="tdpg", env="Lava-v0"):
@@ -82,7 +70,7 @@ def test_our_environments_run_as_a_batch_for_any_algorithm(here, monkeypatch):
 def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     arguments = ["train", *LAVA, "-params", "n_episodes:20", "-n", "8000", "--seed", "1"]
     process = start(arguments, here)
-    wait_for(folder_of(here) / "checkpoint.zip", process)
+    wait_for(here, "logs/tdpg/Lava-v0_1/checkpoint.zip", process)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130, output
@@ -138,7 +126,7 @@ def test_a_killed_training_with_normalised_observations_is_resumed_exactly(here)
     settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
     arguments = ["train", *LAVA, "-params", *settings, "-n", "20000", "--seed", "1"]
     process = start(arguments, here)
-    wait_for(folder_of(here) / "checkpoint.zip", process)
+    wait_for(here, "logs/tdpg/Lava-v0_1/checkpoint.zip", process)
     process.kill()
     process.communicate()
     assert main(["train", "--resume", "logs/tdpg/Lava-v0_1"]) == 0
@@ -156,32 +144,6 @@ def assert_same_training(path):
     if statistics[0].exists():
         resumed, whole = (pickle.loads(file.read_bytes()).obs_rms for file in statistics)
         assert (resumed.mean == whole.mean).all() and (resumed.var == whole.var).all()
-
-
-def start(arguments, folder):
-    return subprocess.Popen(
-        [sys.executable, "-m", "sb3_tdpg", *arguments],
-        cwd=folder, env={**os.environ, **PATH}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        # A shell that runs the tests in the background has it ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
-
-
-def run(command, folder, **environment):
-    """Run Python to its end in a folder."""
-    done = subprocess.run(
-        [sys.executable, *command],
-        cwd=folder, env={**os.environ, **PATH, **environment}, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-
-
-def wait_for(path, process):
-    deadline = time.monotonic() + 120
-    while not path.exists():
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_the_selected_policy_is_saved(here, capsys):
@@ -234,33 +196,6 @@ def test_the_evaluation_uses_the_keywords_of_the_block(here, monkeypatch):
     made.clear()
     assert main([*arguments, "--eval-env-kwargs", "sensor_noise_std:2.0"]) == 0
     assert {kwargs.get("sensor_noise_std") for kwargs in made} == {None, 2.0}
-
-
-BAD = {
-    "environment": (["--env", "Lava-v9"], "Lava-v9 not found .* Lava-v0"),
-    "key": ([*LAVA, "-params", "foo:3"], "foo, which is neither an argument of TDPG .* nor a key of rl-zoo3"),
-    "number as text": (["--env", "Lava-v0", "--conf-file", "text.yml"], "learning_rate: 1e-3.*write 0.001"),
-    "no such file": (["--env", "Lava-v0", "--conf-file", "none.yml"], "none.yml has no readable block .*No such file"),
-    "no YAML": (["--env", "Lava-v0", "--conf-file", "broken.yml"], "broken.yml has no readable block .*while parsing"),
-    "no such block": (["--env", "MountainCar-v0"], "no readable block 'MountainCar-v0' for tdpg .* with --block"),
-    "keyword": (["--env", "Lava-v0", "--env-kwargs", "bar:1"], "cannot be made with env_kwargs={'bar': 1}"),
-    "unquoted text": (["--env", "Lava-v0", "--env-kwargs", "a:violet"], "'violet' is not defined: .* text in quotes"),
-    "setting": ([*LAVA, "-params", "n_episodes:0"], "n_episodes=0 must be an integer of at least 1"),
-    "agent": ([*LAVA, "-i", "none.zip"], "must be a valid path"),
-    "resume": (["--resume", "nothing"], "nothing is not the folder of a training"),
-}
-
-
-@pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
-def test_bad_input_is_reported_in_one_line_and_leaves_nothing(arguments, message, here, capfd):
-    (here / "text.yml").write_text("Lava-v0: {policy: TRVPolicy, n_timesteps: 100, learning_rate: 1e-3}\n")
-    (here / "broken.yml").write_text("Lava-v0: {policy\n")
-    assert main(["train", *arguments]) == 2
-    error = capfd.readouterr().err
-    assert "Traceback" not in error
-    assert re.search(message, error), error
-    assert len([line for line in error.splitlines() if line.startswith("error:")]) == 1
-    assert not list(here.glob("logs/*/*"))
 
 
 @pytest.mark.parametrize("flags, message", [

@@ -6,11 +6,12 @@ import sys
 
 import numpy as np
 import pytest
+from programs import run
 from stable_baselines3.common.monitor import load_results
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.cli import main
-from tests.zoo.test_zoo import folder_of, here, run  # noqa: F401
+from tests.zoo.test_zoo import folder_of
 
 pytest.importorskip("rl_zoo3")
 import optuna
@@ -27,12 +28,6 @@ def loaded(path, env, n=1):
     return TDPG.load(folder_of(path, n, env=env) / f"{env}.zip", device="cpu")
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1", "Lava-v0"])
-def test_a_block_of_ours_trains_for_a_hundred_steps(env, here):  # noqa: F811
-    assert main(["train", "--env", env, "-n", "100", "--verbose", "0"]) == 0
-    assert loaded(here, env).num_timesteps >= 100
-
-
 @pytest.mark.slow
 def test_train_does_not_load_what_only_other_programs_need():
     show = "import sys; print(*(name for name in sys.modules if '.' not in name))"
@@ -43,7 +38,7 @@ def test_train_does_not_load_what_only_other_programs_need():
     assert not {"pandas", "requests"} & (ours - theirs)
 
 
-def test_environments_get_the_keywords_of_the_command_line(here, monkeypatch):  # noqa: F811
+def test_environments_get_the_keywords_of_the_command_line(here, monkeypatch):
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     gravities = {}
@@ -60,14 +55,14 @@ def test_environments_get_the_keywords_of_the_command_line(here, monkeypatch):  
     assert gravities == dict(training=8.0, evaluation=5.0)
 
 
-def test_the_monitor_writes_the_keywords_of_the_block(here):  # noqa: F811
+def test_the_monitor_writes_the_keywords_of_the_block(here):
     keywords = "monitor_kwargs:dict(info_keywords=('TimeLimit.truncated',))"
     command = ["train", "--env", "Pendulum-v1", "-n", "400", "-params", "n_episodes:2", "batch_size:100", keywords]
     assert main([*command, *NO_EVALUATION]) == 0
     assert load_results(str(folder_of(here, env="Pendulum-v1")))["TimeLimit.truncated"].all()
 
 
-def test_an_environment_and_a_block_from_a_package_of_ones_own(here):  # noqa: F811
+def test_an_environment_and_a_block_from_a_package_of_ones_own(here):
     (here / "my_package").mkdir()
     (here / "my_package" / "__init__.py").write_text(
         "from gymnasium.envs.classic_control import PendulumEnv\nfrom gymnasium import register\n"
@@ -91,7 +86,7 @@ def test_an_environment_and_a_block_from_a_package_of_ones_own(here):  # noqa: F
     "frame_stack: 2, normalize: {norm_obs: true, norm_reward: false}",
 ], ids=["one", "history", "noise", "stack", "stack and monitor", "stack and normalize"])  # fmt: skip
 @pytest.mark.parametrize("env", ["Pendulum-v1", "Lava-v0"])
-def test_wrappers_of_the_zoo(env, wrappers, here):  # noqa: F811
+def test_wrappers_of_the_zoo(env, wrappers, here):
     (here / "mine.yml").write_text(f"{env}: {{{BLOCK}, {wrappers}}}\n")
     assert main(["train", "--env", env, "--conf-file", "mine.yml", "-n", "200", "--verbose", "0"]) == 0
     model = loaded(here, env)
@@ -101,7 +96,7 @@ def test_wrappers_of_the_zoo(env, wrappers, here):  # noqa: F811
     assert main(["enjoy", "--env", env, "--no-render", "-n", "200"]) == 0
 
 
-def test_the_raw_statistics_of_episodes_go_to_tensorboard(here):  # noqa: F811
+def test_the_raw_statistics_of_episodes_go_to_tensorboard(here):
     callback = "callback:'rl_zoo3.callbacks.RawStatisticsCallback'"
     command = ["train", "--env", "Pendulum-v1", "-n", "800", "-params", "n_episodes:2", "batch_size:100", callback]
     assert main([*command, "--tensorboard-log", "tensorboard", *NO_EVALUATION]) == 0
@@ -112,7 +107,7 @@ def test_the_raw_statistics_of_episodes_go_to_tensorboard(here):  # noqa: F811
     np.testing.assert_allclose(sorted(returns), sorted(monitored), rtol=1e-4)
 
 
-def test_enjoy_takes_the_best_model_and_the_checkpoints(here, capsys):  # noqa: F811
+def test_enjoy_takes_the_best_model_and_the_checkpoints(here, capsys):
     command = ["train", "--env", "CartPole-v1", "-params", "n_envs:1", "n_episodes:2", "batch_size:100", "-P"]
     assert main([*command, "-n", "1000", "-f", "elsewhere", "--eval-freq", "500", "--save-freq", "500"]) == 0
     enjoy = ["enjoy", "--env", "CartPole-v1", "-f", "elsewhere", "--no-render", "-n", "100"]
@@ -127,7 +122,7 @@ def test_enjoy_takes_the_best_model_and_the_checkpoints(here, capsys):  # noqa: 
 
 
 @pytest.mark.slow
-def test_the_zoos_benchmark_evaluates_tdpg(here):  # noqa: F811
+def test_the_zoos_benchmark_evaluates_tdpg(here):
     """The benchmark runs enjoy.py of its working directory, here the script of a third-party algorithm."""
     assert main(["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "-n", "100", "-params", "n_episodes:20",
                  *NO_EVALUATION]) == 0  # fmt: skip
@@ -141,7 +136,7 @@ def test_the_zoos_benchmark_evaluates_tdpg(here):  # noqa: F811
     assert "|tdpg|Lava-v0|" in (here / "benchmark" / "benchmark.md").read_text().replace(" ", "")
 
 
-def test_workers_one_after_the_other_stop_at_the_total_of_trials(here):  # noqa: F811
+def test_workers_one_after_the_other_stop_at_the_total_of_trials(here):
     command = ["tune", "--env", "Pendulum-v1", "-n", "400", "-params", "n_envs:1", "n_episodes:2", "batch_size:100"]
     command += ["--n-evaluations", "1", "--seed", "12", "--eval-episodes", "40", "--max-total-trials", "3"]
     for n_trials in ("2", "2"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch as th
 from torch import nn
@@ -41,37 +42,21 @@ def fit_one_by_one(
 
 def bench_critics(sizes: Sizes) -> Iterable[Row]:
     """Compare one batched network with a loop over T critics, at the sizes of Lava and of grasping."""
+    return [_compare_critics(sizes, *of_problem) for of_problem in ((5, 32, 50), (25, 64, 20))]
+
+
+def _compare_critics(sizes: Sizes, horizon: int, hidden: int, size: int) -> Row:
     n_steps = 20 * sizes.epochs
-    for horizon, hidden, size in ((5, 32, 50), (25, 64, 20)):
-        batch = correlated_gaussians(horizon, 500)
-        mine = Mine(
-            horizon,
-            2,
-            2,
-            hidden_sizes=(hidden, hidden),
-            batch_size=size,
-            gradient_steps=n_steps,
-            warmup_gradient_steps=n_steps,
-        )
-        critics = unbatch(mine.critic)
-        optimizers = [th.optim.Adam(critic.parameters(), lr=mine.learning_rate) for critic in critics]
-
-        def fit_batched(mine: Mine = mine, batch: InformationBatch = batch) -> float:
-            return seconds(lambda: mine.fit(batch), n_steps)
-
-        def fit_loop(
-            critics: list[nn.Sequential] = critics,
-            optimizers: list[th.optim.Adam] = optimizers,
-            batch: InformationBatch = batch,
-            size: int = size,
-        ) -> float:
-            return seconds(lambda: fit_one_by_one(critics, optimizers, batch, size, n_steps), n_steps)
-
-        yield compare(
-            f"gradient step of the critics, T={horizon}, hidden {hidden}-{hidden}, B={size}: "
-            "batched against a loop over critics",
-            fit_batched,
-            fit_loop,
-            sizes.repetitions,
-            goal=5,
-        )
+    batch = correlated_gaussians(horizon, 500)
+    settings: dict[str, Any] = dict(hidden_sizes=(hidden, hidden), batch_size=size)
+    mine = Mine(horizon, 2, 2, gradient_steps=n_steps, warmup_gradient_steps=n_steps, **settings)
+    critics = unbatch(mine.critic)
+    optimizers = [th.optim.Adam(critic.parameters(), lr=mine.learning_rate) for critic in critics]
+    return compare(
+        f"gradient step of the critics, T={horizon}, hidden {hidden}-{hidden}, B={size}: "
+        "batched against a loop over critics",
+        lambda: seconds(lambda: mine.fit(batch), n_steps),
+        lambda: seconds(lambda: fit_one_by_one(critics, optimizers, batch, size, n_steps), n_steps),
+        sizes.repetitions,
+        goal=5,
+    )

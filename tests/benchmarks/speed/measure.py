@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import quantile_test
 
+from sb3_tdpg.common.markdown import markdown_table
+
 SEED = 0
 
 
@@ -37,11 +39,6 @@ class Row(NamedTuple):
     lowest: float  # of the interval of the ratio
     highest: float
     goal: float | None
-
-    @property
-    def met(self) -> str:
-        """Whether the goal is met."""
-        return "-" if self.goal is None else "yes" if self.ratio >= self.goal else "no"
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float]:
@@ -75,14 +72,8 @@ def compare(
         for function, times in ((ours, our_times), (reference, reference_times))[:: 1 if i % 2 == 0 else -1]:
             times.append(function())
     ratios = [theirs / mine for mine, theirs in zip(our_times, reference_times, strict=True)]
-    row = Row(
-        what,
-        statistics.median(our_times),
-        statistics.median(reference_times),
-        statistics.median(ratios),
-        *median_interval(ratios),
-        goal,
-    )
+    medians = map(statistics.median, (our_times, reference_times, ratios))
+    row = Row(what, *medians, *median_interval(ratios), goal)
     print(f"{row.what}: {format_interval(row)}", flush=True)
     return row
 
@@ -114,9 +105,8 @@ def format_interval(row: Row) -> str:
 
 def format_table(rows: Iterable[Row]) -> str:
     """Lay out the rows as a Markdown table."""
-    lines = ["| what | ours | reference | ratio (interval) | goal | met |", "|---|---|---|---|---|---|"]
+    lines = []
     for row in rows:
-        goal = "-" if row.goal is None else f"{row.goal:g}x"
-        times = f"{format_time(row.ours)} | {format_time(row.reference)}"
-        lines.append(f"| {row.what} | {times} | {format_interval(row)} | {goal} | {row.met} |")
-    return "\n".join(lines)
+        met = ["-", "-"] if row.goal is None else [f"{row.goal:g}x", "yes" if row.ratio >= row.goal else "no"]
+        lines.append([row.what, format_time(row.ours), format_time(row.reference), format_interval(row), *met])
+    return markdown_table(lines, ["what", "ours", "reference", "ratio (interval)", "goal", "met"])

@@ -13,18 +13,16 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.experiments.public import trainings
-from sb3_tdpg.experiments.public.page import TABLES, Records
-from sb3_tdpg.experiments.public.study import make_trainings
-from sb3_tdpg.experiments.public.tasks import TASKS
-from sb3_tdpg.experiments.public.trainings import LABEL, LIMIT, PRESET, Training, complete_training, with_limit
+from sb3_tdpg.paper import public_trainings
+from sb3_tdpg.paper.public import Records, make_trainings
+from sb3_tdpg.paper.public_trainings import LIMIT, PRESET, TASKS, Training, complete_training, with_limit
 
 CARTPOLE = TASKS[0]
 
 
 @pytest.fixture(autouse=True)
 def _few_episodes(monkeypatch):
-    monkeypatch.setattr(trainings, "N_EVAL_ENVS", 3)
+    monkeypatch.setattr(public_trainings, "N_EVAL_ENVS", 3)
 
 
 def trained(root, method=PRESET, seed=200):
@@ -68,7 +66,7 @@ def test_a_task_of_popgym_which_keeps_its_state_to_itself_can_be_trained_on():
 def test_a_finished_training_is_kept_and_has_all_records(method, tmp_path):
     training, folder = trained(tmp_path, method)
     records = Records([training], tmp_path)
-    assert set(records.times[LABEL].itertuples(index=False, name=None)) == {training.label}
+    assert records.times[list(training.labels)].to_dict("records") == [training.labels]
     assert records.times["timesteps"][0] >= 400
     assert records.times["nats"].notna()[0] == (method == PRESET)
     assert records.episodes.groupby("deterministic").size().to_dict() == {True: 3, False: 3}
@@ -82,12 +80,12 @@ def test_a_finished_training_is_kept_and_has_all_records(method, tmp_path):
 
 def test_the_page_has_a_table_for_each_question(tmp_path):
     records = Records([trained(tmp_path)[0], trained(tmp_path, "PPO")[0]], tmp_path)
-    for name in TABLES:
+    for name in ("episodes", "times", "curves"):
         table = getattr(records, name)
         hidden = table.replace({"method": {"PPO": "RecurrentPPO"}}).assign(env_id="CartPoleNoVel-v1")
         limited = table[table["method"] == PRESET].assign(method=LIMIT)
         setattr(records, name, pd.concat([table, hidden, limited], ignore_index=True))
-    summary = records.write(tmp_path / "out", "sb3-tdpg reproduce public")
+    summary = records.write(tmp_path / "out")
     assert (tmp_path / "out" / "summary.md").read_text() == summary
     for part in ("## Final returns", "## Cost limit", "| kept |", "## CPU time", "`sb3-tdpg reproduce public` at"):
         assert part in summary

@@ -1,4 +1,4 @@
-"""One training on a public task, and its evaluation: ours, or PPO and RecurrentPPO through rl-zoo3."""
+"""Public tasks, and one training on one of them with its evaluation: ours, or PPO and RecurrentPPO through rl-zoo3."""
 
 from __future__ import annotations
 
@@ -6,35 +6,106 @@ import argparse
 import io
 import json
 import time
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pandas as pd
+import rl_zoo3.import_envs  # registers CartPoleNoVel-v1 and PendulumNoVel-v1
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, jsonable, write_frame_atomically, write_run_config
-from sb3_tdpg.experiments.public.tasks import PublicTask
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.information.logdet import LogDet
 
+N_HOPPER_POSITIONS = 5  # of an observation; the other components are velocities
 N_EVAL_ENVS = 10
 EVAL_SEED = 10_000  # its environments are seeded alike for all methods
-N_CURVE_POINTS = 50
 
-LABEL = ["env_id", "method", "train_seed"]
 PRESET, TUNED, LIMIT = "TDPG, one preset", "TDPG, tuned", "TDPG, cost limit"
 """Methods: without any setting; with the block of ``hyperparams/tdpg.yml``; with a limit, see :func:`with_limit`."""
 SHARE = 0.95  # of the return
+
+
+@dataclass(frozen=True)
+class PublicTask:
+    """
+    A task that others made.
+
+    :param env_id: Its registered id.
+    :param block: Block of rl-zoo3's settings, where it is of an older version of the environment or of a similar one.
+    :param n_timesteps: Length of a training, the same for all methods.
+    :param hidden: Whether a memory is needed: the rival is RecurrentPPO instead of PPO.
+    :param tuned: Block of ``hyperparams/tdpg.yml``.
+    """
+
+    env_id: str
+    block: str
+    n_timesteps: int = 100_000
+    hidden: bool = False
+    tuned: str | None = None
+
+    @property
+    def rival(self) -> str:
+        """The method to compare with."""
+        return "RecurrentPPO" if self.hidden else "PPO"
+
+    def zoo_block(self) -> dict[str, Any]:
+        """Read rl-zoo3's settings for the rival."""
+        file = Path(rl_zoo3.__file__).parent / "hyperparams" / ("ppo_lstm.yml" if self.hidden else "ppo.yml")
+        block = dict(yaml.safe_load(file.read_text())[self.block])
+        if isinstance(gym.spec(self.env_id).make().observation_space, gym.spaces.Discrete):
+            block.pop("normalize")  # VecNormalize refuses it
+        return block
+
+
+TASKS = (
+    PublicTask("CartPole-v1", "CartPole-v1"),
+    PublicTask("Acrobot-v1", "Acrobot-v1", tuned="Acrobot-v1"),
+    PublicTask("Pendulum-v1", "Pendulum-v1"),
+    PublicTask("MountainCarContinuous-v0", "MountainCarContinuous-v0", 20_000),
+    PublicTask("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v2"),
+    PublicTask("Reacher-v5", "Reacher-v2"),
+    PublicTask("Hopper-v5", "Hopper-v4"),
+    PublicTask("HalfCheetah-v5", "HalfCheetah-v4"),
+    PublicTask("Swimmer-v5", "Swimmer-v4", tuned="Swimmer-v5"),
+    PublicTask("CartPoleNoVel-v1", "CartPoleNoVel-v1", hidden=True),
+    PublicTask("PendulumNoVel-v1", "PendulumNoVel-v1", hidden=True),
+    PublicTask("HopperNoVel-v5", "Hopper-v4", hidden=True),
+    # rl-zoo3 has no settings for POPGym: those of the nearest task.
+    PublicTask("NoisyPositionOnlyCartPoleEasy-v0", "CartPoleNoVel-v1", hidden=True),
+    PublicTask("RepeatPreviousEasy-v0", "CartPoleNoVel-v1", hidden=True),
+)
+
+
+def make_hopper_without_velocities(**kwargs: Any) -> gym.Env:
+    """Make Hopper-v5 with the first components of its observation, the positions, only."""
+    env = gym.make("Hopper-v5", **kwargs)
+    full: Any = env.observation_space
+    low, high = (bound[:N_HOPPER_POSITIONS] for bound in (full.low, full.high))
+    space = gym.spaces.Box(low, high, dtype=np.float64)
+    return gym.wrappers.TransformObservation(env, lambda y: y[:N_HOPPER_POSITIONS], space)
+
+
+gym.register("HopperNoVel-v5", make_hopper_without_velocities, max_episode_steps=1000)
+# POPGym's environments end by themselves but declare no time limit, which TDPG needs.
+for _module, _name, _horizon in (
+    ("noisy_position_only_cartpole", "NoisyPositionOnlyCartPoleEasy", 200),
+    ("repeat_previous", "RepeatPreviousEasy", 51),
+):
+    gym.register(f"{_name}-v0", f"popgym.envs.{_module}:{_name}", max_episode_steps=_horizon)
 
 
 @dataclass(frozen=True)
@@ -60,9 +131,9 @@ class Training:
         return {**asdict(self), "task": task, "settings": settings}
 
     @property
-    def label(self) -> tuple[str, str, int]:
-        """The values of the columns ``LABEL`` in all records."""
-        return self.task.env_id, self.method, self.seed
+    def labels(self) -> dict[str, Any]:
+        """The columns that all records have."""
+        return dict(env_id=self.task.env_id, method=self.method, train_seed=self.seed)
 
     @property
     def folder_name(self) -> str:
@@ -83,10 +154,6 @@ class EpisodeLog(BaseCallback):
                 self.rows.append((self.num_timesteps, float(episode["r"]), int(episode["l"])))
         return True
 
-    def frame(self) -> pd.DataFrame:
-        """Return the episodes, one row each."""
-        return pd.DataFrame(self.rows, columns=["timestep", "return", "length"])
-
 
 def complete_training(training: Training, root: Path) -> Path:
     """Train and evaluate, unless ``episodes.csv``, written last, says that this is done."""
@@ -96,12 +163,14 @@ def complete_training(training: Training, root: Path) -> Path:
         return folder
     write_run_config(folder / "config.json", training.config)
     log, start = EpisodeLog(), time.perf_counter()
-    model, cpu_s = train_ours(training, log) if training.settings is not None else train_rival(training, log, folder)
-    record: dict[str, Any] = dict(cpu_s=cpu_s, wall_s=time.perf_counter() - start, timesteps=model.num_timesteps)
-    record["nats"] = nats_per_step(model) if isinstance(model, TDPG) else None
+    model, learn = _ours(training, log) if training.settings is not None else _rival(training, log, folder)
+    cpu_start = time.process_time()
+    learn()
+    record: dict[str, Any] = dict(cpu_s=time.process_time() - cpu_start, wall_s=time.perf_counter() - start)
+    record.update(timesteps=model.num_timesteps, nats=nats_per_step(model) if isinstance(model, TDPG) else None)
     write_atomically(folder / "time.json", json.dumps(jsonable(record)))
     model.save(folder / "model.zip")
-    write_frame_atomically(log.frame(), folder / "training.csv")
+    write_frame_atomically(pd.DataFrame(log.rows, columns=["timestep", "return", "length"]), folder / "training.csv")
     write_frame_atomically(evaluate(training, model), folder / "episodes.csv")
     return folder
 
@@ -114,21 +183,16 @@ def with_limit(training: Training, root: Path) -> Training:
     return replace(training, method=LIMIT, settings=dict(cost_limit=float(f"{limit:.4g}")))
 
 
-def train_ours(training: Training, log: EpisodeLog) -> tuple[BaseAlgorithm, float]:
-    """Train TDPG as a user would; return the model and the CPU time of ``learn``."""
-    assert training.settings is not None
-    task = training.task
-    block = {"policy": "TRVPolicy", "n_timesteps": task.n_timesteps, **training.settings}
-    model, callbacks, n_timesteps = make_training(task.env_id, block, seed=training.seed, device="cpu")
-    start = time.process_time()
-    model.learn(n_timesteps, [*callbacks, log])
-    return model, time.process_time() - start
+def _ours(training: Training, log: EpisodeLog) -> tuple[BaseAlgorithm, Callable[[], Any]]:
+    """Make TDPG as a user would; return the model, and a function that trains it."""
+    block = {"policy": "TRVPolicy", "n_timesteps": training.task.n_timesteps, **(training.settings or {})}
+    model, callbacks, n_timesteps = make_training(training.task.env_id, block, seed=training.seed, device="cpu")
+    return model, lambda: model.learn(n_timesteps, [*callbacks, log])
 
 
-def train_rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[BaseAlgorithm, float]:
-    """Train PPO or RecurrentPPO by rl-zoo3, with its settings for the task."""
-    task = training.task
-    blocks = folder / "zoo.yml"
+def _rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[BaseAlgorithm, Callable[[], Any]]:
+    """Make PPO or RecurrentPPO by rl-zoo3, with its settings for the task."""
+    task, blocks = training.task, folder / "zoo.yml"
     write_atomically(blocks, yaml.safe_dump({task.env_id: task.zoo_block()}))
     manager = ExperimentManager(
         argparse.Namespace(),
@@ -146,11 +210,8 @@ def train_rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[Base
     with redirect_stdout(io.StringIO()):  # it prints its settings
         ready = manager.setup_experiment()
     assert ready is not None
-    model, _ = ready
     manager.callbacks.append(log)
-    start = time.process_time()
-    manager.learn(model)
-    return model, time.process_time() - start
+    return ready[0], lambda: manager.learn(ready[0])
 
 
 def nats_per_step(model: TDPG) -> float:
@@ -162,27 +223,16 @@ def nats_per_step(model: TDPG) -> float:
 def evaluate(training: Training, model: BaseAlgorithm) -> pd.DataFrame:
     """Return the returns of evaluation episodes, with and without noise in the policy: one row for each."""
     env = make_vec_env(training.task.env_id, n_envs=N_EVAL_ENVS)
-    trained_in = model.get_env()
-    assert trained_in is not None
-    norm = unwrap_vec_normalize(trained_in)
-    if norm is not None:
+    if (norm := model.get_vec_normalize_env()) is not None:
         env = VecNormalize(env, training=False, norm_reward=False)
         env.obs_rms = norm.obs_rms
     frames = []
-    returns: Any
     for deterministic in (True, False):
         env.seed(EVAL_SEED)
+        returns: Any
         returns, lengths = evaluate_policy(
             model, env, training.n_eval_episodes, deterministic, return_episode_rewards=True
         )
-        frames.append(pd.DataFrame({"episode": range(len(returns)), "return": returns, "length": lengths}))
-        frames[-1]["deterministic"] = deterministic
-    return pd.concat(frames, ignore_index=True).assign(**dict(zip(LABEL, training.label, strict=True)))
-
-
-def learning_curve(folder: Path, n_timesteps: int) -> pd.DataFrame:
-    """Average the returns of a training's episodes over equal numbers of steps."""
-    episodes = pd.read_csv(folder / "training.csv")
-    width = n_timesteps // N_CURVE_POINTS
-    episodes["timestep"] = ((episodes["timestep"] - 1) // width + 1) * width
-    return episodes.groupby("timestep", as_index=False)["return"].mean()
+        frame = pd.DataFrame({"episode": range(len(returns)), "return": returns, "length": lengths})
+        frames.append(frame.assign(deterministic=deterministic))
+    return pd.concat(frames, ignore_index=True).assign(**training.labels)

@@ -1,25 +1,90 @@
-"""Tables and the figure of the study on public tasks, from the folders of finished trainings."""
+"""The study on public tasks: our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from concurrent.futures import as_completed
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from scipy.stats import trim_mean
+from tqdm import tqdm
 
-from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
-from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
+from sb3_tdpg.common.processes import process_pool
+from sb3_tdpg.common.provenance import write_frame_atomically
+from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.evaluation import save_figure
 from sb3_tdpg.evaluation.figures import PALETTE, WIDTH, new_panels
 from sb3_tdpg.evaluation.statistics import interquartile_means, probabilities_of_improvement
-from sb3_tdpg.experiments.public.tasks import TASKS, PublicTask
-from sb3_tdpg.experiments.public.trainings import LABEL, LIMIT, PRESET, SHARE, TUNED, Training, learning_curve
+from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.paper import common
+from sb3_tdpg.paper.public_trainings import (
+    LIMIT,
+    PRESET,
+    SHARE,
+    TASKS,
+    TUNED,
+    PublicTask,
+    Training,
+    complete_training,
+    with_limit,
+)
 
-TABLES = ("episodes", "times", "curves")
+FIRST_SEED = 200  # those below were used for tuning
+N_CURVE_POINTS = 50
+
+
+def make_trainings(seeds: Sequence[int], n_eval_episodes: int = 100, n_timesteps: int | None = None) -> list[Training]:
+    """List all trainings, seed by seed, so that an interrupted call has the same seeds of all methods."""
+    trainings = []
+    for seed in seeds:
+        for listed in TASKS:
+            task = replace(listed, n_timesteps=n_timesteps or listed.n_timesteps)
+            methods: dict[str, dict[str, Any] | None] = {PRESET: {}, task.rival: None}
+            if task.tuned is not None:
+                methods[TUNED] = {**load_hyperparams(task.tuned), "n_timesteps": task.n_timesteps}
+            trainings += [Training(task, name, seed, how, n_eval_episodes) for name, how in methods.items()]
+    return trainings
+
+
+def complete(training: Training, root: Path) -> list[Training]:
+    """Complete a training, and after that of the preset the one with a limit; return what is finished."""
+    complete_training(training, root)
+    if training.method != PRESET:
+        return [training]
+    limited = with_limit(training, root)
+    complete_training(limited, root)
+    return [training, limited]
+
+
+def reproduce_public(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
+    """
+    Train all methods on all tasks, and compare the returns.
+
+    It needs the extra ``public`` of the package. Each training has one thread.
+
+    :param out: Folder of the trainings, and of ``summary.md``, ``curves.png``, ``config.json`` and the records.
+    :param n_seeds: Training seeds of each method.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`; 100 episodes by default, with and without the noise of
+        the policy each.
+    :return: the summary, as Markdown
+    """
+    given = common.Options(**{"n_eval_episodes": 100, **options})
+    trainings = make_trainings(range(FIRST_SEED, FIRST_SEED + n_seeds), given.n_eval_episodes, given.n_timesteps)
+    n_jobs = given.jobs or usable_cores()
+    with tqdm(total=len(trainings), unit="training") as progress, process_pool(n_jobs) as pool:
+        tasks = [pool.submit(complete, each, out) for each in trainings]
+        for task in as_completed(tasks):
+            progress.set_postfix_str(task.result()[0].folder_name)
+            progress.update()
+    finished = [done for task in tasks for done in task.result()]
+    return Records(finished, out).write(out, given.publish)
 
 
 class Records:
@@ -31,18 +96,17 @@ class Records:
     """
 
     def __init__(self, trainings: Sequence[Training], root: Path) -> None:
-        folders = [root / each.folder_name for each in trainings]
-        self.episodes = _joined([pd.read_csv(folder / "episodes.csv") for folder in folders])
+        self.runs: list[Any] = [(each, root / each.folder_name, ()) for each in trainings]  # no rows of scenarios
+        self.episodes = common.read_records(self.runs)
         times, curves = [], []
-        for each, folder in zip(trainings, folders, strict=True):
-            label = dict(zip(LABEL, each.label, strict=True))
+        for each, folder, _ in self.runs:
             made = json.loads((folder / "config.json").read_text())["provenance"]
             git = made["git"] or dict(commit="", dirty=False)
             origin = dict(commit=git["commit"][:7] + "+" * git["dirty"], date=made["utc_time"][:10])
-            times.append({**label, **json.loads((folder / "time.json").read_text()), **origin})
-            curves.append(learning_curve(folder, each.task.n_timesteps).assign(**label))
+            times.append({**each.labels, **json.loads((folder / "time.json").read_text()), **origin})
+            curves.append(learning_curve(folder, each.task.n_timesteps).assign(**each.labels))
         self.times = pd.DataFrame(times)
-        self.curves = _joined(curves)
+        self.curves = pd.concat(curves, ignore_index=True)
 
     @property
     def tasks(self) -> list[PublicTask]:
@@ -56,29 +120,14 @@ class Records:
         frame = frame[frame["deterministic"] == deterministic]
         return frame.groupby("train_seed")["return"].mean().to_numpy()
 
-    def write(self, out: Path, command: str) -> str:
+    def write(self, out: Path, publish: Path | None = None) -> str:
         """Write the records, ``config.json``, ``curves.png`` and ``summary.md``, and return the latter."""
-        how = provenance()  # before the files below change the checkout
-        for name in TABLES:
+        for name in ("episodes", "times", "curves"):
             write_frame_atomically(getattr(self, name).round(3), out / f"{name}.csv.xz")
         save_figure(self.figure(), out / "curves.png")
-        write_run_config(out / "config.json", dict(provenance=how))
-        parts = [
-            "# Public tasks",
-            "## Final returns",
-            "With the noise that the policies were trained with:",
-            self.returns_table(False),
-            "Without noise, as `evaluate_policy` evaluates by default:",
-            self.returns_table(True),
-            "## Cost limit",
-            self.limit_table(),
-            "## CPU time",
-            self.time_table(),
-            how_made(command, how, sorted(self.times["commit"].unique())),
-        ]
-        summary = "\n\n".join(parts) + "\n"
-        write_atomically(out / "summary.md", summary)
-        return summary
+        tables = dict(noisy=self.returns_table(False), plain=self.returns_table(True))
+        tables.update(limits=self.limit_table(), times=self.time_table())
+        return common.write_results(out, "public.md", self.runs, "sb3-tdpg reproduce public", publish, **tables)
 
     def returns_table(self, deterministic: bool) -> str:
         """Compare the final returns with those of the rival."""
@@ -86,7 +135,7 @@ class Records:
         for task in self.tasks:
             rival, ours, tuned = (self.means(task, m, deterministic) for m in (task.rival, PRESET, TUNED))
             _, (low,), (high,) = interquartile_means(rival[:, None])
-            (mine,), *_ = interquartile_means(ours[:, None])
+            mine = trim_mean(ours, 0.25)
             better = probabilities_of_improvement(-ours[:, None], -rival[:, None])
             rows.append(
                 {
@@ -110,14 +159,15 @@ class Records:
             if len(kept) == 0:
                 continue
             shares = 1 + (kept - without) / np.abs(without)
+            share = trim_mean(shares, 0.25)
             before, after = (nats[task.env_id, method] for method in (PRESET, LIMIT))
             rows.append(
                 {
                     "task": task.env_id,
                     "without a limit": _interval(without),
                     "with the limit": _interval(kept),
-                    "share kept": f"{_interquartile(shares):.2f} ({shares.min():.2f} to {shares.max():.2f})",
-                    "verdict": "kept" if _interquartile(shares) >= SHARE else "**missed**",
+                    "share kept": f"{share:.2f} ({shares.min():.2f} to {shares.max():.2f})",
+                    "verdict": "kept" if share >= SHARE else "**missed**",
                     "nat a step, without": f"{before:.2f}",
                     "with": f"{after:.2f}",
                 }
@@ -150,32 +200,30 @@ class Records:
         figure, panels = new_panels(WIDTH, 1.9 * n_rows, n_rows, n_columns)
         for axes in panels.flat[len(self.tasks) :]:
             axes.set_visible(False)
+        lines = {}
         for axes, task in zip(panels.flat, self.tasks, strict=False):
             for color, method in zip(PALETTE, (PRESET, task.rival, TUNED), strict=False):
                 curves = self.curves[(self.curves["env_id"] == task.env_id) & (self.curves["method"] == method)]
                 if curves.empty:
                     continue
                 quantiles = curves.groupby("timestep")["return"].quantile([0, 0.5, 1]).unstack()
-                label = "rival" if method == task.rival else method
-                axes.plot(quantiles.index / 1000, quantiles[0.5], color=color, label=label, lw=1.4)
-                axes.fill_between(quantiles.index / 1000, quantiles[0], quantiles[1], color=color, alpha=0.15, lw=0)
+                steps = quantiles.index / 1000
+                name = "rival" if method == task.rival else method
+                (lines[name],) = axes.plot(steps, quantiles[0.5], color=color, lw=1.4)
+                axes.fill_between(steps, quantiles[0], quantiles[1], color=color, alpha=0.15, lw=0)
             axes.set_title(f"{task.env_id}\n(rival: {task.rival})", fontsize=8)
         for axes in panels[-1]:
             axes.set_xlabel("steps (thousands)", fontsize=8)
-        lines = {
-            name: line for axes in panels.flat for line, name in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
         figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)
         return figure
 
 
-def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    filled = [table for table in tables if len(table)]
-    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
-
-
-def _interquartile(scores: np.ndarray) -> float:
-    return float(interquartile_means(scores[:, None])[0][0])
+def learning_curve(folder: Path, n_timesteps: int) -> pd.DataFrame:
+    """Average the returns of a training's episodes over equal numbers of steps."""
+    episodes = pd.read_csv(folder / "training.csv")
+    width = n_timesteps // N_CURVE_POINTS
+    episodes["timestep"] = ((episodes["timestep"] - 1) // width + 1) * width
+    return episodes.groupby("timestep", as_index=False)["return"].mean()
 
 
 def _interval(scores: np.ndarray) -> str:

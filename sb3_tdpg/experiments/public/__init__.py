@@ -1,1 +1,0 @@
-"""TDPG beside PPO and RecurrentPPO on tasks that others made."""
