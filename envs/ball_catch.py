@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from . import checks
 from .ball_scene import IMAGE_SIZE, BallScene
+from .noise import NOISE_MODES, noisy_pixels
 from .pool import SharedEnv
 from .textures import TRAINING_TEXTURE, load_texture
 
@@ -19,23 +20,7 @@ PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highe
 
 # By name, so that PyBullet is imported only where it draws.
 RENDERERS = {"pybullet": ("ball_bullet", "BulletRenderer"), "fast": ("ball_fast", "FastRenderer")}
-NOISE_MODES = ("minmax", "clip")
 NOISE_CHUNK = 64  # images to which noise is added at once: bounds the memory
-
-
-def noisy_pixels(images: np.ndarray, std: float, mode: str, rng: np.random.Generator) -> np.ndarray:
-    """
-    Add Gaussian noise to every pixel of images in [0, 1], ``(N, C, H, W)`` float32, and bring them back to [0, 1].
-
-    ``"minmax"``, as in the paper, subtracts the minimum of each image, then divides by its maximum; ``"clip"`` clips.
-    """
-    noisy: np.ndarray = std * rng.standard_normal(images.shape, dtype=np.float32) + images
-    if mode == "minmax":
-        noisy -= noisy.min(axis=(1, 2, 3), keepdims=True)
-        noisy /= noisy.max(axis=(1, 2, 3), keepdims=True)
-    else:
-        np.clip(noisy, 0, 1, out=noisy)
-    return noisy
 
 
 class BallCatchEnv(SharedEnv):

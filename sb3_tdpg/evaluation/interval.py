@@ -161,18 +161,35 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
-    which holds for any F that is independent of the samples: critics are fitted to some of the episodes and evaluated
-    on the others, by ``critic_bounds`` and ``gaussian_bound``. The larger bound counts. The encoder's density alone
-    gives no lower bound: it bounds the information about the encoder's *input*, which can be larger.
+    which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
+    on the others. There are two kinds, and the larger bound counts:
+
+    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to each half of the episodes and
+      evaluated on the other. Up to 300 episodes are divided in three ways, since each division misses some pairs.
+    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, which is fitted fast and therefore
+      to more episodes: to all but two of eight groups, and evaluated on these two (of five groups with more than 300
+      episodes). It is tighter where states and TRVs are about jointly Gaussian.
+
+    The means over episodes and pairs are taken over all critics of a kind before the logarithm. The encoder's density
+    alone gives no lower bound: it bounds the information about the encoder's *input*, which can be larger.
 
     **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
-    e_t = (x~_{t-1}, y_t) is the input of the encoder with density q: ``log_det_bound``, ``leave_one_out_bound`` and,
-    with the marginal density a of the critic on fresh episodes, :math:`E \log q(\tilde x | e) / a(\tilde x)`.
+    e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
 
-    Each limit is a multiple of the standard error away from its estimate, which depends on the gap between the
-    estimates (``miss_of_each_limit``) and is valid for all bounds of a side together (``joint_quantile``). The
-    confidence is that of each step alone. docs/guide/information.md tells how the bounds are made, and how far they
-    can be trusted.
+    - ``"logdet"``: :class:`~sb3_tdpg.information.logdet.LogDet`, its bias removed by the jackknife;
+    - ``"loo"``: :class:`~sb3_tdpg.information.loo.LeaveOneOut`;
+    - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the marginal density a of the critic, also on
+      fresh episodes.
+
+    Each episode uses the mean over several draws of x~ given e, since the encoder's density is known. Control variates
+    remove the deviation of the noise from its expected mean square. Both reduce the error and change no expectation.
+
+    Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of
+    the probability to miss, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
+    contributions of episodes: means that are too low come with standard errors that are too small. The shares depend on
+    the gap between the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since
+    the tightest is chosen (``joint_quantile``). The confidence is that of each step alone. Above about ``ln N`` nats
+    the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
     :param confidence: Probability, at least, that the interval of a step contains the truth.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.declared import compare, load_models, write_summary
+from sb3_tdpg.certificates.models import compare, load_models, write_summary
 from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, lava_shift, random_lava_shifts, wall_cost
 from sb3_tdpg.common.markdown import markdown_table
 from sb3_tdpg.common.provenance import write_frame_atomically

@@ -11,7 +11,7 @@ import functools
 
 import numpy as np
 
-from sb3_tdpg.envs.ball_catch import noisy_pixels
+from sb3_tdpg.envs.noise import noisy_pixels
 from sb3_tdpg.envs.textures import random_texture
 from sb3_tdpg.robustness.registry import KEEP, NOTHING, Episode, perturbation
 from sb3_tdpg.robustness.sensor import Sensor

@@ -15,7 +15,7 @@ from torch.distributions import Normal, kl_divergence
 
 from sb3_tdpg.certificates import shifts
 from sb3_tdpg.certificates.certificate import cost_distribution, worst_mean
-from sb3_tdpg.certificates.declared import load_models
+from sb3_tdpg.certificates.models import load_models
 from sb3_tdpg.certificates.shifts import (
     Budget,
     Shift,

@@ -236,3 +236,18 @@ def test_outcomes_and_images_are_the_same_in_another_process(shared):
     final, sums = json.loads(run_python("-c", IN_ANOTHER_PROCESS, input=given).splitlines()[-1])
     np.testing.assert_array_equal(final[::-1], expected)
     np.testing.assert_array_equal(sums[::-1], shared.sensor(states).sum(axis=(1, 2, 3), dtype=float))
+
+
+def test_two_environments_in_one_process_do_not_disturb_each_other(env):
+    states = random_states(6, seed=8)
+    actions = mixed_actions(states)
+    alone, _ = outcomes(env, states, actions)
+    images = env.sensor(states)
+    other = PandaGraspEnv(mug_scale=1.2, friction=0.9, frame_offset=0.0)
+    for i in range(6):
+        outcomes(other, states[i : i + 1] + 0.01, actions[i : i + 1])
+        other.sensor(states[:1])
+        np.testing.assert_array_equal(outcomes(env, states[i : i + 1], actions[i : i + 1])[0][0], alone[i])
+        np.testing.assert_array_equal(env.sensor(states[i : i + 1])[0], images[i])
+    other.close()
+    np.testing.assert_array_equal(outcomes(env, states, actions)[0], alone)
