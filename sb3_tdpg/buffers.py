@@ -1,7 +1,7 @@
 """
 The rollouts of one policy epoch, episode by episode, and what the policy makes of them.
 
-Dimension key: T horizon, N episodes, X state, Z TRVs.
+Dimension key: T horizon, N episodes, E environments, X state, Z TRVs.
 """
 
 from __future__ import annotations
@@ -212,3 +212,59 @@ class EpisodeBuffer(RolloutBuffer):
     def mean_length(self) -> float:
         """Mean number of steps of an episode."""
         return float(self.alive.sum() / self.alive[0].sum())
+
+
+class RunningEpisodes:
+    """
+    The time of each environment, the column of the buffer that its episode fills, and the end of an epoch.
+
+    :param n_envs: E.
+    :param n_episodes: Each environment runs its share of these; ``None``: it begins another episode as long as fewer
+        than ``n_steps`` steps are stored.
+    :param horizon: T.
+    """
+
+    def __init__(self, n_envs: int, n_episodes: int | None, n_steps: int, horizon: int) -> None:
+        self.n_episodes, self.n_steps, self.horizon = n_episodes, n_steps, horizon
+        self.t = np.zeros(n_envs, np.int64)
+        """``(E,)``, t of its current episode."""
+        self.column = np.arange(n_envs)
+        """``(E,)``; -1: the environment has run its last episode."""
+        self._n_columns, self._n_stored = n_envs, 0
+
+    @property
+    def running(self) -> np.ndarray:
+        """The environments whose steps are stored, in order."""
+        return np.flatnonzero(self.column >= 0)
+
+    def advance(self, dones: np.ndarray, infos: Sequence[dict[str, Any]] = ()) -> np.ndarray:
+        """
+        Count a step of the running environments, and give those whose episode is over the next column.
+
+        :param dones: ``(E,)``
+        :param infos: Of the step.
+        :return: the columns of episodes that were lost: RayVecEnv has restarted these environments, and they run them
+            again
+        :raises ValueError: if an episode is longer than the horizon.
+        """
+        running = self.running
+        self._n_stored += running.size
+        self.t = np.where(dones, 0, self.t + 1)
+        lost = []
+        for i in running[dones[running]]:
+            if infos and infos[i].get("episode_lost", False):
+                lost.append(self.column[i])
+            elif self.n_episodes is not None:
+                following = self.column[i] + len(self.column)
+                self.column[i] = following if following < self.n_episodes else -1
+            elif self._n_stored < self.n_steps:
+                self.column[i] = self._n_columns
+                self._n_columns += 1
+            else:
+                self.column[i] = -1
+        if (self.t[self.running] >= self.horizon).any():
+            raise ValueError(
+                f"an episode did not end after horizon={self.horizon} steps: the environment must return "
+                "terminated or truncated there (or declare its true horizon)"
+            )
+        return np.array(lost, np.int64)

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_tdpg.common.files import write_atomically
-from sb3_tdpg.episodic import EpisodicAlgorithm
+from sb3_tdpg.policies import TRVPolicy
 
 if TYPE_CHECKING:
     from sb3_tdpg.tdpg import TDPG
@@ -28,7 +28,7 @@ class TDPGCallback(BaseCallback):
 
     def init_callback(self, model: BaseAlgorithm) -> None:
         """Refuse other algorithms before they start."""
-        if not isinstance(model, EpisodicAlgorithm):
+        if not isinstance(model.policy, TRVPolicy):
             raise ValueError(f"{type(self).__name__} is for TDPG, but the model is a {type(model).__name__}")
         super().init_callback(model)
 
@@ -62,24 +62,7 @@ class MINECallback(TDPGCallback):
             )
 
     def _on_rollout_end(self) -> None:
-        model = self.tdpg
-        # As before train(): a schedule of beta may turn the penalty on with this epoch.
-        model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
-        if not model.needs_information:
-            model.information = None
-            return
-        batch = model.rollout_buffer.episode_batch().information_batch(model.pools_information)
-        diagnostics = model.estimator.fit(batch)
-        with th.no_grad():
-            information = model.estimator(batch).cpu().numpy()  # (T,), nats
-        if model.pools_information:  # one estimate for a step of any time
-            information = information * model.rollout_buffer.mean_length
-        model.information = information
-        self.logger.record("mi/total", float(information.sum()))
-        for name, value in diagnostics.items():
-            self.logger.record(f"mi/{name}", value)
-        for t, value in enumerate(information):
-            self.logger.record(f"mi/t{t:02d}", float(value), exclude=("stdout", "log", "json", "csv"))
+        self.tdpg.fit_critics()
 
 
 class Candidate(NamedTuple):
@@ -198,7 +181,7 @@ class SelectionCallback(TDPGCallback):
             return (candidate.information, candidate.cost) < (best.information, best.cost)
         return candidate.cost < best.cost
 
-    def restore(self, model: EpisodicAlgorithm) -> Candidate:
+    def restore(self, model: TDPG) -> Candidate:
         """
         Put the selected policy into the model.
 
@@ -277,7 +260,7 @@ class TDPGProgressBar(ProgressBarCallback):
             cls._open.pop().pbar.close()
 
     def _on_rollout_end(self) -> None:
-        model = cast(EpisodicAlgorithm, self.model)
+        model = cast("TDPG", self.model)
         shown = f"cost {model.rollout_buffer.episode_costs.mean():.2f}"
         if successes := model.ep_success_buffer:  # of the last stats_window_size episodes
             shown += f", {1 - sum(successes) / len(successes):.0%} failures"

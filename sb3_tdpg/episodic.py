@@ -1,5 +1,5 @@
 """
-On-policy learning from whole episodes: rollouts, environments, saving and resuming.
+On-policy learning from whole episodes: environments, ``learn``, saving, resuming and exporting.
 
 This is what :class:`~sb3_tdpg.TDPG` needs beside its own method, which is in :mod:`sb3_tdpg.tdpg`.
 
@@ -15,72 +15,43 @@ import warnings
 from collections.abc import Collection, Iterable
 from inspect import signature
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdpg.advantages import ValueFunction
-from sb3_tdpg.buffers import EpisodeBuffer, each_part
-from sb3_tdpg.checks import nearest_multiples, refuse_others
+from sb3_tdpg.auto_weight import AutoWeight
+from sb3_tdpg.buffers import EpisodeBuffer
+from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
+from sb3_tdpg.checks import nearest_multiples, refuse_others, warn_if_short
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
+from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information import InformationEstimator
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.problem import Problem, check_numbers, check_observations, named_shapes, read_problem
+from sb3_tdpg.presets import DEFAULTS, Defaults, preset_of
+from sb3_tdpg.problem import Problem, named_shapes, read_problem
 
 SelfEpisodic = TypeVar("SelfEpisodic", bound="EpisodicAlgorithm")
+
+HARDLY_ANY = 0.1  # nats an episode: a seventh of a bit
 
 
 class TrainingDivergedError(ValueError):
     """A loss is NaN or infinite. The model keeps the last good parameters."""
 
 
-class RunningEpisodes:
-    """
-    The column of the buffer that the episode of each environment fills, and the end of an epoch.
-
-    :param n_envs: E.
-    :param n_episodes: Each environment runs its share of these; ``None``: it begins another episode as long as fewer
-        than ``n_steps`` steps are stored.
-    """
-
-    def __init__(self, n_envs: int, n_episodes: int | None, n_steps: int) -> None:
-        self.n_episodes, self.n_steps = n_episodes, n_steps
-        self.column = np.arange(n_envs)
-        """``(E,)``; -1: the environment has run its last episode."""
-        self._n_columns, self._n_stored = n_envs, 0
-
-    @property
-    def running(self) -> np.ndarray:
-        """The environments whose steps are stored, in order."""
-        return np.flatnonzero(self.column >= 0)
-
-    def advance(self, finished: np.ndarray) -> None:
-        """Count a step of the running environments, and give those whose episode is over the next column: ``(E,)``."""
-        self._n_stored += self.running.size
-        for i in np.flatnonzero(finished & (self.column >= 0)):
-            if self.n_episodes is not None:
-                following = self.column[i] + len(self.column)
-                self.column[i] = following if following < self.n_episodes else -1
-            elif self._n_stored < self.n_steps:
-                self.column[i] = self._n_columns
-                self._n_columns += 1
-            else:
-                self.column[i] = -1
-
-
 class EpisodicAlgorithm(OnPolicyAlgorithm):
     """
     An on-policy algorithm that rolls out N whole episodes of a :class:`~sb3_tdpg.TRVPolicy` per epoch.
 
-    A subclass sets ``n_episodes`` and the attributes below, and implements ``train``.
+    The subclass sets the attributes below, and implements ``collect_rollouts``, ``fit_critics`` and ``train``.
     """
 
     policy: TRVPolicy  # type: ignore[assignment]
@@ -94,6 +65,13 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     """Episodes of an epoch."""
     epoch_steps: int | None = None
     """Instead: an epoch ends when its episodes have that many steps."""
+    n_threads: int | None
+    preset: str | None
+    cost_limit: float | str | None
+    auto_weight: AutoWeight | None = None
+    """The weight of the information with ``beta="auto"``."""
+    first_cost: float | None = None
+    """Mean episode cost of the first epoch."""
     # Plain numbers, so that a model that is loaded without an environment can rebuild its networks.
     horizon: int = 0
     state_dim: int = 0
@@ -168,97 +146,14 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
         return with_nuisance(env, self.nuisance)
 
-    # -- rollouts ---------------------------------------------------------------------------------------------
+    # -- what the rollouts need ----------------------------------------------------------------------------------
 
-    def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        rollout_buffer: EpisodeBuffer,  # type: ignore[override]
-        n_rollout_steps: int,
-    ) -> bool:
-        """
-        Roll out N whole episodes with the current policy (line 2 of Algorithm 2).
-
-        Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
-        would favour short ones. With ``epoch_steps`` an environment begins another episode as long as there are fewer
-        steps; the last epoch of ``learn`` takes those that are left, but a tenth of an epoch at least. All environments
-        begin an epoch at t = 0.
-
-        :param env: The training environments.
-        :param callback: Called at each step, and at the beginning and the end.
-        :param rollout_buffer: Receives the episodes.
-        :param n_rollout_steps: Unused: an epoch is a number of episodes.
-        :return: False if a callback asked to stop.
-        """
-        assert self._problem is not None, "the model has no environment: set_env() first"
-        callback.on_rollout_start()
-        self.policy.set_training_mode(False)
-        rollout_buffer.reset()
-        n_envs = env.num_envs
-        obs = self._first_observations(env)
-        states = self._problem.initial_states(env, obs)  # (E, X)
-        trvs = th.zeros(n_envs, self.policy.trv_dim, device=self.device)
-        t = np.zeros(n_envs, np.int64)
-        episodes = RunningEpisodes(n_envs, self.n_episodes, self._steps_of_this_epoch())
-        # An epoch that ends early cannot be continued: leave the environments to be reset.
-        self._last_obs = None
-
-        while (running := episodes.running).size > 0:
-            check_observations(self.observation_space, obs, t)
-            check_numbers("state", states, (self.state_dim,), t)
-            with th.no_grad():
-                step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(t, self.horizon - 1))
-            actions = step.actions.cpu().numpy()
-            env_actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
-            if isinstance(self.action_space, spaces.Box):
-                env_actions = np.clip(env_actions, self.action_space.low, self.action_space.high)
-            with named_shapes(env):
-                new_obs, rewards, dones, infos = cast(Any, env.step(env_actions))
-
-            check_numbers("reward", np.nan_to_num(rewards), (), t)  # train() tells of NaN
-            self.num_timesteps += n_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            self._update_info_buffer(infos, dones)
-
-            stored = {
-                "observations": obs,
-                "states": states,
-                "noise": step.noise.cpu().numpy(),
-                "trvs": step.trvs.cpu().numpy(),
-                "means": step.means.cpu().numpy(),
-                "stds": step.stds.cpu().numpy(),
-                "actions": actions.reshape(n_envs, -1),
-                "costs": -rewards,
-            }
-            columns = episodes.column[running]
-            rollout_buffer.add_step(
-                t[running], columns, **{k: each_part(lambda x: x[running], v) for k, v in stored.items()}
-            )
-            states = self._problem.next_states(env, new_obs, dones, infos)
-            trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
-            t = np.where(dones, 0, t + 1)
-            finished = dones
-            if dones.any() and (lost := np.array([info.get("episode_lost", False) for info in infos])).any():
-                # RayVecEnv has restarted these environments: they run the episode again.
-                rollout_buffer.clear_episodes(columns[lost[running]])
-                finished = dones & ~lost
-            episodes.advance(finished)
-            if (t[episodes.running] >= self.horizon).any():
-                raise ValueError(
-                    f"an episode did not end after horizon={self.horizon} steps: the environment must return "
-                    "terminated or truncated there (or declare its true horizon)"
-                )
-            obs = new_obs
-
-        rollout_buffer.full = True
-        if (t == 0).all():
-            self._last_obs = obs
-        callback.update_locals(locals())
-        callback.on_rollout_end()
-        return True
+    def _clipped(self, actions: np.ndarray) -> np.ndarray:
+        """Return the actions in the shape of the space and within its bounds: ``(E, *action)``."""
+        actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            return np.clip(actions, self.action_space.low, self.action_space.high)
+        return actions
 
     def _first_observations(self, env: VecEnv) -> Any:
         if self._last_obs is None:
@@ -295,6 +190,62 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         )
 
     # -- learn, save, resume ----------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfEpisodic,
+        total_timesteps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "TDPG",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfEpisodic:
+        """
+        Train; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
+
+        After Ctrl-C the model keeps the parameters of the last finished update: it can be used, saved or trained on.
+
+        :param total_timesteps: Environment steps; default: 400 policy epochs for vectors of a short horizon (a million
+            steps on Lava), 75 for images, 100 for depth images and from a horizon of 50 on. Epochs are made of whole
+            episodes: with ``n_episodes`` there are up to an epoch more steps, with ``epoch_steps`` up to an episode of
+            each environment or a tenth of an epoch.
+        :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
+        """
+        if total_timesteps is None:
+            total_timesteps = self._defaults.total_epochs * self.epoch_size
+        warn_if_short(total_timesteps, self.epoch_size)
+        try:
+            with threads(self.n_threads):
+                super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        finally:
+            TDPGProgressBar.close()
+            if self.auto_weight is not None and self.epoch > 0:
+                self.auto_weight.warn_if_never_met()
+        if self.verbose >= 1 and (kept := self._information_kept()) is not None:
+            print(f"Information: {kept}")
+        return self
+
+    def _information_kept(self) -> str | None:
+        """Say what the last epoch has of the information, if it was penalised, and whether that is hardly any."""
+        if self.auto_weight is not None:
+            return self.auto_weight.kept()
+        if self.information is None or not self.rollout_buffer.full:  # a callback has stopped within an epoch
+            return None
+        nats = float(self.information.sum())
+        text = f"{nats:.3g} nats kept, at a cost of {self.rollout_buffer.episode_costs.mean():.3g}"
+        if nats < HARDLY_ANY:
+            text += "; this policy hardly looks at its sensor. If it must, use beta='auto', which keeps the cost low"
+        return text
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        given = callback if isinstance(callback, list) else [callback]
+        callbacks = [c if isinstance(c, BaseCallback) else ConvertCallback(c) for c in given]
+        callbacks = [c for each in callbacks for c in (each.callbacks if isinstance(each, CallbackList) else [each])]
+        first = [c for c in callbacks if isinstance(c, MINECallback)] or [MINECallback()]
+        callbacks = [*first, *(c for c in callbacks if c not in first)]  # the others see the information
+        if progress_bar:
+            callbacks.append(TDPGProgressBar())
+        return super()._init_callback(callbacks)
 
     def _setup_learn(
         self,
@@ -412,6 +363,21 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 f"({' '.join(str(e).split())[:200]})"
             ) from e
 
+    def export(self, path: str | os.PathLike[str], *, format: str | None = None) -> Path:
+        """
+        Write one step of the policy to a file that runs without this package; see
+        :func:`~sb3_tdpg.deployment.export.export_policy`.
+
+        What ``VecNormalize`` does to the observations of the model's environment is part of the file.
+
+        :param path: The file, ``.onnx`` or ``.pt``.
+        :param format: ``"onnx"`` or ``"torchscript"``; default: by the suffix.
+        :return: the file
+        """
+        from sb3_tdpg.deployment.export import export_policy
+
+        return export_policy(self.policy, path, format=format, normalization=self.get_vec_normalize_env())
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_problem", "_has_default_device"]
 
@@ -419,6 +385,10 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         # The estimator's state dict holds its optimiser, too.
         value = [] if self.value_function is None else ["value_function", "value_function.optimizer"]
         return ["policy", "policy.optimizer", "estimator", *value], []
+
+    @property
+    def _defaults(self) -> Defaults:
+        return DEFAULTS[self.preset or preset_of(self.observation_space, None)]
 
 
 def check_policy(policy: Any, aliases: Collection[str]) -> None:

@@ -37,7 +37,7 @@ from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, BatchedLinear, Ti
 from sb3_tdpg.common.running_norms import Changes
 from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
-from sb3_tdpg.presets import POLICY_DEFAULTS, default, fill_in_extractor, fill_in_trvs
+from sb3_tdpg.presets import POLICY_DEFAULTS, PolicyDefaults, default, fill_in_extractor, fill_in_trvs
 
 # Standard deviations of at most 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
@@ -162,7 +162,6 @@ class TRVPolicy(BasePolicy):
         default_arch = dict(encoder=list(defaults.encoder), action_head=list(defaults.action_head))
         self.net_arch = check_net_arch(net_arch, default_arch)
 
-        self.norm = ObservationNorm(observation_space) if self.normalize_observations else None
         self.features_extractor = self.make_features_extractor()
         self.features_dim = self.features_extractor.features_dim
         self.trv_dim, self.skip, self.skip_changes = fill_in_trvs(
@@ -170,20 +169,26 @@ class TRVPolicy(BasePolicy):
         )
         if self.gate and self.skip:
             raise ValueError("policy_kwargs: gate=True and skip=True both decide what the TRVs keep: give one of them")
+        self._build(lr_schedule, defaults)
+
+    def _build(self, lr_schedule: Schedule, defaults: PolicyDefaults) -> None:
+        """Make the networks behind the feature extractor, and the optimiser."""
+        action_space = self.action_space
+        self.norm = ObservationNorm(self.observation_space) if self.normalize_observations else None
         self.changes = Changes(self.features_dim) if self.skip_changes else None
         self.action_dist = make_proba_distribution(flat_action_space(action_space))
         n_outputs = (3 if self.gate else 2) * self.trv_dim
         sizes = [self.trv_dim + self.features_dim, *self.net_arch["encoder"], n_outputs]
-        activation = activation_fn or defaults.encoder_activation_fn
-        self.encoder = TimeMLP(horizon, sizes, activation, time_varying=self.time_varying)
+        activation = self.activation_fn or defaults.encoder_activation_fn
+        self.encoder = TimeMLP(self.horizon, sizes, activation, time_varying=self.time_varying)
         sizes = [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()]
-        activation = activation_fn or defaults.action_head_activation_fn
-        self.action_head = TimeMLP(horizon, sizes, activation, time_varying=self.time_varying)
+        activation = self.activation_fn or defaults.action_head_activation_fn
+        self.action_head = TimeMLP(self.horizon, sizes, activation, time_varying=self.time_varying)
         if defaults.is_long:  # begin near the middle of the actions, and with little else than the features in the TRVs
             self.encoder.scale_output(0.1)
             self.action_head.scale_output(0.1)
-        if action_mean_init is not None:
-            means = check_action_mean(action_mean_init, action_space)
+        if self.action_mean_init is not None:
+            means = check_action_mean(self.action_mean_init, action_space)
             cast(BatchedLinear, self.action_head.mlp.layers[-1]).bias.data[..., : len(means)] = th.as_tensor(means)
         if self.shared_action_noise and isinstance(self.action_dist, DiagGaussianDistribution):
             self.action_log_var = nn.Parameter(th.zeros(self.action_dist.action_dim))

@@ -7,49 +7,39 @@ Dimension key: T horizon, N episodes of an epoch, X state, Z task-relevant varia
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from functools import partial
 from inspect import signature
-from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, cast
 
+import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg import losses
 from sb3_tdpg.advantages import ValueFunction, get_baseline
 from sb3_tdpg.auto_weight import AutoWeight
-from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer
-from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
+from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer, RunningEpisodes, each_part
 from sb3_tdpg.checks import (
-    check_action_space,
     check_arguments,
     check_batch_size,
     check_beta,
-    check_n_envs,
     check_segments,
     refuse_others,
     schedule_of,
-    warn_if_short,
     with_keywords,
 )
-from sb3_tdpg.common.threads import threads
-from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.episodic import EpisodicAlgorithm, check_policy
 from sb3_tdpg.features import pooled_steps
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.presets import DEFAULTS, Defaults, fill_in, preset_of
-from sb3_tdpg.problem import Problem, horizon_of
-from sb3_tdpg.vec_env import make_episodes_env
-
-SelfTDPG = TypeVar("SelfTDPG", bound="TDPG")
-
-HARDLY_ANY = 0.1  # nats an episode: a seventh of a bit
+from sb3_tdpg.presets import Defaults, fill_in, preset_of
+from sb3_tdpg.problem import Problem, check_numbers, check_observations, horizon_of, named_shapes
+from sb3_tdpg.vec_env import made_env
 
 
 class TDPG(EpisodicAlgorithm):
@@ -128,6 +118,18 @@ class TDPG(EpisodicAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TRVPolicy": TRVPolicy}
     values_see_changes = False
+    # The arguments with which an update is made, with their defaults filled in.
+    beta: float | Schedule | str
+    mi_estimator: str | type[InformationEstimator]
+    mi_kwargs: dict[str, Any]
+    baseline: str
+    encoder_gradient: str
+    bptt_steps: int | None
+    n_epochs: int
+    batch_size: int | None
+    clip_range: Any
+    target_kl: float
+    normalize_advantage: bool
 
     def __init__(
         self,
@@ -166,15 +168,7 @@ class TDPG(EpisodicAlgorithm):
     ) -> None:
         given = {name: value for name, value in locals().items() if name in Defaults._fields}
         refuse_others(others, signature(TDPG).parameters)
-        for name, count in (("n_episodes", n_episodes), ("epoch_steps", epoch_steps), ("n_envs", n_envs)):
-            if count is not None:
-                check_count(name, count)
-        if isinstance(env, str):
-            env = make_episodes_env(env, n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps)
-        elif n_envs is not None:
-            check_n_envs(env, n_envs)
-        if env is not None:
-            check_action_space(env.action_space)
+        env = made_env(env, n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps)
         horizon = None if env is None else horizon_of(env)
         # A model that is being loaded has its preset from the file.
         self.preset = None if env is None or not _init_setup_model else preset_of(env.observation_space, horizon)
@@ -186,10 +180,7 @@ class TDPG(EpisodicAlgorithm):
         super().__init__(
             policy=policy,
             env=env,
-            learning_rate=settings["learning_rate"],
-            gamma=settings["gamma"],
-            gae_lambda=settings["gae_lambda"],
-            max_grad_norm=settings["max_grad_norm"],
+            **{name: settings.pop(name) for name in ("learning_rate", "gamma", "gae_lambda", "max_grad_norm")},
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
@@ -197,26 +188,7 @@ class TDPG(EpisodicAlgorithm):
             seed=seed,
             device=device,
         )
-        self.beta: float | Schedule | str = settings["beta"]
-        self.cost_limit = cost_limit
-        self.n_episodes: int | None = settings["n_episodes"]
-        self.epoch_steps: int | None = settings["epoch_steps"]
-        self.mi_estimator: str | type[InformationEstimator] = settings["mi_estimator"]
-        self.mi_kwargs = {} if mi_kwargs is None else mi_kwargs
-        self.baseline: str = settings["baseline"]
-        self.encoder_gradient: str = settings["encoder_gradient"]
-        self.bptt_steps: int | None = settings["bptt_steps"]
-        self.n_epochs: int = settings["n_epochs"]
-        self.batch_size: int | None = settings["batch_size"]
-        self.clip_range: Any = settings["clip_range"]
-        self.target_kl: float = settings["target_kl"]
-        self.normalize_advantage: bool = settings["normalize_advantage"]
-        self.n_threads: int | None = settings["n_threads"]
-        self.nuisance = nuisance
-        self.first_cost: float | None = None
-        """Mean episode cost of the first epoch."""
-        self.auto_weight: AutoWeight | None = None
-        """The weight of the information with ``beta="auto"``."""
+        vars(self).update(settings, mi_kwargs=mi_kwargs or {}, nuisance=nuisance)
         if _init_setup_model:
             self._setup_model()
 
@@ -287,10 +259,6 @@ class TDPG(EpisodicAlgorithm):
             self.auto_weight = AutoWeight(self.cost_limit, by_slack=self.preset == "long", first_cost=self.first_cost)
 
     @property
-    def _defaults(self) -> Defaults:
-        return DEFAULTS[self.preset or preset_of(self.observation_space, None)]
-
-    @property
     def mi_coef(self) -> float:
         """1 / beta at the current progress: the weight of the information, in units of cost per nat."""
         if self.auto_weight is not None:
@@ -302,11 +270,97 @@ class TDPG(EpisodicAlgorithm):
         """Whether the information of this epoch's rollouts is used: by the penalty, or to find its weight."""
         return self.auto_weight is not None or self.mi_coef > 0.0
 
-    # -- the update -------------------------------------------------------------------------------------------
+    # -- an epoch ---------------------------------------------------------------------------------------------
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: EpisodeBuffer,  # type: ignore[override]
+        n_rollout_steps: int,
+    ) -> bool:
+        """
+        Roll out N whole episodes with the current policy (line 2 of Algorithm 2).
+
+        Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
+        would favour short ones. With ``epoch_steps`` an environment begins another episode as long as there are fewer
+        steps; the last epoch of ``learn`` takes those that are left, but a tenth of an epoch at least. All environments
+        begin an epoch at t = 0.
+
+        :param env: The training environments.
+        :param callback: Called at each step, and at the beginning and the end.
+        :param rollout_buffer: Receives the episodes.
+        :param n_rollout_steps: Unused: an epoch is a number of episodes.
+        :return: False if a callback asked to stop.
+        """
+        assert self._problem is not None, "the model has no environment: set_env() first"
+        callback.on_rollout_start()
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        obs = self._first_observations(env)
+        states = self._problem.initial_states(env, obs)  # (E, X)
+        trvs = th.zeros(env.num_envs, self.policy.trv_dim, device=self.device)
+        episodes = RunningEpisodes(env.num_envs, self.n_episodes, self._steps_of_this_epoch(), self.horizon)
+        # An epoch that ends early cannot be continued: leave the environments to be reset.
+        self._last_obs = None
+
+        while (running := episodes.running).size > 0:
+            check_observations(self.observation_space, obs, episodes.t)
+            check_numbers("state", states, (self.state_dim,), episodes.t)
+            with th.no_grad():
+                step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(episodes.t, self.horizon - 1))
+            actions = step.actions.cpu().numpy()
+            with named_shapes(env):
+                new_obs, rewards, dones, infos = cast(Any, env.step(self._clipped(actions)))
+            check_numbers("reward", np.nan_to_num(rewards), (), episodes.t)  # train() tells of NaN
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+
+            stored = dict(observations=obs, states=states, actions=actions, costs=-rewards)
+            stored.update((name, getattr(step, name).cpu().numpy()) for name in ("noise", "trvs", "means", "stds"))
+            stored = {name: each_part(lambda x: x[running], value) for name, value in stored.items()}
+            rollout_buffer.add_step(episodes.t[running], episodes.column[running], **stored)
+            rollout_buffer.clear_episodes(episodes.advance(dones, infos))
+            obs, states = new_obs, self._problem.next_states(env, new_obs, dones, infos)
+            trvs = step.trvs * th.as_tensor(~dones[:, None], device=self.device)
+
+        rollout_buffer.full = True
+        if (episodes.t == 0).all():
+            self._last_obs = obs
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def fit_critics(self) -> None:
+        """
+        Fit the mutual-information critics to the rollouts (lines 3 to 5 of Algorithm 2), and set ``information``.
+
+        :class:`~sb3_tdpg.MINECallback` calls it at the end of the rollouts. Without a penalty no critic is trained.
+        """
+        # As before train(): a schedule of beta may turn the penalty on with this epoch.
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        if not self.needs_information:
+            self.information = None
+            return
+        batch = self.rollout_buffer.episode_batch().information_batch(self.pools_information)
+        diagnostics = self.estimator.fit(batch)
+        with th.no_grad():
+            information = self.estimator(batch).cpu().numpy()  # (T,), nats
+        if self.pools_information:  # one estimate for a step of any time
+            information = information * self.rollout_buffer.mean_length
+        self.information = information
+        self.logger.record("mi/total", float(information.sum()))
+        for name, value in diagnostics.items():
+            self.logger.record(f"mi/{name}", value)
+        for t, value in enumerate(information):
+            self.logger.record(f"mi/t{t:02d}", float(value), exclude=("stdout", "log", "json", "csv"))
 
     def train(self) -> None:
         """
-        Update encoder and action head from the rollouts of one epoch (line 6 of Algorithm 2).
+        Update encoder and action head from the rollouts (line 6 of Algorithm 2).
 
         :raises TrainingDivergedError: if a cost, the loss or a gradient is NaN or infinite; the parameters stay as they
             were before that step.
@@ -399,76 +453,3 @@ class TDPG(EpisodicAlgorithm):
         size = n_columns if self.policy.time_varying else batch.alive.sum().item()
         n_parts = 1 if self.batch_size is None else math.ceil(size / self.batch_size)
         return batch.partition(min(n_parts, max(1, n_columns // 2)))  # the information needs two columns
-
-    # -- learn and load ---------------------------------------------------------------------------------------
-
-    def learn(
-        self: SelfTDPG,
-        total_timesteps: int | None = None,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "TDPG",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfTDPG:
-        """
-        Train; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
-
-        After Ctrl-C the model keeps the parameters of the last finished update: it can be used, saved or trained on.
-
-        :param total_timesteps: Environment steps; default: 400 policy epochs for vectors of a short horizon (a million
-            steps on Lava), 75 for images, 100 for depth images and from a horizon of 50 on. Epochs are made of whole
-            episodes: with ``n_episodes`` there are up to an epoch more steps, with ``epoch_steps`` up to an episode of
-            each environment or a tenth of an epoch.
-        :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
-        """
-        if total_timesteps is None:
-            total_timesteps = self._defaults.total_epochs * self.epoch_size
-        warn_if_short(total_timesteps, self.epoch_size)
-        try:
-            with threads(self.n_threads):
-                super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        finally:
-            TDPGProgressBar.close()
-            if self.auto_weight is not None and self.epoch > 0:
-                self.auto_weight.warn_if_never_met()
-        if self.verbose >= 1 and (kept := self._information_kept()) is not None:
-            print(f"Information: {kept}")
-        return self
-
-    def _information_kept(self) -> str | None:
-        """Say what the last epoch has of the information, if it was penalised, and whether that is hardly any."""
-        if self.auto_weight is not None:
-            return self.auto_weight.kept()
-        if self.information is None or not self.rollout_buffer.full:  # a callback has stopped within an epoch
-            return None
-        nats = float(self.information.sum())
-        text = f"{nats:.3g} nats kept, at a cost of {self.rollout_buffer.episode_costs.mean():.3g}"
-        if nats < HARDLY_ANY:
-            text += "; this policy hardly looks at its sensor. If it must, use beta='auto', which keeps the cost low"
-        return text
-
-    def export(self, path: str | os.PathLike[str], *, format: str | None = None) -> Path:
-        """
-        Write one step of the policy to a file that runs without this package; see
-        :func:`~sb3_tdpg.deployment.export.export_policy`.
-
-        What ``VecNormalize`` does to the observations of the model's environment is part of the file.
-
-        :param path: The file, ``.onnx`` or ``.pt``.
-        :param format: ``"onnx"`` or ``"torchscript"``; default: by the suffix.
-        :return: the file
-        """
-        from sb3_tdpg.deployment.export import export_policy
-
-        return export_policy(self.policy, path, format=format, normalization=self.get_vec_normalize_env())
-
-    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        given = callback if isinstance(callback, list) else [callback]
-        callbacks = [c if isinstance(c, BaseCallback) else ConvertCallback(c) for c in given]
-        callbacks = [c for each in callbacks for c in (each.callbacks if isinstance(each, CallbackList) else [each])]
-        first = [c for c in callbacks if isinstance(c, MINECallback)] or [MINECallback()]
-        callbacks = [*first, *(c for c in callbacks if c not in first)]  # the others see the information
-        if progress_bar:
-            callbacks.append(TDPGProgressBar())
-        return super()._init_callback(callbacks)

@@ -19,9 +19,11 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_tdpg.checks import check_action_space, check_n_envs
 from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.checks import count as check_count
@@ -177,6 +179,24 @@ def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | Non
 def largest_divisor(n_episodes: int, limit: int = 50) -> int:
     """Return the largest divisor up to a limit: so many environments run the same number of episodes each."""
     return max(n for n in range(1, min(n_episodes, limit) + 1) if n_episodes % n == 0)
+
+
+def made_env(env: GymEnv | str | None, n_envs: int | None, **sizes: Any) -> GymEnv | None:
+    """
+    Return the environment that a model was given, or that of its id.
+
+    :param env: A registered id, an environment or a ``VecEnv``.
+    :param n_envs: Number of environments, for an id.
+    :param sizes: ``n_episodes`` and ``epoch_steps``.
+    :raises ValueError: if the environment has another number of them, or actions that no policy chooses.
+    """
+    if isinstance(env, str):
+        env = make_episodes_env(env, n_envs, **sizes)
+    elif n_envs is not None:
+        check_n_envs(env, n_envs)
+    if env is not None:
+        check_action_space(env.action_space)
+    return env
 
 
 def make_episodes_env(

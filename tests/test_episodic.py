@@ -8,7 +8,7 @@ from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env, t
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import TDPG, TrainingDivergedError
-from sb3_tdpg.episodic import RunningEpisodes
+from sb3_tdpg.buffers import RunningEpisodes
 
 
 def test_the_last_epoch_takes_the_steps_that_are_left():
@@ -60,7 +60,7 @@ def test_after_an_error_the_next_training_begins_with_new_episodes():
 
 
 def test_each_environment_runs_its_share_of_a_number_of_episodes():
-    episodes = RunningEpisodes(2, n_episodes=4, n_steps=100)
+    episodes = RunningEpisodes(2, n_episodes=4, n_steps=100, horizon=9)
     assert episodes.column.tolist() == [0, 1]
     episodes.advance(np.array([True, False]))
     assert episodes.column.tolist() == [2, 1]
@@ -73,7 +73,7 @@ def test_each_environment_runs_its_share_of_a_number_of_episodes():
 
 
 def test_with_a_number_of_steps_an_episode_begins_as_long_as_fewer_are_stored():
-    episodes = RunningEpisodes(2, n_episodes=None, n_steps=6)
+    episodes = RunningEpisodes(2, n_episodes=None, n_steps=6, horizon=9)
     episodes.advance(np.array([False, True]))  # two steps
     assert episodes.column.tolist() == [0, 2]
     episodes.advance(np.array([False, False]))

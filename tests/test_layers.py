@@ -21,7 +21,7 @@ LAYERS = [
 ]
 LEVELS = {name: level for level, names in enumerate(LAYERS) for name in names}
 # What the algorithm does not import before a model needs it.
-ON_DEMAND = {("tdpg", "deployment.export"), ("episodic", "robustness.nuisance")}
+ON_DEMAND = {("episodic", "deployment.export"), ("episodic", "robustness.nuisance")}
 
 
 def module_of(path):
