@@ -26,8 +26,8 @@ LONG_ONLY = ("skip", "skip_changes", "normalize_observations", "scale_actions", 
 def shown(name: str, kind: str, value: Any) -> str:
     """Write a value as a reader would type it, or say what it stands for."""
     if name == "batch_size":
-        unit = dict(image="{} episodes' steps", depth="{} episodes", long="{} steps")
-        return unit[kind].format(value) if value else "all"
+        defaults = DEFAULTS[kind]
+        return f"the steps of {defaults.batch_episodes} episodes" if defaults.batch_episodes else str(value or "all")
     if name == "features_extractor_kwargs" and value:
         pooled = f"means of {value['pool']} x {value['pool']} pixels, " if "pool" in value else ""
         layers = ", ".join(f"{n} ({size} x {size})" for n, size, _ in value["layers"])
@@ -53,7 +53,7 @@ def shown(name: str, kind: str, value: Any) -> str:
 
 def table() -> str:
     """Make the table: a row for each argument whose default depends on the kind of problem."""
-    rows = [(NAMES.get(name, f"`{name}`"), DEFAULTS, name) for name in Defaults._fields]
+    rows = [(NAMES.get(name, f"`{name}`"), DEFAULTS, name) for name in Defaults._fields if name != "batch_episodes"]
     rows += [
         (f"policy: {OF_ARCH.get(name, f'`{name}`')}", POLICY_DEFAULTS, name)
         for name in PolicyDefaults._fields

@@ -113,27 +113,27 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
         raise ValueError(f"target_kl={settings['target_kl']} must be positive; float('inf') sets no limit")
 
 
-def check_batch_size(settings: Mapping[str, Any], epoch_size: int, unit: str) -> None:
+def check_batch_size(settings: Mapping[str, Any], epoch_size: int, *, time_varying: bool) -> None:
     """
     Check the size of a minibatch, and that several updates on the same rollouts are clipped.
 
-    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name.
-    :param epoch_size: Size of an epoch.
-    :param unit: What both sizes count, "episodes" or "steps".
+    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name, and ``horizon``.
+    :param epoch_size: Steps of an epoch.
+    :param time_varying: Whether each time step has weights of its own.
     """
     batch_size, n_epochs, clip_range = settings["batch_size"], settings["n_epochs"], settings["clip_range"]
-    why, least = "all time steps share their weights", MIN_BATCH_STEPS
-    if unit == "episodes":
-        why, least = "each time step has weights of its own (policy_kwargs: time_varying)", 2
-    if unit == "episodes" and epoch_size < 2:
-        raise ValueError(
-            f"epoch_steps={settings['epoch_steps']} is less than two episodes, and {why}: give n_episodes=2 or "
-            "more, or more steps"
-        )
+    least, why = MIN_BATCH_STEPS, ""
+    if time_varying:
+        least, why = 2 * settings["horizon"], "each time step has weights of its own (policy_kwargs: time_varying)"
+        if epoch_size < least:
+            raise ValueError(
+                f"epoch_steps={settings['epoch_steps']} is less than two episodes, and {why}: give n_episodes=2 or "
+                "more, or more steps"
+            )
+        why = f"; it has two episodes at least, because {why}"
     if batch_size is not None and not min(least, epoch_size) <= batch_size <= epoch_size:
         raise ValueError(
-            f"batch_size={batch_size} must be between {least} and {epoch_size}, the {unit} of an epoch: it counts "
-            f"{unit}, because {why}"
+            f"batch_size={batch_size} must be between {least} and {epoch_size}, the steps of an epoch{why}"
         )
     n_updates = n_epochs * (1 if batch_size is None else math.ceil(epoch_size / batch_size))
     if n_updates > 1 and math.isinf(_values(clip_range)[0]):

@@ -35,7 +35,7 @@ from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.information import InformationEstimator
 from sb3_tdpg.policies import TRVPolicy
-from sb3_tdpg.presets import DEFAULTS, Defaults, preset_of
+from sb3_tdpg.presets import DEFAULTS, Defaults, implied, preset_of
 from sb3_tdpg.problem import Problem, named_shapes, read_problem
 
 SelfEpisodic = TypeVar("SelfEpisodic", bound="EpisodicAlgorithm")
@@ -328,14 +328,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to continue from a policy-gradient model.
         :raises ValueError: if the file is damaged or TDPG did not save it.
         """
-        # As in the constructor: a limit alone implies beta="auto", and a number for beta needs no limit.
-        if kwargs.get("cost_limit") is not None:
-            kwargs.setdefault("beta", "auto")
-        elif kwargs.get("beta", "auto") != "auto":
-            kwargs.setdefault("cost_limit", None)
-        for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
-            if kwargs.get(one) is not None:
-                kwargs.setdefault(other, None)
+        kwargs = {**implied(kwargs), **kwargs}  # as in the constructor
         known = {name for each in cls.__mro__[:-1] for name in signature(each).parameters}
         refuse_others({name: 0 for name in kwargs if name not in known and name[0] != "_"}, known)
         if "batch_size" in kwargs:

@@ -27,6 +27,7 @@ class Defaults(NamedTuple):
     epoch_steps: int | None = None
     n_epochs: int = 1
     batch_size: int | None = None
+    batch_episodes: int | None = None  # a batch_size of that many episodes, whatever their length
     clip_range: float = float("inf")
     normalize_advantage: bool = False
     encoder_gradient: str = "pathwise"
@@ -40,6 +41,11 @@ class Defaults(NamedTuple):
     max_grad_norm: float = float("inf")
     target_kl: float = float("inf")
     share: str = "95%"  # the cost_limit of beta="auto"
+
+    def minibatch(self, horizon: int, epoch_size: int) -> int | None:
+        """Return the default ``batch_size`` for a horizon T, at most the steps of an epoch."""
+        size = self.batch_size if self.batch_episodes is None else self.batch_episodes * horizon
+        return None if size is None else min(size, epoch_size)
 
 
 # One update per epoch, without clipping, as in the paper; the falling learning rate improves the last epochs.
@@ -60,7 +66,7 @@ IMAGE = Defaults(
     learning_rate="lin_1e-3_5e-5",
     n_episodes=160,
     n_epochs=4,
-    batch_size=40,
+    batch_episodes=40,
     clip_range=0.2,
     normalize_advantage=True,
     n_threads=None,
@@ -71,7 +77,7 @@ IMAGE = Defaults(
 # Depth images come from environments that simulate each trial: even more expensive. Where nearly all trials succeed,
 # the normalised advantages of the few failures are huge, and without target_kl one epoch can undo the training.
 DEPTH = IMAGE._replace(
-    share="95%", n_episodes=400, batch_size=200, total_epochs=100, baseline="regression", target_kl=0.05
+    share="95%", n_episodes=400, batch_episodes=200, total_epochs=100, baseline="regression", target_kl=0.05
 )
 
 # Ordinary environments: PPO's update, with minibatches of short segments and a value network.
@@ -163,6 +169,27 @@ def discount_of(horizon: int) -> float:
     return min(max(1 - 8 / horizon, 0.9), 0.995)
 
 
+def implied(given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return what some arguments say of others, unless these are given, too.
+
+    A limit means ``beta="auto"``, another beta no limit, and a number of episodes no number of steps.
+
+    :param given: Arguments by name; those that are None say nothing.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    others: dict[str, Any] = {}
+    if "cost_limit" in given:
+        others["beta"] = "auto"
+    elif given.get("beta", "auto") != "auto":
+        others["cost_limit"] = None
+    if "n_episodes" in given:
+        others["epoch_steps"] = None
+    if "epoch_steps" in given:
+        others["n_episodes"] = None
+    return {name: value for name, value in others.items() if name not in given}
+
+
 def fill_in(
     given: Mapping[str, Any], preset: str, cost_limit: float | str | None, n_envs: int, horizon: int
 ) -> dict[str, Any]:
@@ -171,7 +198,7 @@ def fill_in(
 
     :param given: Arguments by name.
     :param preset: See :func:`preset_of`.
-    :param cost_limit: With a limit the default of beta is "auto".
+    :param cost_limit: See :func:`implied`.
     :param n_envs: Number of environments, whose multiple the default of ``n_episodes`` is.
     :param horizon: T, which the default of ``gamma`` depends on.
     """
@@ -179,14 +206,10 @@ def fill_in(
     settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
     if settings["gamma"] is None:
         settings["gamma"] = discount_of(horizon)
-    if given["beta"] is None and cost_limit is not None:
-        settings["beta"] = "auto"
-    for one, other in (("n_episodes", "epoch_steps"), ("epoch_steps", "n_episodes")):
-        if given[one] is not None and given[other] is None:
-            settings[other] = None
+    settings |= {"cost_limit": cost_limit, **implied({**given, "cost_limit": cost_limit})}
     if given["n_episodes"] is None and settings["n_episodes"] is not None:
         settings["n_episodes"] = math.ceil(settings["n_episodes"] / n_envs) * n_envs
-    return {**settings, "cost_limit": cost_limit}
+    return settings
 
 
 def default(value: Any, otherwise: Any) -> Any:

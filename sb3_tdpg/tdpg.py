@@ -88,7 +88,8 @@ class TDPG(EpisodicAlgorithm):
         steps must share their weights (``time_varying=False``). Default: 5 for vectors with a horizon of 50 or more
         (the horizon gives whole episodes), otherwise whole episodes.
     :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO.
-    :param batch_size: Minibatch size in steps, or in *episodes* where each time step has weights of its own.
+    :param batch_size: Minibatch size in steps, as in PPO. Minibatches are made of whole episodes, or of segments of
+        them with ``bptt_steps``.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
     :param target_kl: As in PPO: the passes of an epoch end when the policy has moved by 1.5 times this divergence, in
         nats a step; ``inf``: no limit.
@@ -218,14 +219,9 @@ class TDPG(EpisodicAlgorithm):
         self.policy = cast(TRVPolicy, policy).to(self.device)
         if self.policy.time_varying:
             check_segments(self.bptt_steps, self.horizon)
-            unit, size = "episodes", self.epoch_size // self.horizon
-        else:
-            unit, size = "steps", self.epoch_size
-        if self._has_default_batch_size and (batch_size := self._defaults.batch_size) is not None:
-            # The defaults of the paper's problems count episodes always, and a default must fit any number of them.
-            in_steps = unit == "steps" and self.preset != "long"
-            self.batch_size = min(batch_size * (self.horizon if in_steps else 1), size)
-        check_batch_size(vars(self), size, unit)
+        if self._has_default_batch_size:
+            self.batch_size = self._defaults.minibatch(self.horizon, self.epoch_size)
+        check_batch_size(vars(self), self.epoch_size, time_varying=self.policy.time_varying)
         if self.baseline == "value":
             if self.env is not None and "values_see_changes" not in vars(self):  # a loaded model keeps its network
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
@@ -450,6 +446,5 @@ class TDPG(EpisodicAlgorithm):
 
     def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
         n_columns = batch.costs.shape[1]
-        size = n_columns if self.policy.time_varying else batch.alive.sum().item()
-        n_parts = 1 if self.batch_size is None else math.ceil(size / self.batch_size)
+        n_parts = 1 if self.batch_size is None else math.ceil(batch.alive.sum().item() / self.batch_size)
         return batch.partition(min(n_parts, max(1, n_columns // 2)))  # the information needs two columns

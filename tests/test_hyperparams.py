@@ -42,7 +42,7 @@ def test_every_block_trains_for_an_epoch(block):
     if settings.get("mi_estimator") == "mine":
         cheap["mi_kwargs"] = {**settings.get("mi_kwargs", {}), "gradient_steps": 2, "warmup_gradient_steps": 2}
     if "batch_size" in settings:
-        cheap["batch_size"] = 20
+        cheap["batch_size"] = 20 * 25  # the epoch
     training = make_training(env_id_of(block), settings, n_episodes=20, seed=0, **cheap)
     training.model.learn(1, training.callbacks)  # an epoch is the least
     assert training.model.epoch == 1

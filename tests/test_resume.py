@@ -34,7 +34,7 @@ SETTINGS = {
         beta=lambda progress: 0.1 + progress, learning_rate=lambda progress: 1e-2 * progress, max_grad_norm=1.0
     ),
     "passes under a cost limit": dict(
-        beta="auto", cost_limit=1e4, n_epochs=2, batch_size=4, clip_range=0.2, encoder_gradient="pathwise"
+        beta="auto", cost_limit=1e4, n_epochs=2, batch_size=20, clip_range=0.2, encoder_gradient="pathwise"
     ),
     "policy gradient without a seed": dict(beta=float("inf"), seed=None),
     "a nuisance": dict(nuisance={"vector_noise": (1, 3), "vector_bias": 5}),
@@ -46,7 +46,7 @@ def make_model(env, settings):
     if env == "cartpole":
         given["n_episodes"] = 8
         if "batch_size" in given:
-            given["batch_size"] = 200  # steps, of which all share their weights
+            given["batch_size"] = 200
     return tiny_tdpg(ENVIRONMENTS[env](), **given)
 
 

@@ -13,7 +13,7 @@ from sb3_tdpg.paper import ball_paper
 @pytest.fixture
 def tiny(monkeypatch):
     """Epochs of four episodes, two prices, two levels."""
-    give_settings(monkeypatch, dict(n_episodes=4, batch_size=4, mi_kwargs={}, mi_estimator="logdet"))
+    give_settings(monkeypatch, dict(n_episodes=4, batch_size=4 * 25, mi_kwargs={}, mi_estimator="logdet"))
     monkeypatch.setattr(ball_paper, "LEVELS", (1e6, 8.7))
     monkeypatch.setattr(ball_paper, "PRICES", (16, 40))
     monkeypatch.setattr(
