@@ -37,11 +37,11 @@ CODE = [
 LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|show_window|_figure__")
 TESTS = [
     "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
-    "test_passes.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py", "test_episodic.py",
-    "common/test_running_norms.py", "test_pooling.py", "test_nuisance.py", "test_callbacks.py", "test_sb3_surface.py",
-    "test_vec_env.py", "information", "robustness/test_families.py", "evaluation/test_information_report.py",
-    "evaluation/test_interval.py", "evaluation/test_interval_bounds.py", "evaluation/test_trust_badge.py",
-    "certificates", "envs",
+    "test_passes.py", "test_presets.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py",
+    "test_episodic.py", "common/test_running_norms.py", "test_features.py", "test_problem.py",
+    "test_nuisance.py", "test_callbacks.py", "test_sb3_surface.py", "test_vec_env.py", "information",
+    "robustness/test_families.py", "evaluation/test_information_report.py", "evaluation/test_interval.py",
+    "evaluation/test_interval_bounds.py", "evaluation/test_trust_badge.py", "certificates", "envs",
 ]  # fmt: skip
 SETTINGS = """
 [mutmut]

@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_tdpg.buffers import STORED, EpisodeBuffer
+from sb3_tdpg.buffers import STORED, EpisodeBuffer, RunningEpisodes
 
 T, N, X, Z, U = 3, 4, 5, 2, 1
 SHAPES = dict(observations=(2,), states=(X,), noise=(Z,), trvs=(Z,), means=(Z,), stds=(Z,), actions=(U,), costs=())
@@ -98,3 +98,30 @@ def test_where_no_episode_runs_the_encoder_has_a_density(buffer):
     stds = buffer.episode_batch().stds
     assert (stds[0] == 7).all()
     assert (stds[1:] == 1).all()  # its logarithm is finite
+
+
+# -- which column of the buffer an environment fills -----------------------------------------------------------------
+
+
+def test_each_environment_runs_its_share_of_a_number_of_episodes():
+    episodes = RunningEpisodes(2, n_episodes=4, n_steps=100, horizon=9)
+    assert episodes.column.tolist() == [0, 1]
+    episodes.advance(np.array([True, False]))
+    assert episodes.column.tolist() == [2, 1]
+    episodes.advance(np.array([True, False]))  # its second and last one
+    assert episodes.column.tolist() == [-1, 1]
+    assert episodes.running.tolist() == [1]
+    episodes.advance(np.array([True, True]))
+    episodes.advance(np.array([False, True]))
+    assert episodes.running.size == 0
+
+
+def test_with_a_number_of_steps_an_episode_begins_as_long_as_fewer_are_stored():
+    episodes = RunningEpisodes(2, n_episodes=None, n_steps=6, horizon=9)
+    episodes.advance(np.array([False, True]))  # two steps
+    assert episodes.column.tolist() == [0, 2]
+    episodes.advance(np.array([False, False]))
+    episodes.advance(np.array([True, False]))  # the sixth step ends the epoch when the episodes are over
+    assert episodes.column.tolist() == [-1, 2]
+    episodes.advance(np.array([True, True]))
+    assert episodes.running.size == 0

@@ -8,7 +8,6 @@ from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env, t
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import TDPG, TrainingDivergedError
-from sb3_tdpg.buffers import RunningEpisodes
 
 
 def test_the_last_epoch_takes_the_steps_that_are_left():
@@ -54,30 +53,3 @@ def test_after_an_error_the_next_training_begins_with_new_episodes():
     before = np.array(env.get_attr("n_resets"))
     model.learn(12, reset_num_timesteps=False)
     assert (env.get_attr("n_resets") - before == 2).all()  # at its start, and after its episode
-
-
-# -- which column of the buffer an environment fills -----------------------------------------------------------------
-
-
-def test_each_environment_runs_its_share_of_a_number_of_episodes():
-    episodes = RunningEpisodes(2, n_episodes=4, n_steps=100, horizon=9)
-    assert episodes.column.tolist() == [0, 1]
-    episodes.advance(np.array([True, False]))
-    assert episodes.column.tolist() == [2, 1]
-    episodes.advance(np.array([True, False]))  # its second and last one
-    assert episodes.column.tolist() == [-1, 1]
-    assert episodes.running.tolist() == [1]
-    episodes.advance(np.array([True, True]))
-    episodes.advance(np.array([False, True]))
-    assert episodes.running.size == 0
-
-
-def test_with_a_number_of_steps_an_episode_begins_as_long_as_fewer_are_stored():
-    episodes = RunningEpisodes(2, n_episodes=None, n_steps=6, horizon=9)
-    episodes.advance(np.array([False, True]))  # two steps
-    assert episodes.column.tolist() == [0, 2]
-    episodes.advance(np.array([False, False]))
-    episodes.advance(np.array([True, False]))  # the sixth step ends the epoch when the episodes are over
-    assert episodes.column.tolist() == [-1, 2]
-    episodes.advance(np.array([True, True]))
-    assert episodes.running.size == 0

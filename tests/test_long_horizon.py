@@ -16,7 +16,6 @@ from sb3_tdpg import TDPG, InformationCallback
 from sb3_tdpg.advantages import ValueFunction, generalised_advantages
 from sb3_tdpg.common.running_norms import Changes
 from sb3_tdpg.information.logdet import LogDet
-from sb3_tdpg.presets import DEFAULTS, discount_of, preset_of
 
 
 def tiny(env="CartPole-v1", **kwargs):
@@ -327,22 +326,6 @@ def test_a_dict_of_vectors_is_its_own_state_and_one_with_an_image_is_not():
 
 
 # -- words -----------------------------------------------------------------------------------------------------
-
-
-def test_the_default_discount_looks_ahead_for_a_share_of_the_horizon():
-    assert [discount_of(horizon) for horizon in (50, 200, 500, 1000, 27_000)] == [0.9, 0.96, 0.984, 0.992, 0.995]
-    assert tiny("Pendulum-v1").gamma == 0.96
-    assert tiny("Pendulum-v1", gamma=0.8).gamma == 0.8
-
-
-def test_the_kind_of_problem_decides_the_defaults():
-    vector, image = spaces.Box(-1, 1, (3,)), spaces.Box(0, 255, (3, 64, 64), np.uint8)
-    assert [preset_of(vector, t) for t in (None, 49, 50)] == ["vector", "vector", "long"]
-    assert preset_of(image, 1000) == "image"
-    model = TDPG("TRVPolicy", "Pendulum-v1")
-    for name in ("epoch_steps", "batch_size", "n_epochs", "gae_lambda", "baseline", "bptt_steps"):
-        assert getattr(model, name) == getattr(DEFAULTS["long"], name), name
-    assert model.beta == math.inf
 
 
 def test_a_limit_that_no_epoch_meets_is_told_at_the_end():

@@ -11,7 +11,6 @@ from small_problems import ToyEnv, parameters, same_parameters, tiny_tdpg, toy_v
 
 from sb3_tdpg import TDPG, TRVPolicy
 from sb3_tdpg.buffers import RebuiltTRVs, each_part
-from sb3_tdpg.features import observation_kind
 from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
 
 T, N = 4, 6
@@ -284,37 +283,6 @@ def test_depth_images_have_the_papers_network_of_grasping_but_for_keypoints(kwar
     assert [tuple(layer.weight.shape[1:]) for layer in policy.action_head.mlp.layers] == [(16, 64), (64, 64), (64, 4)]
     assert isinstance(policy.encoder.mlp.activation, th.nn.Tanh)
     assert isinstance(policy.action_head.mlp.activation, th.nn.ELU)
-
-
-@pytest.mark.parametrize(("low", "high", "expected"), [
-    (0.2, 0.7, (-1.0, 0.0, 1.0)),
-    (0.0, 2.0, (-1.0, 0.0, 1.0)),
-    (-1.0, 1.0, (-1.0, 0.0, 1.0)),
-    (0.5, 0.5, (0.5, 0.5, 0.5)),  # nothing to be brought anywhere
-    (0.0, np.inf, (0.0, 1.0, 2.0)),
-])  # fmt: skip
-def test_images_of_floats_are_brought_from_their_bounds_to_plus_and_minus_one(low, high, expected):
-    extractor = make_policy(spaces.Box(low, high, DEPTH.shape, np.float32)).features_extractor
-    seen = []
-    extractor.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    for share in (0.0, 0.5, 1.0):
-        extractor(th.full((1, *DEPTH.shape), low + share * (min(high, low + 2.0) - low)))
-    assert [float(image.mean()) for image in seen] == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize(("space", "kind"), [
-    (DEPTH, "depth"),
-    (CHW, "image"),
-    (HWC, "image"),
-    (VECTOR, "vector"),
-    (spaces.Box(0, 1, (24, 20, 1), np.float32), "vector"),  # channels last
-    (spaces.Box(0, 1, (1, 5, 5), np.float32), "vector"),  # too small for the convolutions
-    (spaces.Box(0, 1, (3, 24, 20), np.float32), "vector"),
-    (spaces.Discrete(3), "vector"),
-    (None, "vector"),
-], ids=str)  # fmt: skip
-def test_the_kind_of_an_observation_is_that_of_its_space(space, kind):
-    assert observation_kind(space) == kind
 
 
 def test_a_saved_policy_predicts_the_same(tmp_path):

@@ -17,9 +17,7 @@ from small_problems import (
     parameters,
     same_parameters,
     tiny_tdpg,
-    toy_vec_env,
     train_epochs,
-    words,
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
@@ -242,31 +240,6 @@ def test_tdpg_fits_its_critics_without_being_asked():
     train_epochs(model, 1)
     assert not same_parameters(before, parameters(model.estimator))
     assert model.information.shape == (5,)
-
-
-@pytest.mark.parametrize(("before", "change", "after"), [
-    (dict(max_grad_norm=0.5), dict(max_grad_norm=None), dict(max_grad_norm=math.inf)),  # no clipping
-    (dict(learning_rate=1e-3), dict(custom_objects={"learning_rate": 3e-5}), dict(learning_rate=3e-5)),
-    (dict(n_episodes=20), dict(n_episodes=40), dict(n_episodes=40, batch_size=None)),
-    (dict(n_episodes=20), dict(epoch_steps=100), dict(n_episodes=None, epoch_steps=100)),
-    (dict(n_episodes=None, epoch_steps=100), dict(n_episodes=20), dict(n_episodes=20, epoch_steps=None)),
-], ids=words)  # fmt: skip
-def test_a_setting_may_be_changed_when_a_model_is_loaded(before, change, after, tmp_path):
-    tiny_tdpg(**before).save(tmp_path / "model")
-    model = TDPG.load(tmp_path / "model", env=lava_env(), **change, device="cpu")
-    assert {name: getattr(model, name) for name in after} == after
-    assert model.learn(100).epoch == 1
-    assert model._minibatches(model.rollout_buffer.episode_batch()) == [slice(None)]  # the whole epoch
-
-
-def test_a_default_size_of_a_minibatch_follows_the_epoch_and_a_given_one_is_checked(tmp_path):
-    env = toy_vec_env(4, horizon=3, observation_space=spaces.Box(0, 255, (3, 16, 16), np.uint8))
-    small = TDPG(env=env, n_episodes=4, device="cpu")
-    small.save(tmp_path / "small")
-    assert small.batch_size == 4 * 3
-    assert TDPG.load(tmp_path / "small", env=env, n_episodes=160, device="cpu").batch_size == 40 * 3
-    with pytest.raises(ValueError, match="batch_size=5000 must be between"):
-        TDPG.load(tmp_path / "small", env=env, batch_size=5000, device="cpu")
 
 
 def test_a_policy_gradient_model_warm_starts_tdpg(tmp_path):

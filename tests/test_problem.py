@@ -103,21 +103,3 @@ def test_a_wrong_shape_from_another_process_is_explained(others):
             train_epochs(tiny_tdpg(env, n_episodes=4), 1)
     finally:
         env.close()
-
-
-@pytest.mark.parametrize(("n_episodes", "mi_estimator", "beta", "warns"), [
-    (39, "mine", 0.1, True),
-    (40, "mine", 0.1, False),
-    (39, "infonce", 0.1, True),
-    (4, "logdet", 0.1, False),
-    (4, "vib", 0.1, False),
-    (4, "mine", np.inf, False),  # without a penalty no number is too few
-])  # fmt: skip
-def test_too_few_episodes_for_the_critics_are_reported_with_the_number_needed(
-    n_episodes, mi_estimator, beta, warns, recwarn
-):
-    # Two TRVs and two components of the state.
-    train_epochs(tiny_tdpg(n_episodes=n_episodes, mi_estimator=mi_estimator, beta=beta), 1)
-    messages = [str(w.message) for w in recwarn if "are too few for" in str(w.message)]
-    assert len(messages) == warns
-    assert all(f"n_episodes={n_episodes} are too few" in m and "n_episodes=40 or more" in m for m in messages)

@@ -1,4 +1,4 @@
-"""The encoder of images: pixels are pooled to their means before the first layer, or keypoints follow the last."""
+"""What stands before the encoder: the kind of an observation, the scale of depth images, the layers for images."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,10 @@ from stable_baselines3 import PPO
 from torch import nn
 from torch.nn.functional import avg_pool2d
 
-from sb3_tdpg.features import SpatialSoftmax, TRVCnn, least_side
+from sb3_tdpg.features import SpatialSoftmax, TRVCnn, least_side, observation_kind
 from sb3_tdpg.policies import TRVPolicy
+
+DEPTH = spaces.Box(0.2, 0.7, (1, 24, 20), np.float32)
 
 
 @pytest.mark.parametrize("shape", [(3, 24, 24), (1, 25, 26), (3, 26, 25)])
@@ -88,3 +90,34 @@ def test_the_convolutions_can_stand_in_sb3s_own_policies():
     """SB3 initialises weights orthogonally, which needs them contiguous."""
     env = ToyEnv(spaces.Box(0, 255, (3, 20, 16), np.uint8))
     PPO("CnnPolicy", env, policy_kwargs=dict(features_extractor_class=TRVCnn), n_steps=8, batch_size=8).learn(8)
+
+
+@pytest.mark.parametrize(("low", "high", "expected"), [
+    (0.2, 0.7, (-1.0, 0.0, 1.0)),
+    (0.0, 2.0, (-1.0, 0.0, 1.0)),
+    (-1.0, 1.0, (-1.0, 0.0, 1.0)),
+    (0.5, 0.5, (0.5, 0.5, 0.5)),  # nothing to be brought anywhere
+    (0.0, np.inf, (0.0, 1.0, 2.0)),
+])  # fmt: skip
+def test_images_of_floats_are_brought_from_their_bounds_to_plus_and_minus_one(low, high, expected):
+    extractor = TRVCnn(spaces.Box(low, high, DEPTH.shape, np.float32))
+    seen = []
+    extractor.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    for share in (0.0, 0.5, 1.0):
+        extractor(th.full((1, *DEPTH.shape), low + share * (min(high, low + 2.0) - low)))
+    assert [float(image.mean()) for image in seen] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("space", "kind"), [
+    (DEPTH, "depth"),
+    (spaces.Box(0, 255, (3, 20, 16), np.uint8), "image"),
+    (spaces.Box(0, 255, (20, 16, 3), np.uint8), "image"),
+    (spaces.Box(-np.inf, np.inf, (3,), np.float32), "vector"),
+    (spaces.Box(0, 1, (24, 20, 1), np.float32), "vector"),  # channels last
+    (spaces.Box(0, 1, (1, 5, 5), np.float32), "vector"),  # too small for the convolutions
+    (spaces.Box(0, 1, (3, 24, 20), np.float32), "vector"),
+    (spaces.Discrete(3), "vector"),
+    (None, "vector"),
+], ids=str)  # fmt: skip
+def test_the_kind_of_an_observation_is_that_of_its_space(space, kind):
+    assert observation_kind(space) == kind
