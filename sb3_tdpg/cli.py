@@ -134,12 +134,13 @@ def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequenc
 
 
 def _certify(
-    models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path, nuisance: str | None, n_members: int,
-    **options: Any,
+    models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path | None, nuisance: str | None,
+    n_members: int, **options: Any,
 ) -> None:  # fmt: skip
     from sb3_tdpg.certificates.declared import certify_nuisance
     from sb3_tdpg.paper.certificates import certify_lava
 
+    out = out or Path("results", "certificate" if nuisance is None else "nuisance")
     say_what_is_trusted(*models)
     keywords = parse_keywords(env_kwargs)
     if nuisance is not None:
@@ -354,7 +355,8 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--n-test-episodes", type=_positive, default=2000, help="episodes per random shift")
     add("--confidence", type=float, default=0.95)
     add("--cost-bound", type=float, help="clip the cost at this value (default: the cost of standing at the wall)")
-    add("--out", type=Path, default=Path("results/certificate"), help="folder for the results")
+    text = "folder for the results (default: results/certificate, with --nuisance results/nuisance)"
+    add("--out", type=Path, help=text)
 
     text = "run models under every perturbation, report which method is more robust, and where"
     add = command(_report, text, "--env", "--env-kwargs", "--seed", "--deterministic", "--jobs")

@@ -23,6 +23,15 @@ def test_certified_bounds_hold_for_random_members(tmp_path):
     assert "random members" in (tmp_path / "out" / "summary.md").read_text()
 
 
+def test_the_two_kinds_of_certificates_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny_tdpg("Lava-v0", n_episodes=2).save("model.zip")
+    command = ["certify", "model.zip", "--env", "Lava-v0", "--n-episodes", "500"]
+    assert main(command) == 0
+    assert main([*command, "--nuisance", "vector_bias", "--members", "1", "--n-test-episodes", "2"]) == 0
+    assert {path.parent.name for path in tmp_path.glob("results/*/summary.md")} == {"certificate", "nuisance"}
+
+
 @pytest.mark.parametrize(("arguments", "fragment"), [
     (["--nuisance", "vector_bias", "--random-shifts", "3"], "leave them or --nuisance out"),
     (["--nuisance", "{"], "is not YAML"),
