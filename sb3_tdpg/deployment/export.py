@@ -7,6 +7,7 @@ Dimension key: N robots, Z task-relevant variables (TRVs), U actions.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import warnings
 from pathlib import Path
@@ -245,6 +246,11 @@ def export_model(
     )
 
 
+def _is_not_of_torchvision(record: logging.LogRecord) -> bool:
+    """Drop a warning of torch for each operator of a package that no policy needs."""
+    return not record.getMessage().startswith("torchvision is not installed")
+
+
 def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
     try:
         from onnxscript import opset18 as op  # torch.onnx needs it, too
@@ -256,17 +262,22 @@ def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
         return op.Reciprocal(op.Add(op.Exp(op.Neg(x)), op.Constant(value_float=1.0)))
 
     names = step.input_names
-    program = th.onnx.export(
-        step,
-        step.example(),
-        input_names=names,
-        output_names=["action", "next_memory"],
-        dynamic_shapes=(tuple({0: th.export.Dim.DYNAMIC} for _ in names),),
-        custom_translation_table={th.ops.aten.sigmoid.default: sigmoid},
-        opset_version=OPSET,
-        dynamo=True,
-        verbose=False,
-    )
+    registration = logging.getLogger("torch.onnx._internal.exporter._registration")
+    registration.addFilter(_is_not_of_torchvision)
+    try:
+        program = th.onnx.export(
+            step,
+            step.example(),
+            input_names=names,
+            output_names=["action", "next_memory"],
+            dynamic_shapes=(tuple({0: th.export.Dim.DYNAMIC} for _ in names),),
+            custom_translation_table={th.ops.aten.sigmoid.default: sigmoid},
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    finally:
+        registration.removeFilter(_is_not_of_torchvision)
     assert program is not None
     program.model.metadata_props[METADATA] = metadata
     program.save(str(path))

@@ -1,6 +1,7 @@
 """An exported step of a policy acts as ``predict`` does, without torch, Stable-Baselines3 or this package."""
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -217,6 +218,19 @@ def test_an_export_leaves_the_model_as_it_was(tmp_path):
     assert model.policy.training
     assert all(th.equal(x, before[name]) for name, x in model.policy.state_dict().items())
     assert th.equal(th.get_rng_state(), state)
+
+
+def test_torch_does_not_warn_of_a_package_that_no_policy_needs(tmp_path):
+    messages = []
+    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+    handler = logging.Handler()
+    handler.emit = lambda record: messages.append(record.getMessage())
+    logger.addHandler(handler)
+    try:
+        TDPG("TRVPolicy", "Lava-v0", seed=0, device="cpu").export(tmp_path / "policy.onnx")
+    finally:
+        logger.removeHandler(handler)
+    assert not messages and not logger.filters
 
 
 def test_bad_requests_are_told_in_one_line(tmp_path, monkeypatch, capsys):
