@@ -80,8 +80,8 @@ def test_the_clipped_loss_begins_with_the_policy_gradient():
 
 
 @pytest.mark.parametrize(("ratio", "advantage", "moves"), [
-    (1.5, 1.0, True),  # too likely and too dear: makes it less likely
-    (0.5, 1.0, False),  # too dear, and already much less likely
+    (1.5, 1.0, True),  # too likely and too expensive: makes it less likely
+    (0.5, 1.0, False),  # too expensive, and already much less likely
     (1.5, -1.0, False),  # cheap, and already much more likely
     (0.5, -1.0, True),  # cheap, and too unlikely
     (1.1, -1.0, True),  # within the range

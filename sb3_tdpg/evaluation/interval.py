@@ -189,7 +189,7 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     contributions of episodes: means that are too low come with standard errors that are too small. The shares depend on
     the gap between the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since
     the tightest is chosen (``joint_quantile``). The confidence is that of each step alone. Above about ``ln N`` nats
-    the lower limit falls behind the truth; it cannot exceed about ``ln(N^2 / 10)``.
+    the lower limit becomes loose; it cannot exceed about ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
     :param confidence: Probability, at least, that the interval of a step contains the truth.

@@ -203,7 +203,7 @@ def verdict(table: pd.DataFrame) -> str:
         f"**{word}**: a limit of {shown.name} keeps {_percent(shown['improvement'])} of the improvement (cost "
         f"{shown['cost']:.4g}) with {_percent(shown['kept'])} of the information "
         f"({interval if shown['seeds'] > 1 else 'one seed, no interval'}), and the best open loop costs "
-        f"{end['best']:.4g}, which is {'cheap' if is_cheap else 'dear'}: the bound is {most:.4g}, half above the "
+        f"{end['best']:.4g}, which is {'cheap' if is_cheap else 'expensive'}: the bound is {most:.4g}, half above the "
         f"{start['cost']:.4g} without a penalty."
     )
 

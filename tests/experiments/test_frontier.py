@@ -196,11 +196,11 @@ FEW_NATS = [(12.0, 0.3), (12.0, 0.5)]
 
 @pytest.mark.parametrize(("limit", "blind", "word", "why"), [
     (FEW_NATS, BLIND, "Probably", "keeps 98 % of the improvement (cost 12) with 7 % of the information"),
-    (FEW_NATS, [(15.5, 0), (16.0, 0)], "Perhaps", "costs 15.5, which is dear: the bound is 15,"),
+    (FEW_NATS, [(15.5, 0), (16.0, 0)], "Perhaps", "costs 15.5, which is expensive: the bound is 15,"),
     (FEW_NATS, [(14.5, 0), (18.0, 0)], "Probably", "costs 14.5, which is cheap: the bound is 15,"),  # the best seed
     ([(12.0, 0.2), (12.0, 1.6)], BLIND, "Perhaps", "12 % of the information (5 % to 20 %)"),  # one keeps more
     ([(25.0, 0.0), (25.0, 0.0)], BLIND, "Perhaps", "keeps 85 % of the improvement"),
-    ([(12.0, 4.0), (12.0, 8.0)], [(99.0, 0)] * 2, "Probably not", "costs 99, which is dear: the bound is 15,"),
+    ([(12.0, 4.0), (12.0, 8.0)], [(99.0, 0)] * 2, "Probably not", "costs 99, which is expensive: the bound is 15,"),
 ])  # fmt: skip
 def test_the_verdict_asks_for_information_to_spare_and_a_cheap_open_loop(limit, blind, word, why):
     text = verdict(table_of(no_penalty=FREE, s95=limit, open_loop=blind))
@@ -218,7 +218,7 @@ def test_returns_are_judged_as_costs_are():
     # CartPole: the open loop falls over, although a limit keeps little of the information.
     cartpole = dict(no_penalty=[(-500.0, 90.0)], s95=[(-480.0, 5.0)], open_loop=[(-40.0, 0.0)])
     text = verdict(table_of(first_cost=-20.0, **cartpole))
-    assert text.startswith("**Perhaps**") and "dear: the bound is -250" in text and "one seed, no interval" in text
+    assert text.startswith("**Perhaps**") and "expensive: the bound is -250" in text and "one seed, no interval" in text
 
 
 def test_a_policy_that_carries_no_information_has_nothing_to_leave_out():
