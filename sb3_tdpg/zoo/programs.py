@@ -19,6 +19,7 @@ from sb3_tdpg.zoo.manager import CHECKPOINT, RECORD, TDPGExperimentManager, regi
 
 # The information cannot be measured with five episodes, the zoo's default.
 TUNING_DEFAULTS = ("--eval-episodes", "200", "--n-trials", "50", "--num-threads", "1", "--verbose", "0")
+HELP = {"-h", "--help"}
 BLOCK = dict(help="block of hyperparameters (default: that of the environment)")
 # The flags of each program beside the zoo's.
 FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -80,7 +81,7 @@ def _split(
     ours = argparse.ArgumentParser(f"sb3-tdpg {program}", add_help=False, allow_abbrev=False)
     for flag, options in FLAGS.get(program, {}).items():
         ours.add_argument(flag, **options)
-    if program in FLAGS and {"-h", "--help"} & set(arguments):
+    if program in FLAGS and HELP & set(arguments):
         ours.print_help()
         print("\nand all flags of rl-zoo3:\n")
     given, flags = ours.parse_known_args(arguments)
@@ -99,12 +100,18 @@ def _split(
     return given, flags
 
 
+def _say_what_is_loaded(flags: list[str], *paths: str | Path) -> None:
+    """Name the files that the program trusts; with ``--help`` it loads none."""
+    if not HELP & set(flags):
+        say_what_is_trusted(*paths)
+
+
 def _train(given: argparse.Namespace, flags: list[str]) -> None:
     if given.algo == "tdpg" and {"-optimize", "--optimize-hyperparameters"} & set(flags):
         raise ValueError("train does not tune TDPG: use `sb3-tdpg tune` with the same flags, but without -optimize")
     folder, seed = given.resume, []
     rl_zoo3.train.StoreDict = StoreDict if folder is None else _PlainDict  # type: ignore[misc]
-    say_what_is_trusted(*(flag for flag in flags if flag.endswith(".zip")))  # of -i
+    _say_what_is_loaded(flags, *(flag for flag in flags if flag.endswith(".zip")))  # of -i
     if folder is not None:
         record = _read_record(folder, bool(flags or given.block))
         say_what_is_trusted(folder)
@@ -162,7 +169,7 @@ def _tune(given: argparse.Namespace, flags: list[str]) -> None:
 def _watch(program: str, given: argparse.Namespace, flags: list[str]) -> None:
     """Find models where ``train`` saves them, and let TDPG act with the stochastic policy that it trained."""
     is_stochastic = given.algo == "tdpg" and "--deterministic" not in flags
-    say_what_is_trusted(given.folder)
+    _say_what_is_loaded(flags, given.folder)
     sys.argv += ["--algo", "tdpg", "-f", "logs", *(["--stochastic"] if is_stochastic else []), *flags]
     unsafe, yaml.UnsafeLoader = yaml.UnsafeLoader, PlainLoader  # the zoo's would run what a file says
     try:
@@ -182,7 +189,7 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
         plt.switch_backend("agg")  # the plots end with plt.show(), which does nothing here
         warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
     if given.kind == "from-file":
-        say_what_is_trusted(*(flag for flag in flags if Path(flag).is_file()))
+        _say_what_is_loaded(flags, *(flag for flag in flags if Path(flag).is_file()))
     try:
         {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
     except (pickle.UnpicklingError, EOFError, LookupError, TypeError) as e:

@@ -265,12 +265,14 @@ def test_blocks_from_a_python_file_or_package_and_a_policy_by_its_path(here, mon
 
 
 def test_help_lists_our_flags_and_the_zoos(capsys):
-    for program, flag in (("train", "--resume"), ("tune", "--objective"), ("plot", "--save")):
+    own = (("train", "--resume"), ("tune", "--objective"), ("plot", "--save"), ("enjoy", "--exp-id"))
+    for program, flag in own:
         with pytest.raises(SystemExit) as stop:
             main([program, "--help"])
         assert stop.value.code == 0
         text = capsys.readouterr().out
         assert flag in text and ("--n-timesteps" in text or "--exp-folder" in text)
+        assert "trusting whoever" not in text  # nothing is loaded
 
 
 def test_a_training_that_a_callback_ends_early_is_finished(here):
