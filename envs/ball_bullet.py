@@ -49,7 +49,7 @@ class BulletScene(BulletWorld):
 
 
 class BulletRenderer(BulletScene):
-    """The camera of the robot: it does not move, but wall and ball do."""
+    """Render the robot's camera. The camera stands still; wall and ball move."""
 
     def __init__(self, scene: BallScene) -> None:
         super().__init__(scene)

@@ -204,7 +204,7 @@ class PandaGraspEnv(SharedEnv):
 
     def film(self) -> Iterator[np.ndarray]:
         """
-        Draw the last grasp from beginning to end, 30 pictures a second, beside the depth image before it.
+        Yield the frames of the last grasp, at 30 frames per second, beside the depth image before it.
 
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """

@@ -111,7 +111,7 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
         return step._replace(details=[{**more, **push} for more, push in zip(step.details, insertions, strict=True)])
 
     def render(self) -> np.ndarray | None:
-        """Draw the scene before or after a squeeze, or after the insertion: ``(256, 384, 3)`` uint8."""
+        """Draw the scene before a squeeze, after it, or after the insertion: ``(256, 384, 3)`` uint8."""
         if self.render_mode is None:
             return None
         state = self._current_state()
@@ -121,7 +121,7 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
 
     def film(self) -> Iterator[np.ndarray]:
         """
-        Draw the last squeeze, and the insertion if there was one, 30 pictures a second.
+        Yield the frames of the last squeeze, and of the insertion if there was one, at 30 frames per second.
 
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """

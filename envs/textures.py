@@ -25,7 +25,7 @@ ROWS, COLUMNS = np.meshgrid(*[(np.arange(SIZE) + 0.5) / SIZE] * 2, indexing="ij"
 
 
 def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
-    """Tileable smooth noise with about ``waves`` blobs a side, spread over [0, 1]."""
+    """Draw tileable smooth noise with about ``waves`` blobs per side, spread over [0, 1]."""
     frequency = np.fft.fftfreq(SIZE, 1 / SIZE)
     envelope = np.exp(-((frequency[:, None] ** 2 + frequency**2) / (2 * waves**2)))
     field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((SIZE, SIZE))) * envelope).real
@@ -33,7 +33,7 @@ def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
 
 
 def bricks(rng: np.random.Generator) -> np.ndarray:
-    """Running bond: 8 courses of 4 bricks (1 m x 2 m each), every brick of its own shade, light mortar."""
+    """Draw a running bond: 8 courses of 4 bricks (1 m x 2 m each), every brick of its own shade, light mortar."""
     courses, per_course, mortar = 8, 4, 2 * 8 / SIZE  # the joint as a fraction of a course
     course = (ROWS * courses).astype(int)
     along = COLUMNS * per_course + 0.5 * (course % 2)
@@ -44,21 +44,21 @@ def bricks(rng: np.random.Generator) -> np.ndarray:
 
 
 def tiles(rng: np.random.Generator) -> np.ndarray:
-    """A chequerboard of squares with unequal shades."""
+    """Draw a chequerboard of squares with unequal shades."""
     per_side = 2 * int(rng.integers(2, 5))
     rows, columns = ((axis * per_side).astype(int) for axis in (ROWS, COLUMNS))
     return 0.3 * rng.random((per_side, per_side))[rows, columns] + 0.7 * ((rows + columns) % 2)
 
 
 def stripes(rng: np.random.Generator) -> np.ndarray:
-    """Straight stripes: vertical, horizontal or slanted."""
+    """Draw straight stripes: vertical, horizontal or slanted."""
     number, slant = int(rng.integers(3, 7)), int(rng.integers(-2, 3))
     rows, columns = (COLUMNS, ROWS) if rng.random() < 0.5 else (ROWS, COLUMNS)
     return 0.5 + 0.5 * np.sin(2 * np.pi * (number * columns + slant * rows))
 
 
 def dots(rng: np.random.Generator) -> np.ndarray:
-    """Round dots, each row shifted by half a distance."""
+    """Draw round dots, with every other row shifted by half a distance."""
     per_side = 2 * int(rng.integers(2, 4))
     rows, columns = ROWS * per_side, COLUMNS * per_side
     columns = columns + 0.5 * (rows.astype(int) % 2)
@@ -67,7 +67,7 @@ def dots(rng: np.random.Generator) -> np.ndarray:
 
 
 def planks(rng: np.random.Generator) -> np.ndarray:
-    """Vertical boards of unequal shades with a grain and dark gaps."""
+    """Draw vertical boards of unequal shades with a grain and dark gaps."""
     number = int(rng.integers(6, 11))
     board = (COLUMNS * number).astype(int)
     grain = np.roll(_noise(rng, 6.0), rng.integers(SIZE), axis=0)
@@ -76,17 +76,17 @@ def planks(rng: np.random.Generator) -> np.ndarray:
 
 
 def blobs(rng: np.random.Generator) -> np.ndarray:
-    """Patches like leaves or camouflage, in four shades."""
+    """Draw patches like leaves or camouflage, in four shades."""
     return np.floor(4 * _noise(rng, 4.0)) / 3
 
 
 def waves(rng: np.random.Generator) -> np.ndarray:
-    """Horizontal bands that a smooth noise bends, as in marble."""
+    """Draw horizontal bands that smooth noise bends, as in marble."""
     return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * ROWS + 1.2 * _noise(rng, 2.0)))
 
 
 def speckles(rng: np.random.Generator) -> np.ndarray:
-    """Fine and coarse noise, as in rough plaster."""
+    """Draw fine and coarse noise, as in rough plaster."""
     return 0.5 * _noise(rng, 3.0) + 0.5 * _noise(rng, 24.0)
 
 

@@ -284,7 +284,7 @@ class TDPG(EpisodicAlgorithm):
         begin an epoch at t = 0.
 
         :param env: The training environments.
-        :param callback: Called at each step, and at the beginning and the end.
+        :param callback: Called at each step, and at the beginning and the end of the rollout.
         :param rollout_buffer: Receives the episodes.
         :param n_rollout_steps: Unused: an epoch is a number of episodes.
         :return: False if a callback asked to stop.

@@ -240,8 +240,9 @@ class TrainingEpisodes:
         """
         Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
 
-        The mean of a step's divergence under the *shifted* distribution is at most its worst mean within the divergence
-        of the steps before. Where it exceeds a cap, the bound assumes an unshifted step and the largest episode cost.
+        Under the shifted distribution, the mean divergence of a step is at most the largest mean over all distributions
+        within the divergence of the earlier steps. Where it exceeds a cap, the bound assumes an unshifted step and the
+        largest episode cost.
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """

@@ -200,7 +200,7 @@ def save_gif(
     palette: Image.Image | None = None,
 ) -> None:
     """
-    Write images of the same size as a GIF that repeats, with one palette: with one for each, they would flicker.
+    Write images of equal size as a looping GIF. All share one palette, because separate palettes flicker.
 
     :param path: The file; its folder exists.
     :param images: RGB.

@@ -49,7 +49,7 @@ def evaluate_scenarios(
     same noise if the environment draws the same number of random numbers whatever the actions. The same holds for all
     scenarios of one environment. The global random generators are restored.
 
-    :param model: One SB3 model, or several by their label.
+    :param model: One SB3 model, or a mapping from labels to models.
     :param scenarios: The rows of the table to make.
     :param n_episodes: Number of episodes of each model in each scenario that has no number of its own.
     :param seed: Seed of the environments and of the policies' sampling.

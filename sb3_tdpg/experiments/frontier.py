@@ -50,7 +50,8 @@ def frontier(
     settings: Mapping[str, Any] | None = None,
 ) -> str:
     """
-    Train without a penalty, with limits on the cost, and blind; draw cost against information, and say if it pays.
+    Train without a penalty, with limits on the cost, and blind. Draw cost against information, and say
+    whether the bottleneck pays.
 
     Each limit keeps a share of the improvement over training (``beta="auto", cost_limit="95%"``). The *open loop* is
     the same training with a policy that sees only the time. Its best seed is the *best open loop* that was found. The
@@ -181,8 +182,8 @@ def verdict(table: pd.DataFrame) -> str:
 
     Two questions. *Is information to spare?* A limit keeps at least 90 % of the improvement and at most a tenth of the
     information. *Is the open loop cheap?* The best open loop costs at most 1.5 times as much as the policy without a
-    penalty (for negative costs: at most half of their size more). Two times yes: probably; once: perhaps; else, and if
-    the policy without a penalty carries no information: probably not.
+    penalty (for a negative cost: at most half of its absolute value more). Two times yes: probably; once: perhaps;
+    else, and if the policy without a penalty carries no information: probably not.
 
     :param table: From :func:`frontier_table`.
     """

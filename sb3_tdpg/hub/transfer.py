@@ -143,7 +143,7 @@ def load_from_hub(
     :param trust_remote_code: Whether to unpickle the download, which can run any code. Default: whether the variable
         ``TRUST_REMOTE_CODE`` is set, as in ``huggingface_sb3``.
     :param kwargs: See :meth:`TDPG.load <sb3_tdpg.TDPG.load>`.
-    :raises ValueError: without that trust, or if there is no such model of TDPG.
+    :raises ValueError: if ``trust_remote_code`` is not true, or if the repository has no such model of TDPG.
     """
     if trust_remote_code is None:
         trust_remote_code = os.environ.get("TRUST_REMOTE_CODE", "").lower() in ("1", "true", "yes", "y", "on", "t")

@@ -143,7 +143,7 @@ def reproduce_ball(
         (the rows ``SHIFTS``), figures, ``config.json`` and ``runs/``.
     :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own.
     :param controls: Also train the ablations, PPO, and RecurrentPPO with our encoder; a later call may add them.
-    :param n_seeds: Training seeds of each method, at most five of the controls.
+    :param n_seeds: Training seeds of each method; the ablations and the further baselines get at most five.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`; 200 episodes a row by default, 20 in front of a wall.
     :return: the summary, as Markdown
     """

@@ -56,7 +56,7 @@ COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ra
 
 
 def methods(reading: str) -> list[Method]:
-    """List PG and TDPG with each estimator for a definition of the cost; ``"paper"``: with the paper's settings."""
+    """List the methods for one cost definition: PG, and TDPG with each estimator. For ``"paper"``, use its settings."""
     if reading == "paper":
         tdpg = [
             Method(f"paper's TDPG, 1/beta = {inverse}", "Lava-v0-paper", overrides=dict(beta=1 / inverse))

@@ -176,7 +176,7 @@ def complete_training(training: Training, root: Path) -> Path:
 
 
 def with_limit(training: Training, root: Path) -> Training:
-    """Add a cost limit: 95 % of the return, with the noise of the policy, that a finished training reached."""
+    """Add a cost limit of 95 % of the return that a finished training reached with the stochastic policy."""
     episodes = pd.read_csv(root / training.folder_name / "episodes.csv")
     reached = episodes.loc[~episodes["deterministic"], "return"].mean()
     limit = (1 - SHARE) * abs(reached) - reached

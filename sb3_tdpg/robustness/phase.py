@@ -39,7 +39,7 @@ def actions(policy: Any, batch: Any) -> list[Distribution]:
 
 
 def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.Tensor:
-    """Compute D[pi_p || pi_q], averaged over the living steps, in nats a step."""
+    """Compute D[pi_p || pi_q], averaged over the steps that are alive, in nats per step."""
     parts = zip(p, q, strict=True)
     by_part = [kl_divergence(of_p, of_q).reshape(batch.alive.numel(), -1).sum(dim=1) for of_p, of_q in parts]
     return (batch.alive * th.stack(by_part).sum(dim=0).view_as(batch.alive)).sum() / batch.alive.sum()
