@@ -124,7 +124,7 @@ class FastRenderer:
         """Do nothing: there is nothing to release."""
 
     def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
-        """Draw walls at some distance, ``(N,)``, whose depth is given by the row: ``(N, 64)``."""
+        """Draw one wall for each image, from its distance ``(N,)`` and its depth in each row of pixels, ``(N, 64)``."""
         first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)  # (64,); equal but at its sides
         with_wall = np.flatnonzero((depth < last).any(axis=0))
         if not len(with_wall):

@@ -84,7 +84,7 @@ class PandaGraspEnv(SharedEnv):
     :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
-    :param motion: ``"fast"``, or ``"reference"``, the paper's slow one.
+    :param motion: ``"fast"``, or ``"reference"``, the paper's slow motion.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch; the results are the same.
     :param render_mode: ``None``, ``"rgb_array"`` (the scene and the depth image) or ``"human"`` (PyBullet's window).

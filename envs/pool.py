@@ -22,14 +22,14 @@ SHARES = 8  # parts of a batch for each process, so that all end at about the sa
 
 class WorkPool:
     """
-    Several processes with a worker each, which share a batch; the results are the same bit for bit.
+    Share a batch among several processes with one worker each; the results are the same bit for bit.
 
     The processes ignore Ctrl-C and end with this one. If one dies, the next call raises
     :class:`concurrent.futures.process.BrokenProcessPool`.
 
-    :param n_processes: Their number.
+    :param n_processes: Number of processes.
     :param make_worker: Called once in each process, for instance a class.
-    :param arguments: Its arguments.
+    :param arguments: Arguments of ``make_worker``.
     """
 
     def __init__(self, n_processes: int, make_worker: Callable[..., Any], *arguments: Any) -> None:

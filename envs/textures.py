@@ -96,7 +96,7 @@ Colour = tuple[float, float, float]  # hue, saturation, value, each in [0, 1]
 
 
 def _paint(pattern: Pattern, seed: int, dark: Colour, light: Colour) -> np.ndarray:
-    """Draw a pattern between two colours with a little grain, upright on the wall."""
+    """Blend two colours by a pattern, add a little grain, and turn the picture upright for the wall."""
     rng = np.random.default_rng(seed)
     ends = np.array([colorsys.hsv_to_rgb(*dark), colorsys.hsv_to_rgb(*light)])
     amount = pattern(rng)[..., None]  # (S, S, 1)

@@ -79,7 +79,7 @@ class EpisodeBatch(NamedTuple):
         """
         Return what the mutual-information estimators use, detached.
 
-        :param pooled: Take the living steps of all times as samples of one variable: ``(1, n, ...)``.
+        :param pooled: Pool the steps that are alive over all times as samples of one variable: ``(1, n, ...)``.
         """
         # Of rebuilt TRVs, too, so that gradients reach both sides of the recurrence.
         prev_trvs = th.cat([self.prev_trvs[:1], self.trvs[:-1]])

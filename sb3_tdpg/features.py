@@ -66,8 +66,9 @@ class SpatialSoftmax(nn.Module):
         p_c = \sum_i \mathrm{softmax}_i(\alpha_c z_{ci}) \, (x_i, y_i)
 
     over the pixels i, with positions from -1 to 1, the activations :math:`z_{ci}` standardised over the image, and a
-    learned factor :math:`\alpha_c`. What moves in the image moves its keypoint in proportion, also to where it never
-    was in training. From Levine et al. (2016), End-to-end training of deep visuomotor policies, who do not standardise.
+    learned factor :math:`\alpha_c`. An object that moves in the image moves its keypoint in proportion, also to places
+    that training never showed. From Levine et al. (2016), End-to-end training of deep visuomotor policies, who do not
+    standardise the activations.
 
     :param channels: C
     :param height: H

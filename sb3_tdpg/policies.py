@@ -82,7 +82,7 @@ class TRVPolicy(BasePolicy):
     :param gate: Whether a gate g in [0, 1] for each TRV, another output of the encoder, decides how much of the last
         TRVs is kept, as the update gate of a GRU: ``mean = g * candidate + (1 - g) * last TRVs``, where the candidate
         is the mean without a gate. The policy then remembers over many steps. Not with ``skip``.
-    :param action_mean_init: The action to begin with, ``(U,)``, in the units of the head's outputs; default: near 0
+    :param action_mean_init: Mean action before training, ``(U,)``, in the units of the head's outputs; default: near 0
         (Box actions).
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0.
     :param action_log_var_init: The same for the action head (Box actions).

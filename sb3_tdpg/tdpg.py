@@ -240,7 +240,7 @@ class TDPG(EpisodicAlgorithm):
 
     @property
     def pools_information(self) -> bool:
-        """Whether one estimate is made of the living steps of all times, which then share their weights."""
+        """Whether one estimate pools the steps of all times, which is so if they share the policy's weights."""
         return not self.policy.time_varying
 
     def _setup_beta(self) -> None:

@@ -204,7 +204,7 @@ def save_gif(
 
     :param path: The file; its folder exists.
     :param images: RGB.
-    :param durations: How long each stays, in ms.
+    :param durations: Duration of each image, in ms.
     :param palette: An image whose palette to use; default: 256 colours of eight of the images.
     """
     if palette is None:

@@ -134,7 +134,7 @@ def read_run(folder: Path) -> Publication:
 
 
 def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
-    """Read the episodes of a run; a file that was cut is refused."""
+    """Read the episodes of a run, and refuse a truncated file."""
     expected = sum(row.get("n_episodes") or config["n_eval_episodes"] for row in config["scenarios"])
     try:
         records = pd.read_csv(path)

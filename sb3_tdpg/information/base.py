@@ -40,7 +40,7 @@ class InformationBatch(NamedTuple):
         return self._each(lambda x: x[:, episodes])._replace(alive=alive)
 
     def pooled(self) -> InformationBatch:
-        """Take the living steps of all times as samples of one variable: ``(1, n, ...)``."""
+        """Pool the steps that are alive over all times as samples of one variable: ``(1, n, ...)``."""
         return self._each(lambda x: x[self.living][None])
 
     def _each(self, take: Callable[[th.Tensor], th.Tensor]) -> InformationBatch:

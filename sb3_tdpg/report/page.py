@@ -65,7 +65,7 @@ def write_page(numbers: Numbers, page: Page) -> str:
 
 
 class Costs:
-    """Write costs with the same number of decimals everywhere: three significant digits of the unperturbed costs."""
+    """Write all costs with the number of decimals that gives the unperturbed costs three significant digits."""
 
     def __init__(self, numbers: Numbers) -> None:
         self.numbers = numbers

@@ -37,12 +37,12 @@ def put(observations: Observations, which: Any, new: Observations) -> None:
 
 class Members:
     """
-    What N episodes have of a family of perturbations: a member each. These ones change nothing.
+    Hold one member of a family of perturbations for each of N episodes. This base class changes nothing.
 
-    They have their own random generator, so the random numbers of the environment do not change. A subclass draws what
-    an episode keeps, and calls :meth:`begin` at the end of its constructor.
+    The members have their own random generator, so the random numbers of the environment do not change. A subclass
+    draws what an episode keeps, and calls :meth:`begin` at the end of its constructor.
 
-    :param names: They are part of the seed: nested perturbations and parts must not draw the same numbers.
+    :param names: Part of the seed, so that nested perturbations and parts do not draw the same numbers.
     :param seed: ``None``: random, until :meth:`reseed`.
     :param children: Members that are seeded with these, and begin with them.
     """

@@ -47,7 +47,7 @@ def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.T
 
 class NuisancePhase(TDPGCallback):
     r"""
-    After the passes of an epoch with plain rollouts, remove what the actions know of a nuisance.
+    After each epoch of plain rollouts, make the actions ignore a nuisance.
 
     The policy on perturbed observations learns to do what it did on plain ones before the phase (the *teacher*), and on
     plain ones to stay as it was, with the same noise of the TRVs:
