@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 
-LEAST_SLACK = 0.01  # of the limit
+LEAST_SLACK = 0.01  # of the limit, or of the improvement: costs of an epoch scatter
 RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
 MAX_GROWTH = 1000.0  # of the starting weight; else it would grow forever where the task needs no information
 # Of a limit that is a share of the improvement.
@@ -29,8 +29,9 @@ class AutoWeight:
     """
     Adapt the weight w of "minimise the information subject to E[cost] <= C" by dual ascent.
 
-    The weight is 0 until the cost first meets the limit. It then starts where the penalty equals the limit, grows while
-    the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"`` does for the entropy:
+    The weight is 0 until the cost first meets the limit. It then starts where the penalty equals the scale (below 1 nat
+    it is smaller), grows while the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"``
+    does for the entropy:
 
         log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
@@ -89,8 +90,11 @@ class AutoWeight:
             )
         scale, aim, low, high = abs(self.limit), self.limit, -2.0, 1.0
         if self.by_slack:
-            scale = max(self.limit - self._lowest, LEAST_SLACK * scale)
-            aim, low, high = self.limit - scale / 2, -3.0, 0.3
+            slack = max(self.limit - self._lowest, 0.0)
+            if self.first_cost is not None:  # a share's scale must not depend on where costs have their zero
+                scale = min(scale, abs(self.first_cost - self._lowest))
+            scale = max(slack, LEAST_SLACK * scale, 1e-9)
+            aim, low, high = self.limit - slack / 2, -3.0, 0.3
         if self.share is not None:
             high *= min(1.0, progress_remaining / LATEST_START)
         if self.value > 0.0:

@@ -48,6 +48,7 @@ class EpisodeBatch(NamedTuple):
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
     advantages: th.Tensor  #: ``(T, N)``, zero until they are computed
     prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at t = 0
+    episode: th.Tensor  #: ``(T, N)``, number of the episode, also of a segment
 
     def select(self, columns: th.Tensor | slice) -> EpisodeBatch:
         """Select episodes or segments by their columns."""
@@ -85,7 +86,7 @@ class EpisodeBatch(NamedTuple):
         prev_trvs = th.cat([self.prev_trvs[:1], self.trvs[:-1]])
         alive = None if bool(self.alive.all()) else self.alive.bool()
         batch = InformationBatch(self.states, self.trvs, self.means, self.stds, alive, prev_trvs)
-        return batch.pooled() if pooled else batch
+        return batch._replace(episode=self.episode).pooled() if pooled else batch
 
 
 class PolicyStep(NamedTuple):
@@ -201,7 +202,9 @@ class EpisodeBuffer(RolloutBuffer):
         stored = {name: each_part(tensor, getattr(self, name)) for name in STORED}
         trvs = stored["trvs"]
         prev_trvs = th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])
-        return EpisodeBatch(**stored, advantages=th.zeros_like(stored["costs"]), prev_trvs=prev_trvs)
+        episode = th.arange(n_episodes, device=trvs.device).expand(length, -1)
+        advantages = th.zeros_like(stored["costs"])
+        return EpisodeBatch(**stored, advantages=advantages, prev_trvs=prev_trvs, episode=episode)
 
     @property
     def episode_costs(self) -> np.ndarray:

@@ -22,6 +22,7 @@ from sb3_tdpg.information import get_estimator_class
 
 ENCODER_GRADIENTS = ("score", "pathwise")
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+VAST = 1e6  # a bound that stands for none
 MIN_BATCH_STEPS = 32  # the information of a minibatch is that of as many samples
 
 # What users of PPO and RecurrentPPO look for, and what it is here.
@@ -244,13 +245,19 @@ def check_action_space(space: spaces.Space) -> None:
     if not isinstance(space, SUPPORTED_ACTION_SPACES):
         names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
         raise ValueError(f"the action space {space} is not supported: use one of {names}")
-    if isinstance(space, spaces.Discrete) and space.start != 0:
-        raise ValueError(f"the action space {space} must begin with 0: policies of SB3 return 0 to n - 1")
-    if isinstance(space, spaces.Box) and not np.isfinite([space.low, space.high]).all():
+    check_start("action", space)
+    if isinstance(space, spaces.Box) and not (np.abs([space.low, space.high]) < VAST).all():
         raise ValueError(
-            f"the action space {space} has infinite bounds: give it finite ones, for instance with "
-            "gymnasium.wrappers.RescaleAction or in the environment itself; actions beyond them are clipped"
+            f"the action space {space} has infinite bounds, or of {VAST:g} and more: give it finite ones, for instance "
+            "with gymnasium.wrappers.RescaleAction or in the environment itself; actions beyond them are clipped"
         )
+
+
+def check_start(what: str, space: spaces.Space) -> None:
+    """Raise a ``ValueError`` if a discrete space, or a part of one, does not begin with 0."""
+    for part in space.values() if isinstance(space, spaces.Dict) else [space]:
+        if isinstance(part, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(part.start != 0):
+            raise ValueError(f"the {what} space {part} must begin with 0: SB3 takes and returns 0 to n - 1")
 
 
 def nearest_multiples(n: int, divisor: int) -> str:

@@ -33,6 +33,7 @@ from sb3_tdpg.checks import nearest_multiples, refuse_others, warn_if_short
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.features import of_images
 from sb3_tdpg.information import InformationEstimator
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.presets import DEFAULTS, Defaults, implied, preset_of
@@ -79,6 +80,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     """Policy epochs completed."""
     information: np.ndarray | None = None
     """I[x_t; x~_t] of the last rollouts in nats, ``(T,)``; None without a penalty."""
+    normalizes: bool = False
+    """Whether the environment of the training normalised observations (``VecNormalize``)."""
     _random_state: RandomState | None = None
     _problem: Problem | None = None
 
@@ -112,7 +115,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                 f"that each environment runs the same number of episodes: use "
                 f"{nearest_multiples(self.n_episodes, env.num_envs)}"
             )
-        problem = read_problem(env)
+        problem = read_problem(env, **of_images(self.policy_kwargs))
         if self.horizon not in (0, problem.horizon) or self.state_dim not in (0, problem.state_dim):
             raise ValueError(
                 f"the environment has horizon={problem.horizon} and {problem.state_dim} state components, but the "
@@ -124,6 +127,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         self._problem = problem
         self.horizon, self.state_dim = problem.horizon, problem.state_dim
         self.n_steps = self.epoch_size // env.num_envs
+        self.normalizes = (normalize := unwrap_vec_normalize(env)) is not None and normalize.norm_obs
 
     @property
     def epoch_size(self) -> int:
@@ -174,7 +178,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     def dump_logs(self, iteration: int = 0) -> None:
         """Write the log; the mean cost comes from all episodes of the epoch."""
-        self.logger.record("rollout/ep_cost_mean", float(self.rollout_buffer.episode_costs.mean()))
+        if self.rollout_buffer.full:  # a callback may ask for the log at any step
+            self.logger.record("rollout/ep_cost_mean", float(self.rollout_buffer.episode_costs.mean()))
         super().dump_logs(iteration)
 
     def _check_finite(self, name: str, value: th.Tensor) -> None:
@@ -240,7 +245,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         given = callback if isinstance(callback, list) else [callback]
         callbacks = [c if isinstance(c, BaseCallback) else ConvertCallback(c) for c in given]
-        callbacks = [c for each in callbacks for c in (each.callbacks if isinstance(each, CallbackList) else [each])]
+        callbacks = [c for each in callbacks for c in (each.callbacks if type(each) is CallbackList else [each])]
         first = [c for c in callbacks if isinstance(c, MINECallback)] or [MINECallback()]
         callbacks = [*first, *(c for c in callbacks if c not in first)]  # the others see the information
         if progress_bar:
@@ -366,10 +371,11 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         :param path: The file, ``.onnx`` or ``.pt``.
         :param format: ``"onnx"`` or ``"torchscript"``; default: by the suffix.
         :return: the file
+        :raises ValueError: if the training had a ``VecNormalize``, and the model has none.
         """
-        from sb3_tdpg.deployment.export import export_policy
+        from sb3_tdpg.deployment.export import export_trained
 
-        return export_policy(self.policy, path, format=format, normalization=self.get_vec_normalize_env())
+        return export_trained(self, path, format, self.get_vec_normalize_env())
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_problem", "_has_default_device"]

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 from torch.nn.functional import avg_pool2d
 
@@ -39,6 +39,12 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
     if space is not None and is_image_space(space, check_channels=False, normalized_image=not normalize_images):
         return "image"
     return "vector"
+
+
+def of_images(policy_kwargs: Any) -> dict[str, bool]:
+    """Return the keywords of the policy that decide the kind of an observation."""
+    given = policy_kwargs if isinstance(policy_kwargs, dict) else {}
+    return {name: value for name, value in given.items() if name == "normalize_images"}
 
 
 def flat_action_space(space: spaces.Space) -> spaces.Space:
@@ -178,9 +184,9 @@ def pooled_steps(extractor: nn.Module, observations: th.Tensor | dict[str, th.Te
 def flat_steps(extractor: nn.Module, x: th.Tensor) -> th.Tensor:
     """Flatten the steps of episodes for a feature extractor: ``(T, N, *obs) -> (T * N, *obs)``."""
     x = x.flatten(0, 1)
-    # Change the layout while the pixels are still bytes: it is cheaper.
-    is_pooled = isinstance(extractor, TRVCnn) and extractor.pool > 1
-    return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and not is_pooled else x
+    # Change the layout while the pixels are still bytes: it is cheaper. Others may rely on the usual one (``view``).
+    is_faster = isinstance(extractor, NatureCNN) or (isinstance(extractor, TRVCnn) and extractor.pool == 1)
+    return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and is_faster else x
 
 
 class ObservationNorm(nn.Module):

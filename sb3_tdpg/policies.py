@@ -195,7 +195,9 @@ class TRVPolicy(BasePolicy):
         if self.scale_actions and isinstance(action_space, spaces.Box):
             bounds = th.as_tensor(np.stack([action_space.low, action_space.high]).reshape(2, -1), dtype=th.float32)
             self.register_buffer("action_middle", bounds.mean(0), persistent=False)
-            self.register_buffer("action_range", (bounds[1] - bounds[0]) / 2, persistent=False)
+            half = (bounds[1] - bounds[0]) / 2
+            half = th.where(half > 0, half, 1.0)  # of an action that has one value only
+            self.register_buffer("action_range", half, persistent=False)
         self.optimizer = self.optimizer_class(
             self.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]  # the base class takes none, every optimiser does

@@ -153,14 +153,15 @@ POLICY_DEFAULTS = dict(
 )
 
 
-def preset_of(observation_space: spaces.Space | None, horizon: int | None) -> str:
+def preset_of(observation_space: spaces.Space | None, horizon: int | None, **keywords: bool) -> str:
     """
     Name the defaults for a problem: ``"vector"``, ``"image"``, ``"depth"`` or ``"long"``.
 
     :param observation_space: The environment's.
     :param horizon: Its time limit T, if it is known.
+    :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """
-    kind = observation_kind(observation_space)
+    kind = observation_kind(observation_space, **keywords)
     return "long" if kind == "vector" and horizon is not None and horizon >= LONG_HORIZON else kind
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, VecEnvWrapper, VecMonitor
 
+from sb3_tdpg.checks import check_start
 from sb3_tdpg.features import observation_kind
 
 BRING_THE_STATE = (
@@ -67,12 +68,12 @@ class Problem:
         except KeyError as e:
             raise ValueError(f'the environment has a `state_space` but no info["state"]: {BRING_THE_STATE}') from e
         for i, state in enumerate(states):
-            if np.shape(state) != (self.state_dim,):
+            if np.size(state) != self.state_dim:
                 raise ValueError(
-                    f'info["state"] of environment {i} has shape {np.shape(state)}, but `state_space` says '
-                    f"{(self.state_dim,)}: mend reset() and step(), or the space"
+                    f'info["state"] of environment {i} has shape {np.shape(state)}, but `state_space` has '
+                    f"{self.state_dim} components: mend reset() and step(), or the space"
                 )
-        return np.stack(states)
+        return np.stack([np.ravel(state) for state in states])
 
 
 def unperturbed(env: VecEnv, obs: Any) -> Any:
@@ -82,8 +83,13 @@ def unperturbed(env: VecEnv, obs: Any) -> Any:
     return obs
 
 
-def read_problem(env: VecEnv) -> Problem:
-    """Read the horizon and the state of an environment without a step; a ``ValueError`` says what it lacks."""
+def read_problem(env: VecEnv, **keywords: bool) -> Problem:
+    """
+    Read the horizon and the state of an environment without a step; a ``ValueError`` says what it lacks.
+
+    :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
+    """
+    check_start("observation", env.observation_space)
     if isinstance(env.observation_space, spaces.Tuple):
         raise ValueError(
             f"the observation space {env.observation_space} is not supported: use gymnasium.wrappers.FlattenObservation"
@@ -97,7 +103,7 @@ def read_problem(env: VecEnv) -> Problem:
     state_space = attribute_of(env, "state_space")
     # POPGym's environments, which have this attribute, describe their state, too, but do not report it.
     is_observation = state_space is None or env.has_attr("observability_level")
-    if is_observation and observation_kind(env.observation_space) != "vector":
+    if is_observation and observation_kind(env.observation_space, **keywords) != "vector":
         raise ValueError(
             f"the mutual information needs the true state, and an image ({env.observation_space}) cannot stand in for "
             f"it: {BRING_THE_STATE}"

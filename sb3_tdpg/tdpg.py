@@ -34,7 +34,7 @@ from sb3_tdpg.checks import (
     with_keywords,
 )
 from sb3_tdpg.episodic import EpisodicAlgorithm, check_policy
-from sb3_tdpg.features import pooled_steps
+from sb3_tdpg.features import of_images, pooled_steps
 from sb3_tdpg.information import InformationEstimator, get_estimator_class
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.presets import Defaults, fill_in, preset_of
@@ -172,7 +172,9 @@ class TDPG(EpisodicAlgorithm):
         env = made_env(env, n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps)
         horizon = None if env is None else horizon_of(env)
         # A model that is being loaded has its preset from the file.
-        self.preset = None if env is None or not _init_setup_model else preset_of(env.observation_space, horizon)
+        self.preset = None
+        if env is not None and _init_setup_model:
+            self.preset = preset_of(env.observation_space, horizon, **of_images(policy_kwargs))
         settings = fill_in(given, self.preset or "vector", cost_limit, getattr(env, "num_envs", 1), horizon or 1)
         self._has_default_batch_size = batch_size is None
         self._has_default_device = device == "auto"
@@ -313,7 +315,8 @@ class TDPG(EpisodicAlgorithm):
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
-            self._update_info_buffer(infos, dones)
+            # Environments that wait for the others go on, and what they do is not stored.
+            self._update_info_buffer([infos[i] for i in running], dones[running])
 
             stored = dict(observations=obs, states=states, actions=actions, costs=-rewards)
             stored.update((name, getattr(step, name).cpu().numpy()) for name in ("noise", "trvs", "means", "stds"))
@@ -424,6 +427,7 @@ class TDPG(EpisodicAlgorithm):
             self.logger.record_mean("train/policy_loss", policy_loss.item())
             self.logger.record_mean("train/loss", loss.item())
             self.logger.record_mean("train/grad_norm", grad_norm.item())
+        vars(self.policy.action_dist).pop("distribution", None)  # with its graph the policy could not be copied
         # Last: the rollouts and all of their gradients saw the same inputs.
         self.policy.update_statistics(whole)
 

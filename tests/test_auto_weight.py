@@ -43,6 +43,18 @@ def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_on
         assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5 - 3)))
 
 
+def test_a_constant_in_every_cost_does_not_change_the_weight_of_a_share():
+    values = []
+    for constant in (0.0, 5000.0, -5000.0):
+        weight = AutoWeight("95%")
+        for epoch in range(100):
+            cost = 10 + 90 * math.exp(-epoch / 5)
+            weight.update(cost + constant, information=4.0, progress_remaining=1 - epoch / 100)
+        values.append(weight.value)
+    assert values == pytest.approx([values[0]] * 3, rel=1e-6)
+    assert values[0] > 4.5 / 4  # it has grown since its start
+
+
 def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
     weight = AutoWeight(cost_limit=10.0)
     for _ in range(500):

@@ -59,6 +59,12 @@ ARGUMENTS = {
     "batch_size above an epoch": (dict(batch_size=101), "batch_size=101", "between 10 and 100, the steps of an epoch"),
     "batch_size of one episode": (dict(batch_size=5), "batch_size=5", "between 10 and 100", "two episodes at least"),
     "bptt_steps none": (dict(bptt_steps=0), "bptt_steps=0", "integer of at least 1"),
+    "actions without bounds but in name": (
+        dict(env=toy_vec_env(action_space=spaces.Box(-1e30, 1e30, (1,)))), "infinite bounds, or of 1e.06 and more"
+    ),
+    "actions that begin with 1": (
+        dict(env=toy_vec_env(action_space=spaces.MultiDiscrete([2, 3], start=[1, 1]))), "must begin with 0"
+    ),
     "no threads": (dict(n_threads=0), "n_threads=0", "integer of at least 1"),
     "bptt_steps of a time-varying policy": (dict(bptt_steps=2), "bptt_steps=2", "horizon of 5", "time_varying=False"),
     "clip_range zero": (dict(clip_range=0.0), "clip_range=0.0", "positive", "inf"),

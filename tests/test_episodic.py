@@ -1,11 +1,14 @@
 """Rollouts of whole episodes: where an epoch ends, and what follows an error."""
 
+import copy
 import math
 
 import numpy as np
 import pytest
-from small_problems import AtEveryEpoch, CountdownEnv, tiny_tdpg, toy_vec_env, train_epochs
-from stable_baselines3.common.vec_env import DummyVecEnv
+from small_problems import AtEveryEpoch, AtEveryStep, CountdownEnv, lava_env, tiny_tdpg, toy_vec_env, train_epochs
+from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_tdpg import TDPG, TrainingDivergedError
 
@@ -40,6 +43,39 @@ def test_an_episode_that_somebody_else_has_begun_is_not_gone_on_with():
     train_epochs(model, 1, reset_num_timesteps=False)
     assert model.rollout_buffer.alive.all()
     np.testing.assert_allclose(model.rollout_buffer.observations[..., :1], model.rollout_buffer.states, rtol=1e-6)
+
+
+def test_the_log_counts_the_stored_episodes_only():
+    class Rows(KVWriter):
+        def write(self, key_values, key_excluded, step=0):
+            rows.append(dict(key_values))
+
+    env = VecMonitor(DummyVecEnv([lambda: CountdownEnv(0, [4]), lambda: CountdownEnv(1, [1])]))  # which goes on
+    model, rows = tiny_tdpg(env, n_episodes=2), []
+    model.set_logger(Logger(None, [Rows()]))
+    model.learn(2, callback=AtEveryStep(lambda each: each.model.dump_logs() is None), log_interval=None)
+    assert [info["l"] for info in model.ep_info_buffer] == [1, 4]
+    assert len(rows) == 4
+    assert not any("rollout/ep_cost_mean" in row for row in rows)  # of episodes that are not over
+
+
+def test_a_list_of_callbacks_of_the_user_s_own_keeps_its_hooks():
+    class Counting(CallbackList):
+        n_steps = 0
+
+        def _on_step(self):
+            self.n_steps += 1
+            return super()._on_step()
+
+    counting = Counting([])
+    tiny_tdpg(lava_env(4), n_episodes=4).learn(20, callback=counting)
+    assert counting.n_steps == 5
+
+
+def test_a_policy_can_be_copied_in_mid_training():
+    copies = []
+    train_epochs(tiny_tdpg(), 2, callback=AtEveryEpoch(lambda m: copies.append(copy.deepcopy(m.policy))))
+    assert len(copies) == 2
 
 
 def test_after_an_error_the_next_training_begins_with_new_episodes():

@@ -165,14 +165,22 @@ def test_the_information_is_pooled_over_the_steps_of_all_times():
     assert model.information.tolist() == pytest.approx([per_step * mean_length], rel=1e-5)
 
 
-def test_the_interval_of_pooled_information_is_that_of_an_episode():
-    model = tiny("Pendulum-v1", epoch_steps=2000, beta=1e6)
+def test_the_interval_of_pooled_information_takes_one_step_of_each_episode():
+    model = tiny(toy_vec_env(10, horizon=50), n_episodes=40, beta=1e6, policy_kwargs=dict(encoder_log_var_init=-2.0))
     logged = {}
     interval = InformationCallback(eval_freq=1)
     model.learn(2000, callback=[interval, AtEveryEpoch(lambda m: logged.update(m.logger.name_to_value))])
+    assert interval.interval.n_episodes.tolist() == [40]
     for limit, of_a_step in zip(("lower", "upper"), interval.interval.total, strict=True):
-        assert logged[f"mi/{limit}"] == pytest.approx(200 * of_a_step)
-    assert logged["mi/lower"] < logged["mi/total"] < 2 * logged["mi/upper"]
+        assert logged[f"mi/{limit}"] == pytest.approx(50 * of_a_step)
+    assert 0 <= logged["mi/lower"] < logged["mi/total"] < 2 * logged["mi/upper"]
+
+
+def test_an_epoch_with_too_few_episodes_for_an_interval_is_passed_over():
+    interval = InformationCallback(eval_freq=1)
+    with pytest.warns(UserWarning, match=r"no interval of the information: the epoch has 8 episodes, and 18 TRVs need"):
+        tiny(toy_vec_env(2, horizon=50)).learn(400, callback=interval)
+    assert interval.interval is None
 
 
 @pytest.mark.parametrize("mi_estimator", ["mine", "infonce", "loo", "vib"])

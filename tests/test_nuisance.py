@@ -161,5 +161,7 @@ def test_another_environment_brings_its_own_scenes():
 
 
 def test_a_nuisance_goes_inside_a_normalisation():
-    with pytest.raises(ValueError, match=r"nuisance='vector_noise': .*VecNormalize\(PerturbedVecEnv"):
-        tiny_tdpg(VecNormalize(make_episodes_env("Lava-v0", 20), norm_reward=False), nuisance="vector_noise")
+    normalized = VecNormalize(make_episodes_env("Lava-v0", 20), norm_reward=False)
+    for env in (normalized, VecMonitor(normalized)):
+        with pytest.raises(ValueError, match=r"nuisance='vector_noise': .*VecNormalize\(PerturbedVecEnv"):
+            tiny_tdpg(env, nuisance="vector_noise")

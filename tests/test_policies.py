@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_problems import ToyEnv, parameters, same_parameters, tiny_tdpg, toy_vec_env, train_epochs
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_tdpg import TDPG, TRVPolicy
 from sb3_tdpg.buffers import RebuiltTRVs, each_part
@@ -393,6 +394,23 @@ def test_the_variance_of_a_trv_levels_off_and_keeps_a_gradient_to_come_back_on()
     assert stds.max() <= np.exp(2) + 1e-2
     stds.sum().backward()
     assert policy.encoder.mlp.layers[-1].bias.grad.abs().max() > 0
+
+
+def test_an_action_with_a_single_value_keeps_it():
+    space = spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32))
+    model = TDPG(env=toy_vec_env(action_space=space, horizon=50), epoch_steps=100, batch_size=50, device="cpu", seed=0)
+    model.learn(100)
+    assert model.predict(np.zeros(2, np.float32))[0][1] == 0.5
+
+
+def test_an_extractor_may_rely_on_the_layout_of_images():
+    class Viewing(FlattenExtractor):
+        def forward(self, observations):
+            return observations.view(len(observations), -1)
+
+    kwargs = dict(features_extractor_class=Viewing, net_arch=dict(encoder=[4], action_head=[]))
+    env = toy_vec_env(observation_space=spaces.Box(0, 255, (3, 12, 12), np.uint8))
+    train_epochs(TDPG(env=env, n_episodes=4, policy_kwargs=kwargs, device="cpu"), 1)
 
 
 def test_observations_without_bounds_give_finite_actions():

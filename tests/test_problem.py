@@ -4,10 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from small_problems import ToyEnv, tiny_tdpg, train_epochs
+from gymnasium import spaces
+from small_problems import ToyEnv, tiny_tdpg, toy_vec_env, train_epochs, words
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_tdpg import BatchedVecEnv
+from sb3_tdpg import TDPG, BatchedVecEnv
 from sb3_tdpg.envs.lava import LavaEnv
 
 
@@ -68,7 +69,7 @@ def test_a_reward_that_is_too_large_is_named_with_environment_and_step(reward):
         train_epochs(model, 1)
 
 
-@pytest.mark.parametrize("shape", [(3,), (1, 1), ()])
+@pytest.mark.parametrize("shape", [(3,), (2, 2), (0,)])
 def test_a_state_of_another_shape_is_named_with_its_environment(shape):
     class WrongState(ToyEnv):
         def reset(self, **kwargs):
@@ -77,7 +78,7 @@ def test_a_state_of_another_shape_is_named_with_its_environment(shape):
 
     model = tiny_tdpg(DummyVecEnv([ToyEnv, WrongState]), n_episodes=8, mi_estimator="logdet")
     with pytest.raises(
-        ValueError, match=rf'"state"\] of environment 1 has shape {re.escape(str(shape))}.*\(1,\): mend'
+        ValueError, match=rf'"state"\] of environment 1 has shape {re.escape(str(shape))}.* has 1 components: mend'
     ):
         train_epochs(model, 1)
 
@@ -103,3 +104,33 @@ def test_a_wrong_shape_from_another_process_is_explained(others):
             train_epochs(tiny_tdpg(env, n_episodes=4), 1)
     finally:
         env.close()
+
+
+def test_a_state_of_two_dimensions_is_flattened():
+    class MatrixState(ToyEnv):
+        def __init__(self):
+            super().__init__()
+            self.state_space = spaces.Box(-1, 1, (2, 3))
+
+        def _info(self):
+            return {"state": np.full((2, 3), self.x)}
+
+    model = train_epochs(tiny_tdpg(DummyVecEnv([MatrixState]), n_episodes=4), 1)
+    assert (model.state_dim, model.rollout_buffer.states.shape[2]) == (6, 6)
+
+
+@pytest.mark.parametrize("space", [
+    spaces.Discrete(5, start=1), spaces.MultiDiscrete([2, 3], start=[0, 1]), spaces.Dict(n=spaces.Discrete(2, start=1))
+], ids=words)  # fmt: skip
+def test_discrete_observations_that_do_not_begin_with_0_are_refused(space):
+    with pytest.raises(ValueError, match=r"the observation space .* must begin with 0"):
+        TDPG(env=toy_vec_env(observation_space=space))
+
+
+def test_images_of_floats_are_images_if_the_policy_is_told_so():
+    env = toy_vec_env(observation_space=spaces.Box(0, 1, (3, 24, 24), np.float32))
+    model = TDPG(env=env, policy_kwargs=dict(normalize_images=False), n_episodes=4, device="cpu")
+    assert (model.preset, type(model.policy.features_extractor).__name__) == ("image", "TRVCnn")
+    blind = toy_vec_env(observation_space=env.observation_space, gives_state=False)
+    with pytest.raises(ValueError, match=r"an image .* cannot stand in for it"):
+        TDPG(env=blind, policy_kwargs=dict(normalize_images=False))

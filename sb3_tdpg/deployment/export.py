@@ -238,12 +238,26 @@ def export_model(
         raise ValueError(f"{model} is not there: give the .zip file that model.save() wrote")
     path = model.with_suffix("") if out is None else Path(out)
     statistics = statistics_beside(model)
-    return export_policy(
-        TDPG.load(model, device="cpu").policy,
+    return export_trained(
+        TDPG.load(model, device="cpu"),
         path,
-        format=format or ("onnx" if path.suffix not in FORMATS.values() else None),
-        normalization=None if statistics is None else load_from_pkl(statistics),
+        format or ("onnx" if path.suffix not in FORMATS.values() else None),
+        None if statistics is None else load_from_pkl(statistics),
     )
+
+
+def export_trained(model: Any, path: str | os.PathLike[str], format: str | None, normalization: Any) -> Path:
+    """
+    Write one step of the policy of a TDPG, see :func:`export_policy`.
+
+    :raises ValueError: if observations were normalised in its training, and there are no statistics.
+    """
+    if model.normalizes and normalization is None:
+        raise ValueError(
+            "the policy was trained on normalised observations, and there is no VecNormalize to export with it: load "
+            "the model with env=VecNormalize.load(file, env), or put the file vecnormalize.pkl beside it"
+        )
+    return export_policy(model.policy, path, format=format, normalization=normalization)
 
 
 def _is_not_of_torchvision(record: logging.LogRecord) -> bool:

@@ -1,9 +1,12 @@
 """A callback that logs a confidence interval of the information."""
 
+import warnings
+
 import numpy as np
 
 from sb3_tdpg.callbacks import TDPGCallback
 from sb3_tdpg.evaluation.interval import InformationInterval, component_estimates, information_interval, min_episodes
+from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.problem import read_problem
 
 
@@ -17,6 +20,9 @@ class InformationCallback(TDPGCallback):
     bound of the information about each component of the state, averaged over the time steps at which it varies.
     Components are named as in the environment's ``state_names``, without the unit, or ``x0``, ``x1``, ...
 
+    Where the steps share their weights, one random step of each episode is a sample, since those of one episode are not
+    independent; every episode counts the same. An epoch that has too few of them is passed over with a warning.
+
     :param eval_freq: Epochs from one interval to the next, beginning with the first.
     :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.
     """
@@ -29,21 +35,32 @@ class InformationCallback(TDPGCallback):
         self.interval: InformationInterval | None = None  # the latest
 
     def _on_training_start(self) -> None:
-        model, trv_dim = self.tdpg, self.tdpg.policy.trv_dim
-        # Where the steps share their weights, each step is a sample; elsewhere each episode is one.
-        name, size = ("epoch_steps", 1) if model.pools_information else ("n_episodes", model.horizon)
-        n_samples = model.epoch_size // size
-        if n_samples < min_episodes(trv_dim):  # it would log 0 and 0, the sums over no time step
+        model, needed = self.tdpg, min_episodes(self.tdpg.policy.trv_dim)
+        n_episodes = model.epoch_size // model.horizon
+        # With epoch_steps an epoch may have more of them, which end early.
+        if model.epoch_steps is None and n_episodes < needed:
             raise ValueError(
-                f"{name}={n_samples} is too small for an interval of the information in {trv_dim} TRVs: use at "
-                f"least {min_episodes(trv_dim)}"
+                f"n_episodes={n_episodes} is too small for an interval of the information in {model.policy.trv_dim} "
+                f"TRVs: use at least {needed}"
             )
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
         if model.epoch % self.eval_freq != 0:
             return
-        batch = model.rollout_buffer.episode_batch().information_batch(model.pools_information)
+        batch = model.rollout_buffer.episode_batch().information_batch()
+        n_episodes, needed = batch.trvs.shape[1], min_episodes(model.policy.trv_dim)
+        if n_episodes < needed:
+            warnings.warn(
+                f"no interval of the information: the epoch has {n_episodes} episodes, and {model.policy.trv_dim} TRVs "
+                f"need {needed}; give a larger epoch_steps, or n_episodes={needed}",
+                stacklevel=2,
+            )
+            return
+        if model.pools_information:
+            lengths = batch.living.sum(0).cpu().numpy()
+            t = (np.random.default_rng(model.epoch).random(n_episodes) * lengths).astype(int)
+            batch = InformationBatch(*(x[t, np.arange(n_episodes)][None] for x in batch[:4]))
         self.interval = information_interval(batch, seed=model.epoch)
         # As mi/total: of an episode, also where one estimate is made for its steps.
         n_steps = model.rollout_buffer.mean_length if model.pools_information else 1.0

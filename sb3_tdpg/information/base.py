@@ -23,6 +23,7 @@ class InformationBatch(NamedTuple):
     stds: th.Tensor  # (T, N, Z)
     alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
     prev_trvs: th.Tensor | None = None  # (T, N, Z), x~_{t-1}, for estimators of the directed information
+    episode: th.Tensor | None = None  # (T, N) its number, where several samples may be of one; None: each is of its own
 
     @property
     def living(self) -> th.Tensor:
@@ -45,9 +46,9 @@ class InformationBatch(NamedTuple):
 
     def _each(self, take: Callable[[th.Tensor], th.Tensor]) -> InformationBatch:
         """Apply a function to all samples, which all live in the result."""
-        prev_trvs = None if self.prev_trvs is None else take(self.prev_trvs)
+        prev_trvs, episode = (None if x is None else take(x) for x in (self.prev_trvs, self.episode))
         states, trvs, means, stds = map(take, self[:4])
-        return InformationBatch(states, trvs, means, stds, None, prev_trvs)
+        return InformationBatch(states, trvs, means, stds, None, prev_trvs, episode)
 
 
 class InformationEstimator(nn.Module):
@@ -76,16 +77,19 @@ class InformationEstimator(nn.Module):
         """
         Estimate I[x_t; x~_t], differentiable in ``trvs``, ``means`` and ``stds``.
 
-        The estimate is 0 at steps with fewer than :meth:`min_episodes` living episodes.
+        The estimate is 0 at steps with too few living episodes, see :meth:`has_enough`.
 
         :return: ``(T,)``, nats
         """
         if batch.alive is None:
             return self._estimate(batch, None)
-        alive = batch.alive.sum(dim=1).tolist()
-        enough = self.min_episodes(batch.alive.shape[1])
         zero = batch.trvs.new_zeros(1)
-        return th.cat([self._estimate(batch.at(t), t) if n >= enough else zero for t, n in enumerate(alive)])
+        steps = enumerate(self.has_enough(batch).tolist())
+        return th.cat([self._estimate(batch.at(t), t) if enough else zero for t, enough in steps])
+
+    def has_enough(self, batch: InformationBatch) -> th.Tensor:
+        """Return at which steps so many episodes are alive that there is an estimate: ``(T,)`` bool."""
+        return batch.living.sum(dim=1) >= self.min_episodes(batch.trvs.shape[1])
 
     def min_episodes(self, n_episodes: int) -> int:
         """Return the number of living episodes that an estimate needs in a batch of ``n_episodes``."""

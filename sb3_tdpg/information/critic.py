@@ -46,7 +46,7 @@ class CriticEstimator(InformationEstimator):
     :param activation_fn: Nonlinearity of the critics.
     :param learning_rate: Adam's learning rate.
     :param batch_size: Minibatch size B; at most half of the episodes, since joint and marginal samples of a step come
-        from different episodes.
+        from different episodes, and a quarter where some end before others.
     :param gradient_steps: Optimiser steps ("MINE epochs") in each policy epoch.
     :param warmup_gradient_steps: Optimiser steps in the first policy epoch.
     :param refit_below: Critics with an estimate on the batch below this value, in nats, or one that is not finite, have
@@ -107,11 +107,14 @@ class CriticEstimator(InformationEstimator):
         for name, shape in zip(MOMENTS, shapes, strict=True):
             self.register_buffer(name, th.zeros(shape))
         self.register_buffer("is_warm", th.tensor(False))
+        # Not saved: each epoch's fit comes before the estimates.
+        self.register_buffer("is_trained", th.ones(horizon, dtype=th.bool), persistent=False)
         self.register_buffer("state_mean", th.zeros(horizon, 1, state_dim))
         self.register_buffer("state_std", th.ones(horizon, 1, state_dim))
 
     step: th.Tensor
     is_warm: th.Tensor
+    is_trained: th.Tensor  # (T,), whether the last fit had enough living episodes
     state_mean: th.Tensor
     state_std: th.Tensor
 
@@ -153,7 +156,8 @@ class CriticEstimator(InformationEstimator):
         train, held_out = self._hold_out(batch)
         if self.standardize:
             self._update_scaling(train)
-        steps = (train.living.sum(1) >= self.min_episodes(train.trvs.shape[1])).nonzero()[:, 0]
+        self.is_trained = train.living.sum(1) >= 2 * self._minibatch_size(train)
+        steps = self.is_trained.nonzero()[:, 0]
         broken = steps
         if len(steps) > 0:
             samples = train._replace(states=self._scale(train.states))
@@ -183,7 +187,9 @@ class CriticEstimator(InformationEstimator):
         """Divide the episodes at random into those to train on and those to hold out, if any."""
         if self.held_out == 0:
             return batch, None
-        n = batch.trvs.shape[1]
+        of_column = None if batch.episode is None else batch.episode[0]  # steps of an episode stay together
+        numbers = th.arange(batch.trvs.shape[1]) if of_column is None else of_column.unique()
+        n = len(numbers)
         n_held_out = round(self.held_out * n)
         if min(n_held_out, n - n_held_out) < MIN_EPISODES:
             raise ValueError(
@@ -191,7 +197,10 @@ class CriticEstimator(InformationEstimator):
                 f"{n - n_held_out}: each needs at least {MIN_EPISODES}; change the share, or use more episodes"
             )
         order = th.randperm(n, device=batch.trvs.device)
-        return batch.select(order[n_held_out:]), batch.select(order[:n_held_out])
+        if of_column is None:
+            return batch.select(order[n_held_out:]), batch.select(order[:n_held_out])
+        is_held_out = th.isin(of_column, numbers[order[:n_held_out]])
+        return batch.select(~is_held_out), batch.select(is_held_out)
 
     def _total(self, batch: InformationBatch, steps: th.Tensor) -> float:
         """Sum the estimates of some steps over those with enough living episodes."""
@@ -203,8 +212,7 @@ class CriticEstimator(InformationEstimator):
         self, critic: BatchedMLP, optimizer: th.optim.Optimizer, batch: InformationBatch, steps: th.Tensor, n_steps: int
     ) -> None:
         """Maximise the objective; ``critic`` has one network for each row of the batch."""
-        n_rows, n_episodes = batch.trvs.shape[:2]
-        n = min(self.batch_size, n_episodes // 2)
+        n_rows, n = batch.trvs.shape[0], self._minibatch_size(batch)
         # In a refit the rows are those of `steps`; otherwise `steps` selects rows.
         rows = slice(None) if len(steps) == n_rows else steps
         for inputs in self._minibatches(batch, n, n_steps):
@@ -272,9 +280,17 @@ class CriticEstimator(InformationEstimator):
         rows = slice(None) if t is None else slice(t, t + 1)
         return (states - self.state_mean[rows]) / self.state_std[rows]
 
+    def _minibatch_size(self, batch: InformationBatch) -> int:
+        """Return B, with room for episodes that have ended: a gradient step needs 2 B that are alive."""
+        return max(1, min(self.batch_size, batch.trvs.shape[1] // (2 if batch.alive is None else 4)))
+
     def min_episodes(self, n_episodes: int) -> int:
-        """Return twice the minibatch size, which a gradient step needs."""
-        return 2 * min(self.batch_size, n_episodes // 2)
+        """Return two: a state is paired with the TRVs of another episode."""
+        return MIN_EPISODES
+
+    def has_enough(self, batch: InformationBatch) -> th.Tensor:
+        """Return at which steps there is an estimate: the critic was trained, and two episodes are alive."""
+        return self.is_trained & super().has_enough(batch)
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         states, trvs = self._scale(batch.states, t), batch.trvs

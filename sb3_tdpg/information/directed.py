@@ -16,11 +16,13 @@ class DirectedLogDet(LogDet):
     The bound of :class:`~sb3_tdpg.information.logdet.LogDet` on what a linear regression on the last TRVs leaves of
     the present ones.
 
-    The penalty becomes the directed information from the sensor to the TRVs. Given x~_{t-1}, the TRVs depend on the
-    past only through y_t, hence by the chain rule it bounds all that an episode's TRVs know of its observations:
+    The penalty becomes the directed information from the sensor to the TRVs: what the sensor brings into them. (What
+    the actions write into later observations does not count.) Given x~_{t-1}, the TRVs depend on the past only through
+    y_t, hence
 
     .. math::
-        I[y_{0:T}; \tilde x_{0:T}] \le \sum_t I[y_t; \tilde x_t | \tilde x_{t-1}]
+        I[y_{0:T} \to \tilde x_{0:T}] = \sum_t I[y_{0:t}; \tilde x_t | \tilde x_{0:t-1}]
+        \le \sum_t I[y_t; \tilde x_t | \tilde x_{t-1}]
         \le \sum_t \tfrac12 \log\det \mathrm{Cov}(\tilde x_t - A_t \tilde x_{t-1})
         - E[\textstyle\sum_i \log \sigma_i(e_t)]
 

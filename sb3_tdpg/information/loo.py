@@ -18,17 +18,24 @@ class LeaveOneOut(InformationEstimator):
         \frac{q(\tilde x_i | e_i)}{\frac{1}{N-1} \sum_{j \ne i} q(\tilde x_i | e_j)}\right],
         \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    An upper bound in expectation, for any shape of q(x~_t). It is loose above about ln N.
+    An upper bound in expectation, for any shape of q(x~_t). It is loose above about ln N. Where the steps of an episode
+    are pooled, the mixture leaves out all steps of the same episode.
     """
 
     bound = "upper"
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
         log_density = log_density_matrix(batch)
-        n = log_density.shape[1]
         own = log_density.diagonal(dim1=1, dim2=2)
-        others = log_density.masked_fill(th.eye(n, dtype=th.bool, device=own.device), -math.inf)
-        return (own - th.logsumexp(others, dim=2)).mean(dim=1) + math.log(n - 1)
+        if batch.episode is None:
+            same = th.eye(own.shape[1], dtype=th.bool, device=own.device)[None]
+        else:
+            same = batch.episode[:, :, None] == batch.episode[:, None, :]
+        n_others = (~same).sum(dim=2)
+        alone = n_others == 0  # all samples are of one episode, and say nothing
+        others = log_density.masked_fill(same & ~alone[..., None], -math.inf)
+        bound = own - th.logsumexp(others, dim=2) + n_others.clamp(min=1).log()
+        return bound.masked_fill(alone, 0.0).mean(dim=1)
 
 
 def own_sample_bound(batch: InformationBatch) -> th.Tensor:

@@ -64,7 +64,7 @@ class VariationalBottleneck(InformationEstimator):
         It does not change at steps with fewer than ``min_episodes`` of them.
         """
         means, variances = batch.means.detach(), batch.stds.detach().square()  # (T, N, Z)
-        enough = batch.living.sum(1) >= self.min_episodes(means.shape[1])
+        enough = self.has_enough(batch)
         means, variances, alive = means[enough], variances[enough], batch.living[enough]
         # Values after the end of an episode are arbitrary.
         means, variances = (x.masked_fill(~alive[:, :, None], 1.0) for x in (means, variances))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tdpg.buffers import each_part
@@ -47,7 +47,7 @@ class PerturbedVecEnv(VecEnvWrapper):
         if not isinstance(venv, VecEnv):
             name = type(venv).__name__
             raise ValueError(f"{name} is not a VecEnv of Stable-Baselines3: use make_vec_env, or DummyVecEnv")
-        if isinstance(venv, VecNormalize) and venv.norm_obs:
+        if (normalize := unwrap_vec_normalize(venv)) is not None and normalize.norm_obs:
             raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)
         family, self._seed = Family(perturbation, venv, severity, scale), seed

@@ -248,6 +248,12 @@ def test_bad_requests_are_told_in_one_line(tmp_path, monkeypatch, capsys):
     assert "nothing.zip is not there" in capsys.readouterr().err.strip().splitlines()[-1]
 
 
+def test_without_the_statistics_of_the_training_nothing_is_exported(tmp_path):
+    normalized().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"trained on normalised observations.*VecNormalize\.load"):
+        TDPG.load(tmp_path / "model", device="cpu").export(tmp_path / "p.pt")
+
+
 @pytest.mark.parametrize(
     ("flags", "made"), [([], "model.onnx"), (["--format", "torchscript"], "model.pt"), (["--out", "b/p.pt"], "b/p.pt")]
 )

@@ -241,6 +241,30 @@ def test_holding_out_nothing_reports_nothing_and_draws_no_number(name):
     assert th.equal(results[0][1], results[1][1])
 
 
+@pytest.mark.parametrize("name", CRITICS)
+def test_one_episode_that_ends_early_leaves_the_estimates_of_the_others(name):
+    numbers = th.randn(3, 60, 1)
+    batch = InformationBatch(numbers, numbers + th.randn_like(numbers), numbers, th.ones_like(numbers))
+    batch = batch._replace(alive=th.ones(3, 60, dtype=th.bool))
+    batch.alive[1:, 0] = False
+    estimator = build(name, 3, 1, 1, warmup_gradient_steps=50)
+    estimator.fit(batch)
+    assert (estimator(batch) != 0).all()
+    assert (estimator(batch.select(th.arange(10)))[1:] != 0).all()  # nor those of a minibatch of the policy
+    batch.alive[2, 5:] = False  # too few for a critic
+    estimator.fit(batch)
+    assert estimator(batch)[2] == 0
+
+
+def test_steps_of_an_episode_are_held_out_together():
+    estimator = build("mine", 1, 1, 1, **TINY_CRITIC, held_out=0.3)
+    numbers = th.arange(40.0).view(1, 40, 1)
+    batch = InformationBatch(numbers, numbers, numbers, numbers + 1, episode=th.arange(10).repeat_interleave(4)[None])
+    trained_on, held_out = estimator._hold_out(batch)
+    assert held_out.trvs.shape == (1, 12, 1)
+    assert not set(trained_on.episode[0].tolist()) & set(held_out.episode[0].tolist())
+
+
 @pytest.mark.parametrize("alive", [0, 1])
 def test_with_hardly_an_episode_alive_there_is_no_information_to_report(alive):
     mask = th.zeros(4, 60, dtype=th.bool)

@@ -92,6 +92,17 @@ def test_an_upper_bound_is_not_below_the_truth(name, dim, gain):
     assert np.mean(values) >= gaussian_information(gains)[0] - 3 * error
 
 
+def test_leave_one_out_is_an_upper_bound_on_pooled_steps_of_episodes_that_stand_still():
+    th.manual_seed(0)
+    episode = th.arange(20)[None].expand(100, -1)
+    means = 10 * th.randn(1, 20, 1).expand(100, -1, -1)
+    batch = InformationBatch(means, means + th.randn_like(means), means, th.ones_like(means), episode=episode)
+    truth = 0.5 * math.log1p(100)
+    assert LeaveOneOut(1, 1, 1)(batch.pooled()).item() > truth
+    alone = batch.select(th.zeros(1, dtype=th.long))  # no other episode to tell it from
+    assert LeaveOneOut(1, 1, 1)(alone.pooled()).item() == 0
+
+
 @pytest.mark.parametrize("name", UPPER)
 def test_an_upper_bound_holds_where_the_encoder_sees_a_noisy_observation_only(name):
     # I[x; x~] < I[y; x~], and the bound is on the latter.
