@@ -42,6 +42,9 @@ class PictureEnv(ToyEnv):
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, terminated or self.x > 0, truncated, info
 
+    def action_masks(self):
+        return np.array([False, True])
+
     def render(self):
         return np.full((30, 50, 3), int(100 * (self.x + 1)), np.uint8)
 
@@ -312,7 +315,7 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
 # -- other algorithms ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", ["A2C", "DQN", "PPO", "RecurrentPPO", "TRPO"])
+@pytest.mark.parametrize("algorithm", ["A2C", "DQN", "MaskablePPO", "PPO", "RecurrentPPO", "TRPO"])
 def test_models_of_other_algorithms_are_played(algorithm, own, tmp_path, capsys):
     make = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
     policy = "MlpLstmPolicy" if algorithm == "RecurrentPPO" else "MlpPolicy"
@@ -324,7 +327,7 @@ def test_models_of_other_algorithms_are_played(algorithm, own, tmp_path, capsys)
     assert costs_printed(capsys.readouterr().out) == pytest.approx(costs, abs=0.01)
     for episode in episodes:
         assert episode.signals.shape == (len(episode.costs), 1)  # the actions
-        assert set(episode.signals.ravel()) <= {0, 1}
+        assert set(episode.signals.ravel()) <= ({1} if algorithm == "MaskablePPO" else {0, 1})
     assert len(frames_of(film)[0]) == sum(len(episode.costs) + 1 for episode in episodes)
 
 
