@@ -25,6 +25,7 @@ from sb3_tdpg.report.models import fingerprint, label_of
 from sb3_tdpg.report.page import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
 from sb3_tdpg.robustness import PerturbedVecEnv
+from sb3_tdpg.robustness.registry import SCENES
 from tests.report.test_report_time import report_of
 
 pytest.importorskip("matplotlib")
@@ -226,12 +227,15 @@ def test_the_statistics_that_lie_beside_a_model_are_used(name, statistics, tmp_p
     np.testing.assert_array_equal(loaded.obs_rms.mean, env.obs_rms.mean)
 
 
-def test_images_get_a_gallery_and_a_scene(tmp_path):
+def test_images_get_a_gallery_and_a_scene(tmp_path, monkeypatch):
     model = tiny_tdpg("BallCatch-v0", n_episodes=4, cost_limit=20.0)
-    settings = dict(perturbations=["noise", "camera_pose"], severities=[5])
+    wall = np.zeros((16, 16, 3), np.uint8)
+    monkeypatch.setitem(SCENES["BallCatch-v0"], "white_wall", (dict(texture=wall + 255),) * 5)
+    settings = dict(perturbations=["noise", "camera_pose", "white_wall"], severities=[5], env_kwargs=dict(texture=wall))
     text = report_of(tmp_path, {"A": model}, "BallCatch-v0", **settings)
     assert "figures/examples.png" in text
     assert "| camera_pose | the environment changes | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
+    assert "| white_wall | the environment changes | `texture` | array (16, 16, 3) |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
     assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
 
