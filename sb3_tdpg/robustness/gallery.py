@@ -30,9 +30,9 @@ def perturbation_gallery(
     """
     Draw one image under each perturbation (rows) in each severity (columns), beside the unperturbed image.
 
-    The image is that of the first environment after 8 steps with the action 0, or the last one of a shorter episode, so
-    that late and lost frames can be seen. For an id, the perturbations of its scene (:func:`.scene_perturbations`) are
-    drawn, too.
+    The image is that of the first environment after 8 steps with the action 0 (moved into the bounds), or the last one
+    of a shorter episode, so that late and lost frames can be seen. For an id, the perturbations of its scene
+    (:func:`.scene_perturbations`) are drawn, too.
 
     :param env: An environment with images, or a registered id.
     :param names: The rows; default: all perturbations of images that apply.
@@ -72,7 +72,7 @@ def _look(env: VecEnv, seed: int) -> tuple[spaces.Space, int | None, list[np.nda
     """Return space and horizon, and the images of an episode of the first environment, up to the one that is drawn."""
     env.seed(seed)
     frames, horizon = [np.asarray(env.reset())[0]], horizon_of(env)
-    actions = np.zeros((env.num_envs, *(env.action_space.shape or ())), env.action_space.dtype)
+    actions = np.stack([Sensor(env.action_space).blank] * env.num_envs)
     for _ in range(min(N_STEPS, (horizon or N_STEPS + 1) - 1)):
         observations, _, dones, _ = env.step(actions)
         if dones[0]:
