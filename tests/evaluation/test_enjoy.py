@@ -140,6 +140,7 @@ def test_keywords_of_the_environment_reach_it(ball, tmp_path, capsys):
     assert main([*command, "--env-kwargs", *keywords[:2], "--env-kwargs", *keywords[2:]]) == 0
     printed = capsys.readouterr().out
     assert "final state [ 0.5 " in printed, "a robot that starts there and cannot move ends there"
+    assert f"the video is {tmp_path / 'film.gif'}\n" in printed
     red, green, blue = frames_of(tmp_path / "film.gif")[0][0][:200, 400:500].reshape(-1, 3).mean(0)
     assert min(red, blue) > 1.2 * green, "the wall is not violet"
 
