@@ -38,10 +38,12 @@ def perturbation_gallery(
     :param names: The rows; default: all perturbations of images that apply.
     :param env_kwargs: Keywords for the environment's constructor, with an id.
     :param seed: Seed of environment and perturbations.
-    :raises ValueError: if the observations are not images, or a perturbation does not apply.
+    :raises ValueError: if the observations are not images, or a perturbation does not apply, or there is none.
     """
     if env_kwargs and not isinstance(env, str):
         raise ValueError("env_kwargs are for an environment that is made here: give its id in place of it")
+    if names is not None and not names:
+        raise ValueError("names=[] leaves nothing to draw: name a perturbation, or give None for all that apply")
     scenes = scene_perturbations(env) if isinstance(env, str) else {}
 
     def look(scene_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, int | None, list[np.ndarray]]:

@@ -93,6 +93,8 @@ def test_the_gallery_refuses_what_it_cannot_show():
         perturbation_gallery(lava_env(2))
     with pytest.raises(ValueError, match="'texture' is unknown"):
         perturbation_gallery(make_episodes_env("BallCatch-v0", 1, env_kwargs=dict(renderer="fast")), ["texture"])
+    with pytest.raises(ValueError, match=r"names=\[\] leaves nothing to draw"):
+        perturbation_gallery("BallCatch-v0", [])
     with pytest.raises(ValueError, match="give its id in place of it"):
         perturbation_gallery(toy_vec_env(), env_kwargs=dict(renderer="fast"))
 
