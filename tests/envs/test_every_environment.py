@@ -296,10 +296,14 @@ def test_actions_of_another_shape_are_refused_and_not_counted(env_id):
     for _ in range(env.horizon):
         assert not env.step(np.zeros(size))[3]
     batch = BatchedVecEnv(env, 3)
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        batch.step(np.zeros((3, size)))
     batch.reset()
     for shape in ((1, size), (3, size + 1), (3,)):
         with pytest.raises(ValueError, match=rf"expected \(3, {size}\)"):
             batch.step(np.zeros(shape))
+    dones = [batch.step(np.zeros((3, size)))[2].all() for _ in range(env.horizon)]
+    assert dones == [False] * (env.horizon - 1) + [True]
 
 
 # -- what the constructors refuse ------------------------------------------------------------------------------------
