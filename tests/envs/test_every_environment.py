@@ -439,6 +439,13 @@ class Switch(POMDPEnv):
         return np.zeros(len(state))
 
 
+def test_actions_may_have_two_dimensions():
+    env = Switch()
+    env.action_space, env.cost = spaces.Box(-1, 1, (2, 2)), lambda state, action: action[:, 0, 1]
+    env.reset()
+    assert env.step(np.array([[0.0, 0.5], [0.0, 0.0]]))[1] == -0.5
+
+
 def test_actions_may_be_discrete():
     env = Switch()
     observation, _ = env.reset(seed=0)
