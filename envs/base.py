@@ -157,9 +157,10 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"the episode has not begun or is over (horizon={self.horizon}): call reset() first"
             )
         terminated = self._time + 1 == self.horizon
-        batch = np.asarray(action, dtype=np.float64)
-        batch = batch.reshape(1, -1) if self.action_space.shape else batch.reshape(1)
-        self._state, observation, cost, details = self.step_batch(self._state, batch, is_last=terminated)
+        action, shape = np.asarray(action, dtype=np.float64), self.action_space.shape
+        if action.size == np.prod(shape):  # step_batch refuses others
+            action = action.reshape(shape)
+        self._state, observation, cost, details = self.step_batch(self._state, action[None], is_last=terminated)
         self._time += 1
         info = {"state": self._state[0].copy(), "cost": float(cost[0])}
         for more in details:

@@ -25,13 +25,14 @@ class BulletClient:
     garbage collection, or when Python exits.
 
     :param gui: Open PyBullet's window; a process can have one.
-    :raises RuntimeError: if there is no display for the window, or no connection is left.
+    :raises ValueError: if there is no display for the window.
+    :raises RuntimeError: if no connection is left.
     """
 
     def __init__(self, *, gui: bool = False) -> None:
         if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             # PyBullet would end the whole process.
-            raise RuntimeError(
+            raise ValueError(
                 "render_mode='human' opens a window, but the environment variable DISPLAY is not set: run it in a "
                 "desktop session, or use render_mode='rgb_array'"
             )

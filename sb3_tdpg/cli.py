@@ -97,6 +97,8 @@ def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> 
 
     say_what_is_trusted(model)
     enjoy(model, env, parse_keywords(env_kwargs), **options)
+    if options["record"] is not None:
+        print(f"the video is {options['record']}")
 
 
 def _export(model: Path, out: Path | None, format: str | None) -> None:

@@ -78,9 +78,11 @@ class BatchedVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Apply the stored actions; see :class:`stable_baselines3.common.vec_env.VecEnv`."""
-        self._time += 1
-        is_last = self._time == self.env.horizon
+        if not len(self._state):
+            raise gym.error.ResetNeeded("the episodes have not begun: call reset() first")
+        is_last = self._time + 1 == self.env.horizon
         self._state, observation, cost, details = self.env.step_batch(self._state, self._actions, is_last=is_last)
+        self._time += 1
         self._returns -= cost
         infos: list[dict[str, Any]] = [
             {"state": state, "cost": c} for state, c in zip(self._state.copy(), cost.tolist(), strict=True)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from scipy.special import betaln, digamma
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.distributions import Normal, kl_divergence
@@ -370,6 +371,8 @@ def _pomdp(model: Any, scenario: Scenario) -> POMDPEnv:
     """Make the unwrapped environment of a scenario, whose sensor can observe any state."""
     if model.get_vec_normalize_env() is not None:
         raise ValueError("the model's environment normalises observations (VecNormalize), which is not supported here")
+    if not isinstance(model.action_space, spaces.Box):
+        raise ValueError(f"the actions are {model.action_space}: a certificate needs a Box, whose density is Gaussian")
     if scenario.sensor is not None:
         raise ValueError(f"scenario {scenario.name!r} changes its sensor, which a certificate cannot: declare a Shift")
     env = scenario_env(scenario, model, n_episodes=1, n_envs=1).unwrapped

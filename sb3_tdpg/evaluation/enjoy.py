@@ -75,7 +75,6 @@ def enjoy(
     if record is not None:
         horizon = model.horizon if has_trvs else max(len(episode.costs) for episode in episodes)
         save_animation(episodes, record, horizon=horizon, fps=fps, signal="TRV" if has_trvs else "action")
-        print(f"the video is {record}")
     return episodes
 
 

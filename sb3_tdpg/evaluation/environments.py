@@ -8,6 +8,7 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 
 from sb3_tdpg.envs.scenarios import Scenario
@@ -58,14 +59,19 @@ def stacked_for(model: Any, env: VecEnv) -> VecEnv:
     return env
 
 
-def load_statistics(path: Path, env: VecEnv) -> VecNormalize:
+def load_statistics(path: Path, env: VecEnv, model: Any = None) -> VecNormalize:
     """
     Normalise an environment as in a training, with the statistics that ``VecNormalize.save`` wrote.
 
+    :param model: Stack the observations first if the statistics are of all that this model sees at once.
     :raises ValueError: if the file is damaged.
     """
     try:
-        return VecNormalize.load(str(path), env)
+        normalize: VecNormalize = load_from_pkl(path)
+        if model is not None and spaces.flatdim(normalize.observation_space) == spaces.flatdim(model.observation_space):
+            env = stacked_for(model, env)
+        normalize.set_venv(env)
+        return normalize
     except Exception as e:  # damaged bytes lead to any error
         reason = " ".join(str(e).split())[:200]
         raise ValueError(f"{path} cannot be loaded ({reason}): it must be what VecNormalize.save() wrote") from e

@@ -18,7 +18,8 @@ class InformationCallback(TDPGCallback):
     penalty and does not change the training. It logs ``mi/lower`` and ``mi/upper``, the limits summed over time;
     ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step (TensorBoard only); and ``mi/knows_d``, ..., a lower
     bound of the information about each component of the state, averaged over the time steps at which it varies.
-    Components are named as in the environment's ``state_names``, without the unit, or ``x0``, ``x1``, ...
+    Components are named as in the environment's ``state_names``, without the unit, or ``x0``, ``x1``, ...; those with
+    long names are left out on the console.
 
     Where the steps share their weights, one random step of each episode is a sample, since those of one episode are not
     independent; every episode counts the same. An epoch that has too few of them is passed over with a warning.
@@ -72,4 +73,7 @@ class InformationCallback(TDPGCallback):
         estimates, _ = component_estimates(batch, seed=model.epoch)
         for name, values in zip(read_problem(self.training_env).state_names, estimates.T, strict=True):
             if np.isfinite(values).any():
-                self.logger.record(f"mi/knows_{name.split(' (')[0]}", float(np.nanmean(values.clip(min=0))))
+                key = f"mi/knows_{name.split(' (')[0]}"
+                # The console cuts longer keys, and two that become equal would end the training.
+                exclude = ("stdout", "log") if len(key) > 36 else ()
+                self.logger.record(key, float(np.nanmean(values.clip(min=0))), exclude=exclude)

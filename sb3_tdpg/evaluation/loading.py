@@ -69,7 +69,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
             env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
         except Exception as e:
             raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
-        model.set_env(stacked_for(model, load_statistics(found, env)))
+        model.set_env(stacked_for(model, load_statistics(found, env, model)))
     return model
 
 

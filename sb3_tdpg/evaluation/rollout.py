@@ -5,6 +5,7 @@ Dimension key: E environments, X state, Z TRVs, ``*obs`` and ``*action`` as in t
 """
 
 import contextlib
+import inspect
 from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
@@ -58,7 +59,7 @@ def rollout(
     of the loop. They are restored when the loop ends, also by ``break`` or an exception.
 
     :param model: An SB3 model, or anything with its method ``predict``.
-    :param env: E environments; they are reset first.
+    :param env: E environments; they are reset first. MaskablePPO gets their ``action_masks()``.
     :param n_episodes: Number of episodes of all environments together; ``None``: run until the caller stops.
     :param seeds: Seeds of the environments and of the policy's sampling; ``None``: take the generators as they are.
     :param deterministic: Act without noise; see :meth:`~sb3_tdpg.TRVPolicy.predict`.
@@ -69,6 +70,7 @@ def rollout(
     n_envs = env.num_envs
     quota = np.full(n_envs, np.inf) if n_episodes is None else (n_episodes + np.arange(n_envs)) // n_envs
     monitored = is_monitored(env)
+    is_masked = "action_masks" in inspect.signature(model.predict).parameters and env.has_attr("action_masks")
     memory, starts = None, np.ones(n_envs, dtype=bool)
     t, episode = np.zeros((2, n_envs), dtype=np.int64)
     states: np.ndarray | None = None
@@ -89,7 +91,8 @@ def rollout(
                 encoded, actions = act(model, seen, trvs * th.as_tensor(~starts[:, None], device=model.device), now)
                 memory = (encoded.trvs, now + 1)
             else:
-                actions, memory = model.predict(seen, memory, starts, deterministic=deterministic)
+                masks = {"action_masks": np.stack(env.env_method("action_masks"))} if is_masked else {}
+                actions, memory = model.predict(seen, memory, starts, deterministic=deterministic, **masks)
             next_observations, rewards, dones, infos = env.step(actions)
             finished = dones & (episode < quota)
             if monitored:  # Atari wrappers also end an "episode" when a life is lost

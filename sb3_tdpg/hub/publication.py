@@ -157,8 +157,8 @@ def read_zoo_folder(
 
     This is the policy at the end of the training or, if there is none, ``best_model.zip``.
 
-    :param scenarios: Where to evaluate; default: the rows of the paper's table or, without any, the training
-        environment, whose keywords hold unless a scenario replaces them.
+    :param scenarios: Where to evaluate; default: the training environment and the test rows of the paper's table. The
+        keywords of the training hold unless a scenario replaces them.
     :param n_eval_episodes: Episodes of each scenario.
     :param seed: Seed of the evaluation.
     """
@@ -183,7 +183,9 @@ def read_zoo_folder(
         if settings.get("frame_stack"):
             env = VecFrameStack(env, settings["frame_stack"])
     model = TDPG.load(model_path, env=env, device="cpu")
-    rows = PAPER_ROWS.get(env_id, [Scenario("Training", env_id)]) if scenarios is None else scenarios
+    # Not the table's own first row: its keywords would replace those of the training.
+    default = [Scenario("Training", env_id), *PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:]]
+    rows = default if scenarios is None else scenarios
     options: Any = dict(seed=seed, env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))
     records = evaluate_scenarios({"TDPG": model}, rows, n_eval_episodes, **options)
     progress = None

@@ -169,7 +169,7 @@ def pull_from_hub(
     repo_id: str, out: str | os.PathLike[str], *, revision: str | None = None, token: str | None = None
 ) -> Path:
     """
-    Download a repository; nothing in it is run or unpickled.
+    Download a repository; nothing in it is run or unpickled. The folder appears only when it is complete.
 
     :param repo_id: ``organization/name``.
     :param out: The folder; it must not exist, or be empty.
@@ -179,8 +179,13 @@ def pull_from_hub(
     :raises ValueError: if ``out`` is not empty, or the download fails.
     """
     out = _empty(out)
-    with _one_line_errors(repo_id, "read"):
-        huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=out, token=token, **LIBRARY)
+    target = Path(os.path.abspath(out))  # "." has no name
+    with replaced_atomically(target) as folder:
+        folder.mkdir()
+        with _one_line_errors(repo_id, "read"):
+            huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=folder, token=token, **LIBRARY)
+        if target.exists():
+            target.rmdir()
     return out
 
 

@@ -29,7 +29,7 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
     ``runs/pg-seed3/model.zip`` is a model of ``pg``, and ``logs/ppo/Lava-v0_1/Lava-v0.zip`` of ``ppo Lava-v0``.
 
     :return: the files of each method, in the order of the arguments
-    :raises ValueError: if a file does not exist, or is given twice.
+    :raises ValueError: if a file does not exist or is given twice, or two in a folder are named after it.
     """
     methods: dict[str, list[Path]] = {}
     seen: dict[Path, str] = {}
@@ -39,6 +39,12 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
             name = label or label_of(path, env_id)
             if (before := seen.setdefault(path.resolve(), name)) != name or path in methods.get(name, ()):
                 raise ValueError(f"{path} is given twice, for {before!r} and for {name!r}: a model counts once")
+            beside = [each for each in methods.get(name, ()) if each.parent.resolve() == path.parent.resolve()]
+            if beside and not label and SEED.sub("", path.stem) != name:
+                raise ValueError(
+                    f"{path} and {beside[0]} are named after one folder, and would count as two trainings of {name!r}: "
+                    f"give each a label, such as A={path}"
+                )
             methods.setdefault(name, []).append(path)
     if not methods:
         raise ValueError("give at least one model: runs/pg-seed0/model.zip, or PG=runs/pg-seed*/model.zip")

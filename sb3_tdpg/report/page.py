@@ -169,8 +169,15 @@ def _severities_table(page: Page) -> str:
             what, parameter = PERTURBATIONS[name].summary, PERTURBATIONS[name].parameter
             values = [f"{row.value:g}" for row in rows]
         else:
-            keywords = [row.scenario.env_kwargs for row in rows]
-            changed = [{k: v for k, v in each.items() if page.plan.env_kwargs.get(k) != v} for each in keywords]
+            training: Any = page.plan.env_kwargs
+            changed = [
+                {
+                    k: f"array {v.shape}" if isinstance(v, np.ndarray) else v
+                    for k, v in each.items()
+                    if not np.array_equal(training.get(k), v)
+                }
+                for each in (row.scenario.env_kwargs for row in rows)
+            ]
             what, parameter = "the environment changes", ", ".join(f"`{key}`" for key in changed[0])
             values = [", ".join(map(str, each.values())) for each in changed]
         by_severity = {f"severity {row.severity}": value for row, value in zip(rows, values, strict=True)}

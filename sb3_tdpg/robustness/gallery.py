@@ -30,18 +30,20 @@ def perturbation_gallery(
     """
     Draw one image under each perturbation (rows) in each severity (columns), beside the unperturbed image.
 
-    The image is that of the first environment after 8 steps with the action 0, or the last one of a shorter episode, so
-    that late and lost frames can be seen. For an id, the perturbations of its scene (:func:`.scene_perturbations`) are
-    drawn, too.
+    The image is that of the first environment after 8 steps with the action 0 (moved into the bounds), or the last one
+    of a shorter episode, so that late and lost frames can be seen. For an id, the perturbations of its scene
+    (:func:`.scene_perturbations`) are drawn, too.
 
     :param env: An environment with images, or a registered id.
     :param names: The rows; default: all perturbations of images that apply.
     :param env_kwargs: Keywords for the environment's constructor, with an id.
     :param seed: Seed of environment and perturbations.
-    :raises ValueError: if the observations are not images, or a perturbation does not apply.
+    :raises ValueError: if the observations are not images, or a perturbation does not apply, or there is none.
     """
     if env_kwargs and not isinstance(env, str):
         raise ValueError("env_kwargs are for an environment that is made here: give its id in place of it")
+    if names is not None and not names:
+        raise ValueError("names=[] leaves nothing to draw: name a perturbation, or give None for all that apply")
     scenes = scene_perturbations(env) if isinstance(env, str) else {}
 
     def look(scene_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, int | None, list[np.ndarray]]:
@@ -72,7 +74,7 @@ def _look(env: VecEnv, seed: int) -> tuple[spaces.Space, int | None, list[np.nda
     """Return space and horizon, and the images of an episode of the first environment, up to the one that is drawn."""
     env.seed(seed)
     frames, horizon = [np.asarray(env.reset())[0]], horizon_of(env)
-    actions = np.zeros((env.num_envs, *(env.action_space.shape or ())), env.action_space.dtype)
+    actions = np.stack([Sensor(env.action_space).blank] * env.num_envs)
     for _ in range(min(N_STEPS, (horizon or N_STEPS + 1) - 1)):
         observations, _, dones, _ = env.step(actions)
         if dones[0]:

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from gymnasium import spaces
 from scipy.integrate import quad
 from scipy.stats import beta as beta_distribution
 from small_problems import ToyEnv, tiny_tdpg, train_epochs
@@ -220,6 +221,9 @@ def test_bad_input_is_told(model):
     normalized = tiny_tdpg(VecNormalize(DummyVecEnv([LavaEnv]), norm_reward=False), n_episodes=2)
     with pytest.raises(ValueError, match="VecNormalize"):
         TrainingEpisodes(normalized, TRAINING, **SMALL)
+    discrete = tiny_tdpg(ToyEnv(action_space=spaces.Discrete(2)), n_episodes=2)
+    with pytest.raises(ValueError, match=r"the actions are Discrete\(2\): a certificate needs a Box"):
+        TrainingEpisodes(discrete, TRAINING, **SMALL)
     with pytest.raises(ValueError, match="changes its sensor"):
         TrainingEpisodes(model, Scenario("x", "Lava-v0", sensor=lambda env: env), **SMALL)
     toy = tiny_tdpg(ToyEnv(), n_episodes=2)

@@ -296,10 +296,14 @@ def test_actions_of_another_shape_are_refused_and_not_counted(env_id):
     for _ in range(env.horizon):
         assert not env.step(np.zeros(size))[3]
     batch = BatchedVecEnv(env, 3)
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        batch.step(np.zeros((3, size)))
     batch.reset()
     for shape in ((1, size), (3, size + 1), (3,)):
         with pytest.raises(ValueError, match=rf"expected \(3, {size}\)"):
             batch.step(np.zeros(shape))
+    dones = [batch.step(np.zeros((3, size)))[2].all() for _ in range(env.horizon)]
+    assert dones == [False] * (env.horizon - 1) + [True]
 
 
 # -- what the constructors refuse ------------------------------------------------------------------------------------
@@ -433,6 +437,13 @@ class Switch(POMDPEnv):
 
     def terminal_cost(self, state):
         return np.zeros(len(state))
+
+
+def test_actions_may_have_two_dimensions():
+    env = Switch()
+    env.action_space, env.cost = spaces.Box(-1, 1, (2, 2)), lambda state, action: action[:, 0, 1]
+    env.reset()
+    assert env.step(np.array([[0.0, 0.5], [0.0, 0.0]]))[1] == -0.5
 
 
 def test_actions_may_be_discrete():

@@ -195,7 +195,7 @@ def test_a_window_without_a_display_is_refused_with_the_mend(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     window = PandaGraspEnv(render_mode="human")
-    with pytest.raises(RuntimeError, match=r"DISPLAY is not set.*render_mode='rgb_array'"):
+    with pytest.raises(ValueError, match=r"DISPLAY is not set.*render_mode='rgb_array'"):
         window.reset(seed=0)  # which draws, as Gymnasium has it
 
 

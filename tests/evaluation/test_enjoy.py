@@ -3,6 +3,7 @@
 import math
 import re
 import sys
+from functools import partial
 from unittest.mock import Mock
 
 import gymnasium as gym
@@ -15,7 +16,7 @@ from PIL import Image
 from small_problems import ToyEnv, error_line, tiny_tdpg
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from sb3_tdpg.cli import main, parse_keywords
 from sb3_tdpg.evaluation.animation import Episode, save_animation
@@ -41,6 +42,9 @@ class PictureEnv(ToyEnv):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, terminated or self.x > 0, truncated, info
+
+    def action_masks(self):
+        return np.array([False, True])
 
     def render(self):
         return np.full((30, 50, 3), int(100 * (self.x + 1)), np.uint8)
@@ -137,6 +141,7 @@ def test_keywords_of_the_environment_reach_it(ball, tmp_path, capsys):
     assert main([*command, "--env-kwargs", *keywords[:2], "--env-kwargs", *keywords[2:]]) == 0
     printed = capsys.readouterr().out
     assert "final state [ 0.5 " in printed, "a robot that starts there and cannot move ends there"
+    assert f"the video is {tmp_path / 'film.gif'}\n" in printed
     red, green, blue = frames_of(tmp_path / "film.gif")[0][0][:200, 400:500].reshape(-1, 3).mean(0)
     assert min(red, blue) > 1.2 * green, "the wall is not violet"
 
@@ -312,7 +317,7 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
 # -- other algorithms ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", ["A2C", "DQN", "PPO", "RecurrentPPO", "TRPO"])
+@pytest.mark.parametrize("algorithm", ["A2C", "DQN", "MaskablePPO", "PPO", "RecurrentPPO", "TRPO"])
 def test_models_of_other_algorithms_are_played(algorithm, own, tmp_path, capsys):
     make = getattr(stable_baselines3, algorithm, None) or getattr(sb3_contrib, algorithm)
     policy = "MlpLstmPolicy" if algorithm == "RecurrentPPO" else "MlpPolicy"
@@ -324,24 +329,27 @@ def test_models_of_other_algorithms_are_played(algorithm, own, tmp_path, capsys)
     assert costs_printed(capsys.readouterr().out) == pytest.approx(costs, abs=0.01)
     for episode in episodes:
         assert episode.signals.shape == (len(episode.costs), 1)  # the actions
-        assert set(episode.signals.ravel()) <= {0, 1}
+        assert set(episode.signals.ravel()) <= ({1} if algorithm == "MaskablePPO" else {0, 1})
     assert len(frames_of(film)[0]) == sum(len(episode.costs) + 1 for episode in episodes)
 
 
 @pytest.mark.filterwarnings("ignore:You are trying to run PPO")
-def test_a_model_plays_with_the_statistics_and_the_stack_of_its_training(tmp_path):
-    """As the zoo saves it: normalised first, then stacked."""
-    normalized = VecNormalize(make_vec_env("Pendulum-v1", 2, seed=0), norm_reward=False)
-    model = PPO("MlpPolicy", VecFrameStack(normalized, 3), n_steps=20, batch_size=10, seed=0, device="cpu").learn(40)
+@pytest.mark.parametrize("is_normalized_first", [True, False])  # as the zoo does it
+def test_a_model_plays_with_the_statistics_and_the_stack_of_its_training(is_normalized_first, tmp_path):
+    def wrapped(env, normalized):
+        return VecFrameStack(normalized(env), 3) if is_normalized_first else normalized(VecFrameStack(env, 3))
+
+    trained = wrapped(make_vec_env("Pendulum-v1", 2, seed=0), partial(VecNormalize, norm_reward=False))
+    model = PPO("MlpPolicy", trained, n_steps=20, batch_size=10, seed=0, device="cpu").learn(40)
     model.save(tmp_path / "Pendulum-v1.zip")
     (tmp_path / "Pendulum-v1").mkdir()
-    normalized.save(tmp_path / "Pendulum-v1" / "vecnormalize.pkl")
+    statistics = tmp_path / "Pendulum-v1" / "vecnormalize.pkl"
+    model.get_vec_normalize_env().save(statistics)
     (episode,) = enjoy(tmp_path / "Pendulum-v1.zip", "Pendulum-v1", deterministic=True)
 
-    env = make_vec_env("Pendulum-v1", 1)
-    env = VecFrameStack(VecNormalize.load(tmp_path / "Pendulum-v1" / "vecnormalize.pkl", env), 3)
+    env = wrapped(make_vec_env("Pendulum-v1", 1), partial(VecNormalize.load, statistics))
     env.unwrapped.seed(evaluation_seeds(0).env)
-    env.venv.training = False
+    unwrap_vec_normalize(env).training = False
     observation = env.reset()
     for expected in episode.signals:
         action, _ = model.predict(observation, deterministic=True)

@@ -162,20 +162,23 @@ def test_the_timeline_names_the_bounds():
     assert any("ln N" in label for label in labels)
 
 
-def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the_training(tmp_path):
+def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the_training(tmp_path, monkeypatch):
     from stable_baselines3.common.logger import configure
 
+    # The console cuts these to the same name.
+    wheels = [f"angular velocity of the wheel on the {side}" for side in ("left", "right")]
+    monkeypatch.setattr(LavaEnv, "state_names", tuple(f"{name} (rad/s)" for name in wheels))
     losses = []
     for callback in (None, InformationCallback(2)):
         model = tiny_tdpg(PROBLEM, n_episodes=30, beta=float("inf"))
         folder = tmp_path / str(callback is None)
-        model.set_logger(configure(str(folder), ["csv"]))
+        model.set_logger(configure(str(folder), ["csv", "log"]))
         train_epochs(model, 4, callback=callback)
         losses.append(pd.read_csv(folder / "progress.csv"))
     plain, watched = losses
     pd.testing.assert_series_equal(plain["rollout/ep_cost_mean"], watched["rollout/ep_cost_mean"])
     assert not [name for name in plain if name.startswith("mi/")]
-    assert {"mi/lower", "mi/upper", "mi/knows_d", "mi/knows_v"} <= set(watched)
+    assert {"mi/lower", "mi/upper", *(f"mi/knows_{name}" for name in wheels)} <= set(watched)
     # The CSV logger fills what is missing in a row with nothing.
     assert watched["mi/upper"].notna().tolist() == [True, False, True, False]
     assert (watched["mi/lower"].dropna() <= watched["mi/upper"].dropna()).all()

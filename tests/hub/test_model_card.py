@@ -190,11 +190,12 @@ def test_shares_of_failures_have_wilsons_interval():
     assert "| Training |  | 10 | 0.00 [0.00, 0.00] | 0.00 | 10.0% [1.8%, 40.4%] |" in text
 
 
-def test_the_video_of_an_episode_is_in_the_folder_of_the_card(runs, tmp_path):
+def test_the_video_of_an_episode_is_in_the_folder_of_the_card(runs, tmp_path, capsys):
     pytest.importorskip("imageio_ffmpeg")
     card = write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=1)
     assert b"ftyp" in (card / "replay.mp4").read_bytes()[:12]
     assert "[replay.mp4](replay.mp4)" in text_of(card)
+    assert "replay.mp4" not in capsys.readouterr().out, "it was written elsewhere and moved"
 
 
 def cut(share):

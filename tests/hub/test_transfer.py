@@ -174,14 +174,24 @@ def test_errors_of_the_hub_are_reported_in_one_line(error, message, card, api):
     assert api.calls[-1][0] == "create_repo", "nothing is uploaded"
 
 
-def test_a_pull_downloads_the_repository(tmp_path, monkeypatch):
-    asked = {}
-    monkeypatch.setattr(
-        "huggingface_hub.snapshot_download", lambda repo_id, **kwargs: asked.update(repo_id=repo_id, **kwargs)
-    )
-    assert pull_from_hub(REPO_ID, tmp_path / "there", revision="v1", token="secret") == tmp_path / "there"
-    assert asked.pop("library_name") == "sb3_tdpg"
-    assert asked == dict(repo_id=REPO_ID, revision="v1", local_dir=tmp_path / "there", token="secret")
+def test_a_pull_downloads_the_repository_and_leaves_nothing_of_a_broken_download(tmp_path, monkeypatch):
+    asked, out = [], tmp_path / "there"
+
+    def download(repo_id, local_dir, **kwargs):
+        asked.append((repo_id, kwargs))
+        local_dir.mkdir(exist_ok=True)
+        (local_dir / "README.md").touch()
+        if len(asked) == 1:
+            raise ConnectionError("no route")
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    with pytest.raises(ValueError, match=r"cannot be read \(no route\): try again"):
+        pull_from_hub(REPO_ID, out)
+    assert not list(tmp_path.iterdir())
+    out.mkdir()
+    assert pull_from_hub(REPO_ID, out, revision="v1", token="secret") == out
+    assert [path.name for path in out.iterdir()] == ["README.md"]
+    assert asked[1] == (REPO_ID, dict(revision="v1", token="secret", library_name="sb3_tdpg"))
 
 
 @pytest.mark.parametrize("module", ["huggingface_hub", "matplotlib"])

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.provenance import provenance
-from sb3_tdpg.envs.scenarios import LAVA
+from sb3_tdpg.envs.scenarios import LAVA, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.hub import write_model_card
 from sb3_tdpg.hub.publication import read_publication, read_zoo_folder
@@ -73,6 +73,18 @@ def test_the_policy_of_a_zoo_folder_is_evaluated_and_described(zoo_folder, tmp_p
     assert re.search(r"versions: Python \d.*PyTorch \d", text)
     assert "The policy is the last one." in text
     assert (card / "training.png").exists()
+
+
+def test_the_first_row_is_the_training_environment_however_it_was_changed(zoo_folder, tmp_path):
+    copy = shutil.copytree(zoo_folder, tmp_path / "Lava-v0_1")
+    for path in (copy / "Lava-v0").glob("*.yml"):
+        text = path.read_text().replace("- Lava-v0", "- sb3_tdpg:Lava-v0")
+        path.write_text(text.replace("action_cost: 1", "sensor_noise_std: 1"))
+    publication = read_publication(copy, n_eval_episodes=2)
+    assert [row.name for row in publication.scenarios] == [row.name for row in LAVA]
+    training = [Scenario("Training", "Lava-v0", dict(sensor_noise_std=1.0))]
+    expected = read_publication(copy, n_eval_episodes=2, scenarios=training).records["cost"]
+    assert publication.records["cost"][:2].tolist() == expected.tolist()
 
 
 def test_the_training_curve_of_a_zoo_folder_comes_from_its_monitor_files(zoo_folder):

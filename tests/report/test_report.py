@@ -25,6 +25,7 @@ from sb3_tdpg.report.models import fingerprint, label_of
 from sb3_tdpg.report.page import to_html
 from sb3_tdpg.report.rows import ALL, make_rows
 from sb3_tdpg.robustness import PerturbedVecEnv
+from sb3_tdpg.robustness.registry import SCENES
 from tests.report.test_report_time import report_of
 
 pytest.importorskip("matplotlib")
@@ -207,6 +208,11 @@ def test_models_are_grouped_by_label_or_folder(tmp_path):
     assert label_of(folder / "Lava-v0.zip", "sb3_tdpg:Lava-v0") == "ppo Lava-v0-wide"
     with pytest.raises(ValueError, match="given twice"):
         parse_models([f"A={tmp_path}/c/ppo_s.zip", f"B={tmp_path}/c/ppo_s.zip"])
+    for name in ("rl_model_10_steps", "rl_model_20_steps", "sac_1", "sac_2"):
+        (folder / f"{name}.zip").touch()
+    assert len(parse_models([f"{folder}/sac_*.zip", f"A={folder}/rl_*.zip"])["sac"]) == 2
+    with pytest.raises(ValueError, match="count as two trainings of 'ppo Lava-v0-wide': give each a label"):
+        parse_models([f"{folder}/rl_*.zip"], "Lava-v0")
 
 
 @pytest.mark.filterwarnings("ignore:You are trying to run PPO")
@@ -226,12 +232,15 @@ def test_the_statistics_that_lie_beside_a_model_are_used(name, statistics, tmp_p
     np.testing.assert_array_equal(loaded.obs_rms.mean, env.obs_rms.mean)
 
 
-def test_images_get_a_gallery_and_a_scene(tmp_path):
+def test_images_get_a_gallery_and_a_scene(tmp_path, monkeypatch):
     model = tiny_tdpg("BallCatch-v0", n_episodes=4, cost_limit=20.0)
-    settings = dict(perturbations=["noise", "camera_pose"], severities=[5])
+    wall = np.zeros((16, 16, 3), np.uint8)
+    monkeypatch.setitem(SCENES["BallCatch-v0"], "white_wall", (dict(texture=wall + 255),) * 5)
+    settings = dict(perturbations=["noise", "camera_pose", "white_wall"], severities=[5], env_kwargs=dict(texture=wall))
     text = report_of(tmp_path, {"A": model}, "BallCatch-v0", **settings)
     assert "figures/examples.png" in text
     assert "| camera_pose | the environment changes | `camera_pitch`, `camera_height` | 40.0, 2.5 |" in text
+    assert "| white_wall | the environment changes | `texture` | array (16, 16, 3) |" in text
     records = pd.read_csv(tmp_path / "episodes.csv.xz")
     assert records["kind"].unique().tolist() == ["unperturbed", "sensor", "scene"]
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from perturbed_problems import differs, run
 from small_problems import lava_env, toy_vec_env
 
@@ -81,7 +82,8 @@ def test_the_gallery_has_a_row_for_all_that_applies_and_no_two_pictures_of_a_row
 
 
 def test_the_gallery_takes_an_environment_and_names():
-    env = make_episodes_env("BallCatch-v0", 2, env_kwargs=dict(renderer="fast"))
+    actions = spaces.Box(0.5, 1, (1,), np.float32)  # without 0
+    env = toy_vec_env(observation_space=spaces.Box(0, 255, (3, 36, 36), np.uint8), action_space=actions)
     rows = pictures(perturbation_gallery(env, ["hue", "delay"]))
     assert list(rows) == ["hue", "delay"]
 
@@ -91,6 +93,8 @@ def test_the_gallery_refuses_what_it_cannot_show():
         perturbation_gallery(lava_env(2))
     with pytest.raises(ValueError, match="'texture' is unknown"):
         perturbation_gallery(make_episodes_env("BallCatch-v0", 1, env_kwargs=dict(renderer="fast")), ["texture"])
+    with pytest.raises(ValueError, match=r"names=\[\] leaves nothing to draw"):
+        perturbation_gallery("BallCatch-v0", [])
     with pytest.raises(ValueError, match="give its id in place of it"):
         perturbation_gallery(toy_vec_env(), env_kwargs=dict(renderer="fast"))
 
