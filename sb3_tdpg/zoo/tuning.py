@@ -69,6 +69,8 @@ class TuningManager(TDPGExperimentManager):
         block, saved = super().read_hyperparameters()
         if self.algo == "tdpg":
             self.settings = copy.deepcopy(dict(saved))
+            if self.env_kwargs:  # of the command line, which the zoo adds to a block that has some
+                self.settings["env_kwargs"] = dict(self.env_kwargs)
             policy_kwargs = self.settings.get("policy_kwargs")
             if isinstance(policy_kwargs, str):  # as on the command line, and in the zoo's own files
                 self.settings["policy_kwargs"] = eval(policy_kwargs, {"nn": th.nn})

@@ -187,6 +187,15 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
             assert model.beta == pytest.approx(block["beta"])
 
 
+def test_keywords_of_the_environment_belong_to_the_study_and_its_best_block(here, capsys):
+    command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "1", "--env-kwargs"]
+    assert main([*command, "action_cost:0.5"]) == 0
+    (path,) = here.rglob("best.yml")
+    assert yaml.safe_load(path.read_text())["Lava-v0-logdet"]["env_kwargs"] == dict(action_cost=0.5)
+    line = error_line(capsys, *command, "action_cost:0.1")
+    assert "exists with other settings, block.env_kwargs.action_cost: 0.5 there, 0.1 here" in line
+
+
 def test_a_shifted_scenario_is_what_the_cost_is_of(here, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     shift = ["--eval-env-kwargs", "lava_terminal_cost:1e6"]
