@@ -115,12 +115,17 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
     class Manager(TDPGExperimentManager):
         block, resume, arguments = given.block, folder, tuple(typed)
 
-        def load_trial(self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> Any:
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            if self.algo == "tdpg":  # the zoo tests its truth: it would not load number 0 nor, without one, the best
+                self.trial_id: Any = "best" if self.trial_id is None else str(self.trial_id)
+
+        def load_trial(self, storage: str, study_name: str, trial_id: Any = None, convert: bool = True) -> Any:
             if self.algo != "tdpg":
                 return super().load_trial(storage, study_name, trial_id, convert)
             from sb3_tdpg.zoo.tuning import block_of_trial
 
-            return block_of_trial(storage, study_name, trial_id)
+            return block_of_trial(storage, study_name, None if trial_id == "best" else int(trial_id))
 
     register(Manager)
     sys.argv += ["--algo", "tdpg", *flags, *seed]

@@ -71,6 +71,8 @@ class TuningManager(TDPGExperimentManager):
             self.settings = copy.deepcopy(dict(saved))
             if self.env_kwargs:  # of the command line, which the zoo adds to a block that has some
                 self.settings["env_kwargs"] = dict(self.env_kwargs)
+            if self.n_timesteps > 0:  # decides the schedules
+                self.settings["n_timesteps"] = self.n_timesteps
             policy_kwargs = self.settings.get("policy_kwargs")
             if isinstance(policy_kwargs, str):  # as on the command line, and in the zoo's own files
                 self.settings["policy_kwargs"] = eval(policy_kwargs, {"nn": th.nn})
@@ -139,7 +141,7 @@ class TuningManager(TDPGExperimentManager):
             super().hyperparameters_optimization()
             return
         assert self.storage is not None and self.study_name is not None
-        names = ("cost_limit", "space", "n_timesteps", "eval_env_kwargs", "n_evaluations", "n_eval_episodes")
+        names = ("cost_limit", "space", "eval_env_kwargs", "n_evaluations", "n_eval_episodes")
         description: dict[str, Any] = {name: getattr(self, name) for name in names}
         description.update(env_id=self.env_name.gym_id, objective=self.objective_kind, block=self.settings)
         record = Path(self.save_path, RECORD)
@@ -169,7 +171,7 @@ class TuningManager(TDPGExperimentManager):
             mend = "raise --cost-limit, train longer with -n, or run more trials with --n-trials"
             print(f"no trial of {self.study_name} keeps the expected cost below {self.cost_limit:g}: {mend}")
             return
-        settings = {**put_in(self.settings, best.params, abs(self.cost_limit)), "n_timesteps": self.n_timesteps}
+        settings = put_in(self.settings, best.params, abs(self.cost_limit))
         text = yaml.safe_dump({self.block or self.env_name.gym_id: settings}, sort_keys=False)
         write_atomically(folder / "best.yml", f"# Trial {best.number} of {self.study_name}: {_result(best)}\n{text}")
         print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")

@@ -164,11 +164,10 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     block = yaml.safe_load((folder / "best.yml").read_text())["Lava-v0-logdet"]
     assert block["policy_kwargs"]["trv_dim"] == int(best["params_policy_kwargs.trv_dim"])
     assert block["n_timesteps"] == 400
-    assert block == {**block_of_trial(str(folder / "study.log"), folder.name[6:], int(best["number"])),
-                     "n_timesteps": 400}  # fmt: skip
+    assert block == block_of_trial(str(folder / "study.log"), folder.name[6:], int(best["number"]))
 
     assert main([*command, "--n-trials", "5", "-n", "500"]) == 2  # TINY's -n comes first
-    assert "exists with other settings, n_timesteps: 400 there, 500 here" in capsys.readouterr().err
+    assert "exists with other settings, block.n_timesteps: 400 there, 500 here" in capsys.readouterr().err
 
     results = {path.name: path.read_bytes() for path in folder.iterdir()}
     elsewhere = ["--storage", "another.log", "--cost-limit", "1e5"]  # of the same name
@@ -178,13 +177,16 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     assert not (here / "another.log").exists()
 
     train = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1"]
-    assert main([*train, "--conf-file", str(folder / "best.yml")]) == 0
-    where = ["--storage", str(folder / "study.log"), "--study-name", folder.name[6:], "--trial-id", best["number"]]
-    assert main([*train, *where, "-n", "400"]) == 0
-    for n in (1, 2):
+    where = ["--storage", str(folder / "study.log"), "--study-name", folder.name[6:]]
+    first = block_of_trial(str(folder / "study.log"), folder.name[6:], 0)
+    for n, (flags, trained) in enumerate((
+        (["--conf-file", str(folder / "best.yml")], block),
+        (where, block),  # the best one
+        ([*where, "--trial-id", "0"], first),
+    ), start=1):  # fmt: skip
+        assert main([*train, *flags]) == 0
         model = TDPG.load(here / "logs" / "tdpg" / f"Lava-v0_{n}" / "Lava-v0.zip", device="cpu")
-        if n == 1 or best["number"] != "0":  # the zoo takes no trial for trial 0
-            assert model.beta == pytest.approx(block["beta"])
+        assert (model.beta, model.num_timesteps) == (pytest.approx(trained["beta"]), 400)
 
 
 def test_keywords_of_the_environment_belong_to_the_study_and_its_best_block(here, capsys):
