@@ -123,7 +123,7 @@ def test_a_model_of_the_zoo_loads_without_it_and_its_rates_may_end_anywhere(here
 
 @pytest.mark.slow
 def test_a_killed_training_with_normalised_observations_is_resumed_exactly(here):
-    settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
+    settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)", "callback:[]"]
     arguments = ["train", *LAVA, "-params", *settings, "-n", "20000", "--seed", "1"]
     process = start(arguments, here)
     wait_for(here, "logs/tdpg/Lava-v0_1/checkpoint.zip", process)
