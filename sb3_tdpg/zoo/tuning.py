@@ -25,12 +25,13 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, with_numbers, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.experiments.studies import open_storage, open_study, work
+from sb3_tdpg.experiments.studies import DONE, REASON, open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
 N_EVALUATIONS = 10
+BEHIND = "behind the others"  # why a trial is pruned that could be trained
 RECORD = "study.json"  # settings of a study, in the folder of its results
 COST, INFORMATION = "cost", "information"  # attributes of a trial; cost minus limit is also a constraint
 
@@ -132,7 +133,7 @@ class TuningManager(TDPGExperimentManager):
             if is_constrained:
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
-                raise optuna.TrialPruned(f"behind the others at expected cost {cost:.4g}, {information:.4g} nat")
+                raise optuna.TrialPruned(f"{BEHIND} at expected cost {cost:.4g}, {information:.4g} nat")
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
@@ -147,12 +148,25 @@ class TuningManager(TDPGExperimentManager):
         record = Path(self.save_path, RECORD)
         if Path(self.storage) != record.with_name("study.log"):  # that one names the study in its message
             check_same_config(record, dict(study=self.study_name, **description), "study")
+        self._check_trials()
         sampler, pruner = self._create_sampler(self.sampler), self._create_pruner(self.pruner)
         storage = open_storage(self.storage)
         study = open_study(storage, self.study_name, sampler=sampler, pruner=pruner, space=description)
-        self.create_envs(1, eval_env=True).close()  # errors that every trial would have come before the first one
         work(study, self.objective, self.max_total_trials or self.n_trials, describe=_result)
         self._write_results(study, description)
+
+    def _check_trials(self) -> None:
+        """Refuse before the first trial what would prune all of them."""
+        self.create_envs(1, eval_env=True).close()
+        with contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env:
+            model = TDPG(env=env, device=self.device, **self._hyperparams)
+        searched = self.space.get("policy_kwargs.trv_dim", {})
+        n_trvs = max(searched.get("choices", [searched.get("high", model.policy.trv_dim)]))
+        if self.n_eval_episodes < n_trvs + 2:
+            few = (
+                f"--eval-episodes {self.n_eval_episodes} are too few to measure the information of up to {n_trvs} TRVs"
+            )
+            raise ValueError(f"{few}: give at least {n_trvs + 2}")
 
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         if self.algo != "tdpg" or sampler_method != "tpe":
@@ -168,6 +182,10 @@ class TuningManager(TDPGExperimentManager):
         best = best_trial(study)
         assert self.cost_limit is not None
         if best is None:
+            reasons = [trial.user_attrs.get(REASON, BEHIND) for trial in study.get_trials(states=DONE)]
+            if not any(reason.startswith(BEHIND) for reason in reasons):
+                mend = "change the block or --space, and choose another --study-name"
+                raise ValueError(f"no trial of {self.study_name} could be trained ({reasons[-1]}): {mend}")
             mend = "raise --cost-limit, train longer with -n, or run more trials with --n-trials"
             print(f"no trial of {self.study_name} keeps the expected cost below {self.cost_limit:g}: {mend}")
             return
@@ -243,7 +261,8 @@ def block_of_trial(storage: str, study_name: str, number: int | None = None) -> 
     trials = {trial.number: trial for trial in study.get_trials()}
     trial = best_trial(study) if number is None else trials.get(number)
     if trial is None:
-        raise ValueError(f"study {study_name!r} has no trial {number}: it has {len(trials)}, from number 0")
+        missing = "trial that meets its limit on the cost" if number is None else f"trial {number}"
+        raise ValueError(f"study {study_name!r} has no {missing}: it has {len(trials)}, from number 0")
     described = study.user_attrs["space"]
     return put_in(with_numbers(described["block"]), trial.params, abs(described["cost_limit"]))
 

@@ -258,16 +258,28 @@ def test_a_limit_that_no_trial_meets_is_told(here, capsys):
     assert main(["tune", *TINY, "--cost-limit", "1e-6", "--n-trials", "2"]) == 0
     assert "keeps the expected cost below" in capsys.readouterr().out
     assert not list(here.rglob("best.yml"))
+    (path,) = here.rglob("study.log")
+    where = ["--storage", path, "--study-name", "Lava-v0-logdet-information"]
+    assert "has no trial that meets its limit on the cost: it has 2" in error_line(capsys, "train", *TINY[:4], *where)
 
 
 @pytest.mark.parametrize("arguments, message", [
     (["--eval-env-kwargs", "foo:1"], "cannot be made with env_kwargs={'foo': 1}"),
     (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db cannot be opened"),
-], ids=["keyword", "storage"])  # fmt: skip
+    (["-params", "gamma:3"], "gamma=3 must"),
+    (["--eval-episodes", "33"], "--eval-episodes 33 are too few .* of up to 32 TRVs: give at least 34"),
+], ids=["keyword", "storage", "setting", "episodes"])  # fmt: skip
 def test_what_the_trials_would_fail_at_is_told_in_a_line(arguments, message, here, capsys):
     line = error_line(capsys, "tune", *TINY, *arguments)
     assert re.search(message, line)
     assert "secret" not in line
+    assert not list(here.rglob("study.log"))
+
+
+def test_why_no_trial_could_be_trained_is_told(here, capsys):
+    (here / "space.yml").write_text("gamma: {low: 2.0, high: 3.0}")
+    line = error_line(capsys, "tune", *TINY, "--space", "space.yml", "--n-trials", "1")
+    assert "no trial of Lava-v0-logdet-information could be trained (gamma=" in line
 
 
 def test_other_algorithms_are_tuned_as_the_zoo_does_it(here, capsys):
