@@ -117,15 +117,13 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
 
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
-            if self.algo == "tdpg":  # the zoo tests its truth: it would not load number 0 nor, without one, the best
-                self.trial_id: Any = "best" if self.trial_id is None else str(self.trial_id)
+            if self.algo == "tdpg" and self.storage and self.study_name:
+                from sb3_tdpg.zoo.tuning import block_of_trial
 
-        def load_trial(self, storage: str, study_name: str, trial_id: Any = None, convert: bool = True) -> Any:
-            if self.algo != "tdpg":
-                return super().load_trial(storage, study_name, trial_id, convert)
-            from sb3_tdpg.zoo.tuning import block_of_trial
-
-            return block_of_trial(storage, study_name, None if trial_id == "best" else int(trial_id))
+                # Not in the zoo's way, which takes number 0 for no number, and then loads no trial.
+                trial = block_of_trial(self.storage, self.study_name, self.trial_id)
+                self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
+                self.trial_id = None
 
     register(Manager)
     sys.argv += ["--algo", "tdpg", *flags, *seed]

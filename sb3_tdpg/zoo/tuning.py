@@ -254,16 +254,19 @@ def block_of_trial(storage: str, study_name: str, number: int | None = None) -> 
 
     :raises ValueError: if there is no such study or trial.
     """
+    if "://" not in storage and not Path(storage).exists():  # opening it would make the file
+        raise ValueError(f"there is no storage {storage}: give the --storage that tune was run with")
     try:
         study = optuna.load_study(study_name=study_name, storage=open_storage(storage))
+        described = study.user_attrs["space"]
     except KeyError as e:
-        raise ValueError(f"there is no study {study_name!r} in {storage}") from e
+        found = optuna.get_all_study_names(open_storage(storage))
+        raise ValueError(f"the storage has no study {study_name!r} of tune: it has {', '.join(found) or 'none'}") from e
     trials = {trial.number: trial for trial in study.get_trials()}
     trial = best_trial(study) if number is None else trials.get(number)
     if trial is None:
         missing = "trial that meets its limit on the cost" if number is None else f"trial {number}"
         raise ValueError(f"study {study_name!r} has no {missing}: it has {len(trials)}, from number 0")
-    described = study.user_attrs["space"]
     return put_in(with_numbers(described["block"]), trial.params, abs(described["cost_limit"]))
 
 

@@ -32,6 +32,8 @@ BAD = {
     "log": ([*TUNE, "--space", "space.yml"], "log: 'maybe', which must be true or false"),
     "record": (["train", "--resume", "empty"], "does not say how its training was started"),
     "empty block": ([*TRAIN, "--block", "Empty-v0", "-conf", "empty.yml"], "has no readable block 'Empty-v0'"),
+    "storage": ([*TRAIN, "--storage", "none.log", "--study-name", "a"], "there is no storage none.log: give the --st"),
+    "study": ([*TRAIN, "--storage", "no.log", "--study-name", "a"], "has no study 'a' of tune: it has none"),
     "key of a space": ([*TUNE, "--space", "number.yml"], "5 of number.yml is no argument of TDPG"),
     "file of results": (["plot", "--kind", "from-file", "-i", "results.pkl"], "results.pkl` names no results"),
     "optimize": ([*TRAIN, "-optimize"], "sb3-tdpg tune"),
@@ -73,7 +75,10 @@ def test_bad_input_is_told_in_a_line_and_leaves_nothing_behind(arguments, messag
     for name, settings in BLOCKS.items():
         (here / f"{name}.yml").write_text(f"Lava-v0: {{policy: TRVPolicy, n_timesteps: 100, {settings}}}\n")
     (here / "results.pkl").write_bytes(pickle.dumps({}))
+    (here / "no.log").touch()
+    given = set(here.iterdir())
     assert re.search(message, error_line(capsys, *arguments))
+    assert set(here.iterdir()) - given <= {here / "logs"}
     assert not list(here.glob("logs/*/*"))
 
 
