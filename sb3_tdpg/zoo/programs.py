@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import rl_zoo3.train
 import yaml
 from rl_zoo3.utils import StoreDict
@@ -58,7 +59,7 @@ def run(program: str, arguments: Sequence[str]) -> None:
             _watch(program.replace("-", "_"), given, flags)
         else:
             dict(train=_train, tune=_tune, plot=_plot)[program](given, flags)
-    except (AssertionError, yaml.YAMLError) as e:  # the zoo refuses bad input with these
+    except (AssertionError, yaml.YAMLError, gym.error.Error) as e:  # the zoo refuses bad input with these
         raise ValueError(" ".join(str(e).split())) from e
     finally:
         sys.argv = argv
