@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import pickle
 import runpy
 import sys
@@ -20,6 +21,7 @@ from sb3_tdpg.zoo.manager import CHECKPOINT, RECORD, TDPGExperimentManager, regi
 
 # The information cannot be measured with five episodes, the zoo's default.
 TUNING_DEFAULTS = ("--eval-episodes", "200", "--n-trials", "50", "--num-threads", "1", "--verbose", "0")
+LOGS, FILES = ("-tb", "--tensorboard-log"), ("-conf", "--conf-file", "-i", "--trained-agent", "--storage")
 BLOCK = dict(help="block of hyperparameters (default: that of the environment)")
 # The flags of each program beside the zoo's.
 FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -112,9 +114,14 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
         given, flags = _split("train", record["arguments"], _PlainDict)
         seed = ["--seed", str(record["seed"])]  # it was drawn if none was given
     typed = ["--block", given.block, *flags] if given.block else flags
+    # --resume works in any folder. What does not exist is a package or the address of a database.
+    recorded = [
+        os.path.abspath(word) if flag in LOGS or (flag in FILES and os.path.exists(word)) else word
+        for flag, word in zip(["", *typed], typed, strict=False)
+    ]
 
     class Manager(TDPGExperimentManager):
-        block, resume, arguments = given.block, folder, tuple(typed)
+        block, resume, arguments = given.block, folder, tuple(recorded)
 
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)

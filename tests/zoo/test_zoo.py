@@ -86,8 +86,10 @@ def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     assert_same_training(here)
 
 
-def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, capsys):
+def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, capsys, monkeypatch):
+    (here / "mine.yml").write_text(yaml.safe_dump({"CartPole-v1": load_hyperparams("CartPole-v1")}))
     arguments = ["train", "--env", "CartPole-v1", "-params", "epoch_steps:200", "batch_size:100", "n_epochs:1"]
+    arguments += ["--conf-file", "mine.yml", "-tb", "tensorboard"]
     arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1"]
     with stopped_in_epoch(13):
         assert main(arguments) == 130
@@ -101,7 +103,10 @@ def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_set
     assert main(["train", "--resume", str(other)]) == 2
     assert "was trained with other settings than" in capsys.readouterr().err
 
+    monkeypatch.chdir(other)
     assert main(["train", "--resume", str(folder)]) == 0
+    assert not (other / "tensorboard").exists()
+    monkeypatch.chdir(here)
     assert main(arguments) == 0
     again = folder_of(here, 2, env="CartPole-v1")
     resumed, whole = (TDPG.load(each / "CartPole-v1.zip", device="cpu") for each in (folder, again))
