@@ -270,8 +270,9 @@ class TDPGExperimentManager(ExperimentManager):
                 assert isinstance(model, TDPG)
                 n_timesteps, kwargs["reset_num_timesteps"] = model.remaining_timesteps, False
                 for callback in self.callbacks:
+                    callback.n_calls = model.num_timesteps // model.n_envs  # its rhythm
                     if isinstance(callback, EvalCallback):
-                        _go_on_evaluating(callback, model.num_timesteps, model.n_envs)
+                        _go_on_evaluating(callback, model.num_timesteps)
             try:
                 model.learn(n_timesteps, **kwargs)
             except KeyboardInterrupt:  # the zoo swallows it
@@ -334,9 +335,8 @@ def _without_drawing(evaluate: Callable[[], bool]) -> Callable[[], bool]:
     return apart
 
 
-def _go_on_evaluating(callback: EvalCallback, n_timesteps: int, n_envs: int) -> None:
-    """Keep the evaluations before a checkpoint, their rhythm, and the best model."""
-    callback.n_calls = n_timesteps // n_envs
+def _go_on_evaluating(callback: EvalCallback, n_timesteps: int) -> None:
+    """Keep the evaluations before a checkpoint, and the best model."""
     path = Path(f"{callback.log_path}.npz")
     if callback.log_path is None or not path.exists():
         return

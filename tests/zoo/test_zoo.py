@@ -90,7 +90,7 @@ def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_set
     (here / "mine.yml").write_text(yaml.safe_dump({"CartPole-v1": load_hyperparams("CartPole-v1")}))
     arguments = ["train", "--env", "CartPole-v1", "-params", "epoch_steps:200", "batch_size:100", "n_epochs:1"]
     arguments += ["--conf-file", "mine.yml", "-tb", "tensorboard"]
-    arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1"]
+    arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1", "--save-freq", "700"]
     with stopped_in_epoch(13):
         assert main(arguments) == 130
     folder = folder_of(here, 1, env="CartPole-v1")
@@ -113,6 +113,8 @@ def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_set
     assert_same_parameters(parameters(resumed.policy), parameters(whole.policy))
     evaluations = [np.load(each / "evaluations.npz")["timesteps"] for each in (folder, again)]
     assert len(evaluations[0]) == len(evaluations[1])
+    saved = [{path.name for path in each.glob("rl_model_*.zip")} for each in (folder, again)]
+    assert saved[0] == saved[1]
     kept = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
     assert kept > n_episodes
 
