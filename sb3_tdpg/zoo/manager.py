@@ -5,6 +5,7 @@ import inspect
 import json
 import os
 import re
+import shlex
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
@@ -299,7 +300,7 @@ class TDPGExperimentManager(ExperimentManager):
             return
         print(f"interrupted after {model.num_timesteps} of {model._total_timesteps} steps")
         if checkpoint.exists():
-            print(f"`sb3-tdpg train --resume {self.save_path}` continues from the last checkpoint")
+            print(f"`sb3-tdpg train --resume {shlex.quote(self.save_path)}` continues from the last checkpoint")
         raise KeyboardInterrupt
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:

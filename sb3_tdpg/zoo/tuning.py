@@ -9,6 +9,7 @@ rule for selecting a policy), ``shift`` the least expected cost in an environmen
 import contextlib
 import copy
 import math
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -195,9 +196,9 @@ class TuningManager(TDPGExperimentManager):
         print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")
         for name, value in best.params.items():
             print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
-        block = "" if self.block is None else f" --block {self.block}"
-        command = f"sb3-tdpg train --env {self.env_name.gym_id} --conf-file {folder / 'best.yml'}{block}"
-        print(f"results are in {folder}; to train with them: {command}")
+        command = ["sb3-tdpg", "train", "--env", self.env_name.gym_id, "--conf-file", str(folder / "best.yml")]
+        command += [] if self.block is None else ["--block", self.block]
+        print(f"results are in {folder}; to train with them: {shlex.join(command)}")
 
 
 class _Measuring(BaseCallback):

@@ -5,6 +5,7 @@ import math
 import re
 import sys
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import optuna
@@ -190,8 +191,9 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
 
 
 def test_keywords_of_the_environment_belong_to_the_study_and_its_best_block(here, capsys):
-    command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "1", "--env-kwargs"]
+    command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "1", "-f", "my logs", "--env-kwargs"]
     assert main([*command, "action_cost:0.5"]) == 0
+    assert f"--conf-file '{next(Path('my logs').rglob('best.yml'))}'" in capsys.readouterr().out
     (path,) = here.rglob("best.yml")
     assert yaml.safe_load(path.read_text())["Lava-v0-logdet"]["env_kwargs"] == dict(action_cost=0.5)
     line = error_line(capsys, *command, "action_cost:0.1")

@@ -92,8 +92,9 @@ def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_set
     arguments += ["--conf-file", "mine.yml", "-tb", "tensorboard"]
     arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1", "--save-freq", "700"]
     with stopped_in_epoch(13):
-        assert main(arguments) == 130
-    folder = folder_of(here, 1, env="CartPole-v1")
+        assert main([*arguments, "-f", "my logs"]) == 130
+    assert "--resume 'my logs/tdpg/CartPole-v1_1'`" in capsys.readouterr().out
+    folder = (here / "my logs").rename(here / "logs") / "tdpg" / "CartPole-v1_1"
     n_episodes = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
     record = json.loads((folder / "run.json").read_text())
     record["hyperparams"]["n_epochs"] = 2
