@@ -201,6 +201,10 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
             raise
         raise ValueError(f"`{' '.join(flags)}` names no results that `plot --kind all -o FILE` has written") from e
     if given.save is not None and plt.get_fignums():  # --kind all prints tables only
+        if not any(axes.has_data() for axes in plt.gcf().axes):
+            mend = "name trainings of at least 100 episodes (--episode-window), or results with evaluations"
+            raise ValueError(f"`{' '.join(flags)}` gives an empty figure: {mend}")
         given.save.parent.mkdir(parents=True, exist_ok=True)
         plt.savefig(given.save, dpi=150)
+        plt.close()  # the next plot would draw over it
         print(f"the figure is in {given.save}")

@@ -180,10 +180,12 @@ def test_enjoy_without_the_ending_of_the_file_says_what_it_takes(here, capsys):
     assert "give the .zip file" in error_line(capsys, "enjoy", "logs/tdpg_lava", "--env", "Lava-v0")
 
 
-def test_plot_and_video_of_a_training(here):
+def test_plot_and_video_of_a_training(here, capsys):
     main(["train", *SHORT])
     assert main(["plot", "-e", "Lava-v0", "--save", "curve.png"]) == 0
     assert (here / "curve.png").stat().st_size > 5000
+    assert "-e Nope` gives an empty figure" in error_line(capsys, "plot", "-e", "Nope", "--save", "empty.png")
+    assert not (here / "empty.png").exists()
     assert main(["record-video", "--env", "Lava-v0", "-n", "5"]) == 0
     (film,) = here.rglob("*.mp4")
     assert film.stat().st_size > 1000
