@@ -105,7 +105,8 @@ class SelectionCallback(TDPGCallback):
     :param mi_limit: Upper limit on the information in nats, summed over time.
     :param save_path: File of the selected model (``.zip``); a ``.json`` beside it has its epoch, cost and information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative.
+    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; in training, if a
+        ``VecNormalize`` normalises the observations: the policy can do so itself (``normalize_observations``).
     """
 
     def __init__(
@@ -138,6 +139,11 @@ class SelectionCallback(TDPGCallback):
         return "lowest information" if self.mi_limit is None else "lowest cost"
 
     def _init_callback(self) -> None:
+        if (normalize := self.model.get_vec_normalize_env()) is not None and normalize.norm_obs:
+            raise ValueError(
+                "SelectionCallback keeps the policy of an epoch but not the statistics of VecNormalize, which go on "
+                "changing: give norm_obs=False and policy_kwargs=dict(normalize_observations=True)"
+            )
         resumes = self.model.num_timesteps > 0
         # The record is written last; if it is missing, that epoch is run again.
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()

@@ -120,7 +120,7 @@ def _zoo(program: str, arguments: Sequence[str]) -> None:
 def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> None:
     from sb3_tdpg.experiments.sweep import sweep
 
-    out = options.pop("out") or Path("results", f"sweep-{options['block'] or env}")
+    out = options.pop("out") or Path("results", f"sweep-{options['block'] or env.rpartition(':')[2]}")
     options["settings"] = parse_keywords(settings)
     # With a storage, several workers share the folder.
     is_shared = options["storage"] is not None
@@ -215,7 +215,9 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
     for text in texts:
         key, equals, value = text.partition("=")
         if not (equals and key.isidentifier()):
-            raise ValueError(f"{text!r} is not a keyword of an environment: write key=value, for instance horizon=10")
+            raise ValueError(
+                f"{text!r} is not a keyword or setting with a plain name: write key=value, for instance horizon=10"
+            )
         if key in keywords:
             raise ValueError(f"{text!r}: {key} is given twice")
         try:

@@ -10,6 +10,7 @@ from small_problems import (
     AtEveryEpoch,
     AtEveryStep,
     assert_same_parameters,
+    lava_env,
     parameters,
     same_parameters,
     tiny_tdpg,
@@ -17,6 +18,7 @@ from small_problems import (
     train_epochs,
 )
 from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdpg import (
     TDPG,
@@ -119,6 +121,14 @@ def test_without_an_eligible_epoch_the_error_names_the_limits_and_the_model_stay
     with pytest.raises(ValueError, match=r"cost < -1.0, information < 0.0.*train longer or loosen"):
         selection.restore(model)
     assert_same_parameters(before, parameters(model.policy))
+
+
+def test_observations_whose_normalisation_would_not_be_selected_are_refused():
+    selection = SelectionCallback(cost_limit=1e9)
+    with pytest.raises(ValueError, match=r"not the statistics of VecNormalize.*normalize_observations=True"):
+        train_epochs(tiny_tdpg(VecNormalize(lava_env(), norm_reward=False)), 1, callback=selection)
+    train_epochs(tiny_tdpg(VecNormalize(lava_env(), norm_obs=False, norm_reward=False)), 1, callback=selection)
+    assert selection.best is not None
 
 
 def test_the_selected_model_is_on_disk_with_its_record(tmp_path):

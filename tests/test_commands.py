@@ -18,7 +18,7 @@ TINY = ["--n-timesteps", "200", "--n-eval-episodes", "20", "--set", "mi_estimato
 
 def test_a_sweep_and_the_card_of_one_of_its_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main([*SWEEP, *TINY]) == 0
+    assert main([*SWEEP, *TINY, "--env", "sb3_tdpg:Lava-v0"]) == 0
     assert "results are in results/sweep-Lava-v0" in capsys.readouterr().out
     out = tmp_path / "results" / "sweep-Lava-v0"
     runs = pd.read_csv(out / "runs.csv")
@@ -61,6 +61,7 @@ BAD = {
     "beta": ([*SWEEP, "--betas", "1/x"], "beta='1/x' must be a positive number"),
     "environment": ([*SWEEP, "--env", "Foo-v0"], "'Foo-v0' is not registered"),
     "block": ([*SWEEP, "--block", "Lava-v0-foo"], "no block 'Lava-v0-foo'.*choose one with --block"),
+    "setting": ([*SWEEP, "--set", "policy_kwargs.trv_dim=3"], "_dim=3' is not a keyword or setting with a plain name"),
     "storage": ([*SWEEP, *TINY, "--storage", "postgresql://a:b@127.0.0.1:1/c"], "cannot be opened"),
     "out": ([*SWEEP, *TINY, "--out", "/proc/nowhere"], "No such file or directory: '/proc/nowhere'"),
     "grace period": ([*SWEEP, "--storage", "s.log", "--grace-period", "inf"], "grace_period=inf must be at least 2 s"),

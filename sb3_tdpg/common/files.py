@@ -41,7 +41,12 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
         with suppress(OSError):  # not every system can lock a folder
             stack.enter_context(_locked(Path(folder)))
         partial = Path(folder, path.name)
-        yield partial
+        try:
+            yield partial
+        except OSError as e:  # of a full disk
+            if e.errno is not None and e.filename is None:
+                e.filename = str(path)
+            raise
         for written in [partial, *partial.rglob("*")] if partial.is_dir() else [partial]:
             _flush(written)
         os.replace(partial, path)

@@ -1,6 +1,7 @@
 """Will the bottleneck pay on a task? A short sweep over shares of the improvement kept, and a verdict."""
 
 import contextlib
+import glob
 import json
 import math
 import shlex
@@ -217,8 +218,8 @@ def report_command(out: Path, runs: pd.DataFrame, env_id: str, env_kwargs: Mappi
     :param runs: ``label`` and ``folder`` of each run; those without a penalty come first.
     """
     folders = runs[runs["label"] != OPEN_LOOP].groupby("label", sort=False)["folder"].first()
-    seeds = {label: f"{folder.rpartition('seed')[0]}seed*" for label, folder in folders.items()}
-    words = [f"{label}={out / 'runs' / pattern / 'model.zip'}" for label, pattern in seeds.items()]
+    start = {label: glob.escape(str(out / "runs" / folder.rpartition("seed")[0])) for label, folder in folders.items()}
+    words = [f"{label}={path}seed*/model.zip" for label, path in start.items()]
     words += ["--env", env_id, "--out", f"{out}-report"]
     if env_kwargs:
         words += ["--env-kwargs", *(f"{name}={json.dumps(value)}" for name, value in env_kwargs.items())]

@@ -70,13 +70,16 @@ def scenarios_of(rows: Sequence[Mapping[str, Any]]) -> list[Scenario]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run :func:`rerun` from the command line; return 0, or 2 if the input is bad."""
+    """Run :func:`rerun` from the command line; return the exit code: 0 done, 2 bad input, 130 interrupted."""
     parser = argparse.ArgumentParser(prog="python -m sb3_tdpg.experiments.rerun", description="repeat a recorded run")
     parser.add_argument("config", help="the config.json of a run")
     parser.add_argument("out", help="folder for the new run")
     try:
         rerun(**vars(parser.parse_args(arguments)))
-    except ValueError as e:
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command continues from the last checkpoint", file=sys.stderr)
+        return 130
+    except (ValueError, ImportError, OSError) as e:
         print(f"error: {e}", file=sys.stderr)
         return 2
     return 0

@@ -5,6 +5,7 @@ import inspect
 import json
 import os
 import re
+import shlex
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
@@ -23,9 +24,11 @@ import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import get_callback_list, get_class_by_name, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_tdpg import hyperparams as yaml_files
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
@@ -40,6 +43,7 @@ CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
 CHECKPOINT_EPOCHS = 10
 # Keys whose text the zoo evaluates.
 EVALUATED = {"monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
+KEYWORDS_OF = {"monitor_kwargs": Monitor, "normalize": VecNormalize}
 # Keys that the zoo itself reads; all others are arguments of the algorithm.
 ZOO_KEYS = (
     "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps", "noise_std",
@@ -71,18 +75,41 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
         except ValueError:
             continue
         if number is not None:
-            correct = yaml.safe_dump(number).split()[0]
+            correct = yaml.safe_dump(int(number) if number.is_integer() else number).split()[0]
             raise ValueError(f"{where} has {key}: {value}, which YAML reads as text, not as a number: write {correct}")
-    for key in {"n_timesteps", "n_envs"} & set(block):
-        if not (isinstance(block[key], (int, float)) and block[key] >= 1):
-            raise ValueError(f"{where} has {key}: {block[key]!r}, which must be a number of at least 1")
+    kinds: dict[str, Any] = dict(n_timesteps=(int, float), n_envs=int, frame_stack=(int, type(None)))
+    for key in kinds.keys() & set(block):
+        value = block[key]
+        if not isinstance(value, kinds[key]) or (value is not None and value < 1):
+            kind = "a number" if key == "n_timesteps" else "an integer"
+            raise ValueError(f"{where} has {key}: {value!r}, which must be {kind} of at least 1")
     if not isinstance(block.get("callback", []), (str, list, dict)):
         raise ValueError(f"{where} has callback: {block['callback']!r}, which must be a class or a list of classes")
+    for key, value in block.items():
+        try:
+            _read(key, value)
+        except Exception as e:  # it may be code
+            reason = " ".join(str(e).split())
+            raise ValueError(f"{where} has {key}: {value!r}, which rl-zoo3 cannot read ({reason}): correct it") from e
     for key in ("seed", "device", "verbose"):
         if key in block:
             raise ValueError(f"{where} has {key}: {block[key]!r}: give --{key} on the command line")
     if "n_timesteps" not in block:
         raise ValueError(f"{where} has no n_timesteps, the length of training in environment steps: add it")
+
+
+def _read(key: str, value: Any) -> None:
+    """Read a value as the zoo does, whose errors do not name the key."""
+    if key in EVALUATED and isinstance(value, str):
+        value = eval(value, vars(rl_zoo3.exp_manager))
+    if key in KEYWORDS_OF and isinstance(value, dict):
+        inspect.signature(KEYWORDS_OF[key]).bind_partial(**value)
+    elif key == "callback":
+        get_callback_list({key: value})
+    elif key in ("env_wrapper", "vec_env_wrapper"):
+        get_wrapper_class({key: value}, key)
+    elif key == "policy" and "." in str(value):
+        get_class_by_name(value)
 
 
 class TDPGExperimentManager(ExperimentManager):
@@ -106,6 +133,9 @@ class TDPGExperimentManager(ExperimentManager):
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         kwargs["config"] = kwargs.get("config") or find_file(algo, self.block or env_id)
         super().__init__(args, algo, env_id, *rest, **kwargs)
+        for flag, number in {"--n-eval-envs": self.n_eval_envs, "--eval-episodes": self.n_eval_episodes}.items():
+            if number < 1:
+                raise ValueError(f"{flag} {number} must be at least 1")
         self.is_batch = batched_class(env_id) is not None and self.vec_env_class is DummyVecEnv
         self.is_interrupted = self.has_claimed = False
         self.deterministic_eval = self.deterministic_eval and algo != "tdpg"
@@ -154,7 +184,6 @@ class TDPGExperimentManager(ExperimentManager):
         finally:
             self.env_name = env_name
         saved = copy.deepcopy(saved)  # the zoo adds gamma to normalize
-        check_block(hyperparams, self.algo, f"block {block} of {self.config}")
         if self.resume is not None:
             trained = json.loads(Path(self.resume, RECORD).read_text()).get("hyperparams", saved)
             if changed := differences(*map(_without_addresses, (trained, saved))):
@@ -162,6 +191,7 @@ class TDPGExperimentManager(ExperimentManager):
             for key in EVALUATED & set(hyperparams):
                 if isinstance(text := hyperparams[key], str):
                     check_plain(text, f"{self.resume} was trained with {key}:")
+        check_block(hyperparams, self.algo, f"block {block} of {self.config}")
         return hyperparams, saved
 
     def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
@@ -204,7 +234,11 @@ class TDPGExperimentManager(ExperimentManager):
             logs = {int(path.name.partition(".")[0]): path for path in Path(self.save_path).glob("*.monitor.csv")}
             for number, path in sorted(logs.items(), reverse=True):
                 path.rename(path.with_name(f"{number + n_envs}.monitor.csv"))
-        return super().create_envs(n_envs, eval_env, no_log)
+        try:
+            return super().create_envs(n_envs, eval_env, no_log)
+        except TypeError as e:  # an unknown keyword
+            mend = "correct env_kwargs, or the keywords of a wrapper"
+            raise ValueError(f"{self.env_name.gym_id} cannot be made with its keywords ({e}): {mend}") from e
 
     def _make_batch(self, env_kwargs: dict[str, Any], is_logged: bool, env_fns: list[Any]) -> VecEnv:
         env = self._make_env(env_kwargs, n_envs=len(env_fns), seed=self.seed)
@@ -237,8 +271,9 @@ class TDPGExperimentManager(ExperimentManager):
                 assert isinstance(model, TDPG)
                 n_timesteps, kwargs["reset_num_timesteps"] = model.remaining_timesteps, False
                 for callback in self.callbacks:
+                    callback.n_calls = model.num_timesteps // model.n_envs  # its rhythm
                     if isinstance(callback, EvalCallback):
-                        _go_on_evaluating(callback, model.num_timesteps, model.n_envs)
+                        _go_on_evaluating(callback, model.num_timesteps)
             try:
                 model.learn(n_timesteps, **kwargs)
             except KeyboardInterrupt:  # the zoo swallows it
@@ -265,7 +300,7 @@ class TDPGExperimentManager(ExperimentManager):
             return
         print(f"interrupted after {model.num_timesteps} of {model._total_timesteps} steps")
         if checkpoint.exists():
-            print(f"`sb3-tdpg train --resume {self.save_path}` continues from the last checkpoint")
+            print(f"`sb3-tdpg train --resume {shlex.quote(self.save_path)}` continues from the last checkpoint")
         raise KeyboardInterrupt
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
@@ -301,9 +336,8 @@ def _without_drawing(evaluate: Callable[[], bool]) -> Callable[[], bool]:
     return apart
 
 
-def _go_on_evaluating(callback: EvalCallback, n_timesteps: int, n_envs: int) -> None:
-    """Keep the evaluations before a checkpoint, their rhythm, and the best model."""
-    callback.n_calls = n_timesteps // n_envs
+def _go_on_evaluating(callback: EvalCallback, n_timesteps: int) -> None:
+    """Keep the evaluations before a checkpoint, and the best model."""
     path = Path(f"{callback.log_path}.npz")
     if callback.log_path is None or not path.exists():
         return

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import pickle
 import runpy
 import sys
@@ -10,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import rl_zoo3.train
 import yaml
 from rl_zoo3.utils import StoreDict
@@ -20,6 +22,7 @@ from sb3_tdpg.zoo.manager import CHECKPOINT, RECORD, TDPGExperimentManager, regi
 # The information cannot be measured with five episodes, the zoo's default.
 TUNING_DEFAULTS = ("--eval-episodes", "200", "--n-trials", "50", "--num-threads", "1", "--verbose", "0")
 HELP = {"-h", "--help"}
+LOGS, FILES = ("-tb", "--tensorboard-log"), ("-conf", "--conf-file", "-i", "--trained-agent", "--storage")
 BLOCK = dict(help="block of hyperparameters (default: that of the environment)")
 # The flags of each program beside the zoo's.
 FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -59,7 +62,7 @@ def run(program: str, arguments: Sequence[str]) -> None:
             _watch(program.replace("-", "_"), given, flags)
         else:
             dict(train=_train, tune=_tune, plot=_plot)[program](given, flags)
-    except (AssertionError, yaml.YAMLError) as e:  # the zoo refuses bad input with these
+    except (AssertionError, yaml.YAMLError, gym.error.Error) as e:  # the zoo refuses bad input with these
         raise ValueError(" ".join(str(e).split())) from e
     finally:
         sys.argv = argv
@@ -118,16 +121,24 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
         given, flags = _split("train", record["arguments"], _PlainDict)
         seed = ["--seed", str(record["seed"])]  # it was drawn if none was given
     typed = ["--block", given.block, *flags] if given.block else flags
+    # --resume works in any folder. What does not exist is a package or the address of a database.
+    recorded = [
+        os.path.abspath(word) if flag in LOGS or (flag in FILES and os.path.exists(word)) else word
+        for flag, word in zip(["", *typed], typed, strict=False)
+    ]
 
     class Manager(TDPGExperimentManager):
-        block, resume, arguments = given.block, folder, tuple(typed)
+        block, resume, arguments = given.block, folder, tuple(recorded)
 
-        def load_trial(self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> Any:
-            if self.algo != "tdpg":
-                return super().load_trial(storage, study_name, trial_id, convert)
-            from sb3_tdpg.zoo.tuning import block_of_trial
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            if self.algo == "tdpg" and self.storage and self.study_name:
+                from sb3_tdpg.zoo.tuning import block_of_trial
 
-            return block_of_trial(storage, study_name, trial_id)
+                # Not in the zoo's way, which takes number 0 for no number, and then loads no trial.
+                trial = block_of_trial(self.storage, self.study_name, self.trial_id)
+                self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
+                self.trial_id = None
 
     register(Manager)
     sys.argv += ["--algo", "tdpg", *flags, *seed]
@@ -197,6 +208,10 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
             raise
         raise ValueError(f"`{' '.join(flags)}` names no results that `plot --kind all -o FILE` has written") from e
     if given.save is not None and plt.get_fignums():  # --kind all prints tables only
+        if not any(axes.has_data() for axes in plt.gcf().axes):
+            mend = "name trainings of at least 100 episodes (--episode-window), or results with evaluations"
+            raise ValueError(f"`{' '.join(flags)}` gives an empty figure: {mend}")
         given.save.parent.mkdir(parents=True, exist_ok=True)
         plt.savefig(given.save, dpi=150)
+        plt.close()  # the next plot would draw over it
         print(f"the figure is in {given.save}")

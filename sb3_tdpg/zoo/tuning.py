@@ -9,6 +9,7 @@ rule for selecting a policy), ``shift`` the least expected cost in an environmen
 import contextlib
 import copy
 import math
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,13 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, with_numbers, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.experiments.studies import open_storage, open_study, work
+from sb3_tdpg.experiments.studies import DONE, REASON, open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
 N_EVALUATIONS = 10
+BEHIND = "behind the others"  # why a trial is pruned that could be trained
 RECORD = "study.json"  # settings of a study, in the folder of its results
 COST, INFORMATION = "cost", "information"  # attributes of a trial; cost minus limit is also a constraint
 
@@ -69,6 +71,10 @@ class TuningManager(TDPGExperimentManager):
         block, saved = super().read_hyperparameters()
         if self.algo == "tdpg":
             self.settings = copy.deepcopy(dict(saved))
+            if self.env_kwargs:  # of the command line, which the zoo adds to a block that has some
+                self.settings["env_kwargs"] = dict(self.env_kwargs)
+            if self.n_timesteps > 0:  # decides the schedules
+                self.settings["n_timesteps"] = self.n_timesteps
             policy_kwargs = self.settings.get("policy_kwargs")
             if isinstance(policy_kwargs, str):  # as on the command line, and in the zoo's own files
                 self.settings["policy_kwargs"] = eval(policy_kwargs, {"nn": th.nn})
@@ -128,7 +134,7 @@ class TuningManager(TDPGExperimentManager):
             if is_constrained:
                 trial.set_constraint(COST, cost - limit)
             if measuring.is_pruned:
-                raise optuna.TrialPruned(f"behind the others at expected cost {cost:.4g}, {information:.4g} nat")
+                raise optuna.TrialPruned(f"{BEHIND} at expected cost {cost:.4g}, {information:.4g} nat")
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
@@ -137,18 +143,31 @@ class TuningManager(TDPGExperimentManager):
             super().hyperparameters_optimization()
             return
         assert self.storage is not None and self.study_name is not None
-        names = ("cost_limit", "space", "n_timesteps", "eval_env_kwargs", "n_evaluations", "n_eval_episodes")
+        names = ("cost_limit", "space", "eval_env_kwargs", "n_evaluations", "n_eval_episodes")
         description: dict[str, Any] = {name: getattr(self, name) for name in names}
         description.update(env_id=self.env_name.gym_id, objective=self.objective_kind, block=self.settings)
         record = Path(self.save_path, RECORD)
         if Path(self.storage) != record.with_name("study.log"):  # that one names the study in its message
             check_same_config(record, dict(study=self.study_name, **description), "study")
+        self._check_trials()
         sampler, pruner = self._create_sampler(self.sampler), self._create_pruner(self.pruner)
         storage = open_storage(self.storage)
         study = open_study(storage, self.study_name, sampler=sampler, pruner=pruner, space=description)
-        self.create_envs(1, eval_env=True).close()  # errors that every trial would have come before the first one
         work(study, self.objective, self.max_total_trials or self.n_trials, describe=_result)
         self._write_results(study, description)
+
+    def _check_trials(self) -> None:
+        """Refuse before the first trial what would prune all of them."""
+        self.create_envs(1, eval_env=True).close()
+        with contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env:
+            model = TDPG(env=env, device=self.device, **self._hyperparams)
+        searched = self.space.get("policy_kwargs.trv_dim", {})
+        n_trvs = max(searched.get("choices", [searched.get("high", model.policy.trv_dim)]))
+        if self.n_eval_episodes < n_trvs + 2:
+            few = (
+                f"--eval-episodes {self.n_eval_episodes} are too few to measure the information of up to {n_trvs} TRVs"
+            )
+            raise ValueError(f"{few}: give at least {n_trvs + 2}")
 
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         if self.algo != "tdpg" or sampler_method != "tpe":
@@ -164,18 +183,22 @@ class TuningManager(TDPGExperimentManager):
         best = best_trial(study)
         assert self.cost_limit is not None
         if best is None:
+            reasons = [trial.user_attrs.get(REASON, BEHIND) for trial in study.get_trials(states=DONE)]
+            if not any(reason.startswith(BEHIND) for reason in reasons):
+                mend = "change the block or --space, and choose another --study-name"
+                raise ValueError(f"no trial of {self.study_name} could be trained ({reasons[-1]}): {mend}")
             mend = "raise --cost-limit, train longer with -n, or run more trials with --n-trials"
             print(f"no trial of {self.study_name} keeps the expected cost below {self.cost_limit:g}: {mend}")
             return
-        settings = {**put_in(self.settings, best.params, abs(self.cost_limit)), "n_timesteps": self.n_timesteps}
+        settings = put_in(self.settings, best.params, abs(self.cost_limit))
         text = yaml.safe_dump({self.block or self.env_name.gym_id: settings}, sort_keys=False)
         write_atomically(folder / "best.yml", f"# Trial {best.number} of {self.study_name}: {_result(best)}\n{text}")
         print(f"best of {len(study.trials)} trials is number {best.number}, {_result(best)}:")
         for name, value in best.params.items():
             print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
-        block = "" if self.block is None else f" --block {self.block}"
-        command = f"sb3-tdpg train --env {self.env_name.gym_id} --conf-file {folder / 'best.yml'}{block}"
-        print(f"results are in {folder}; to train with them: {command}")
+        command = ["sb3-tdpg", "train", "--env", self.env_name.gym_id, "--conf-file", str(folder / "best.yml")]
+        command += [] if self.block is None else ["--block", self.block]
+        print(f"results are in {folder}; to train with them: {shlex.join(command)}")
 
 
 class _Measuring(BaseCallback):
@@ -232,15 +255,19 @@ def block_of_trial(storage: str, study_name: str, number: int | None = None) -> 
 
     :raises ValueError: if there is no such study or trial.
     """
+    if "://" not in storage and not Path(storage).exists():  # opening it would make the file
+        raise ValueError(f"there is no storage {storage}: give the --storage that tune was run with")
     try:
         study = optuna.load_study(study_name=study_name, storage=open_storage(storage))
+        described = study.user_attrs["space"]
     except KeyError as e:
-        raise ValueError(f"there is no study {study_name!r} in {storage}") from e
+        found = optuna.get_all_study_names(open_storage(storage))
+        raise ValueError(f"the storage has no study {study_name!r} of tune: it has {', '.join(found) or 'none'}") from e
     trials = {trial.number: trial for trial in study.get_trials()}
     trial = best_trial(study) if number is None else trials.get(number)
     if trial is None:
-        raise ValueError(f"study {study_name!r} has no trial {number}: it has {len(trials)}, from number 0")
-    described = study.user_attrs["space"]
+        missing = "trial that meets its limit on the cost" if number is None else f"trial {number}"
+        raise ValueError(f"study {study_name!r} has no {missing}: it has {len(trials)}, from number 0")
     return put_in(with_numbers(described["block"]), trial.params, abs(described["cost_limit"]))
 
 

@@ -1,5 +1,6 @@
 """Files that are never half-written, and folders that one process keeps."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -84,6 +85,11 @@ def test_content_and_folder_are_flushed_before_and_after_the_file_is_replaced(tm
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
     write_atomically(tmp_path / "summary.md", "text")
     assert done == ["summary.md", "replace", tmp_path.name]
+
+
+def test_a_full_disk_is_told_with_the_file(tmp_path):
+    with pytest.raises(OSError, match=r"File too large: '.*summary.md'"), replaced_atomically(tmp_path / "summary.md"):
+        raise OSError(errno.EFBIG, "File too large")
 
 
 def test_a_folder_is_kept_by_one_process_at_a_time(tmp_path):

@@ -21,6 +21,7 @@ from sb3_tdpg.cli import main
 from sb3_tdpg.experiments.blind import BlindVecEnv
 from sb3_tdpg.experiments.frontier import NO_PENALTY, OPEN_LOOP, _task, frontier, frontier_table, knee, verdict
 from sb3_tdpg.experiments.training import take_env
+from sb3_tdpg.report import parse_models
 from sb3_tdpg.vec_env import make_episodes_env
 
 COMMAND = ["frontier", "--env", "Lava-v0", "--shares", "90", "--seeds", "2", "--jobs", "1"]
@@ -68,9 +69,11 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
 
 def test_the_command_that_measures_it_has_the_keywords_of_the_block(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main([*COMMAND, *TINY, "--seeds", "1", "--block", "Lava-v0-logdet-table"]) == 0
+    assert main([*COMMAND, *TINY, "--seeds", "1", "--block", "Lava-v0-logdet-table", "--out", "of [1]"]) == 0
     (report,) = re.findall(r"^sb3-tdpg report .*$", capsys.readouterr().out, re.MULTILINE)
     assert "--env-kwargs" in report and "action_cost=1.0" in report
+    words = shlex.split(report)
+    assert len(parse_models(words[2 : words.index("--env")])) == 2  # whatever the name of the folder
 
 
 def test_an_interrupted_frontier_goes_on_and_more_shares_add_to_it(tmp_path, monkeypatch):

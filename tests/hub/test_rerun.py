@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -63,6 +64,14 @@ def test_a_run_of_an_open_loop_is_refused_before_it_is_trained(tmp_path):
 
 def noisy(env):
     return PerturbedVecEnv(env, "vector_noise", 5)
+
+
+def test_a_rerun_that_cannot_write_or_is_interrupted_is_told_in_a_line(runs, capsys, monkeypatch):
+    config = str(runs / "pg-seed0" / "config.json")
+    assert rerun_main([config, "/proc/nowhere"]) == 2
+    assert capsys.readouterr().err == "error: [Errno 2] No such file or directory: '/proc/nowhere'\n"
+    monkeypatch.setattr("sb3_tdpg.experiments.rerun.complete_run", Mock(side_effect=KeyboardInterrupt))
+    assert rerun_main([config, "again"]) == 130
 
 
 def test_a_rerun_without_the_policy_that_the_run_started_from_is_refused(card, runs, tmp_path, capsys):

@@ -5,6 +5,7 @@ import math
 import re
 import sys
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import optuna
@@ -164,11 +165,10 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     block = yaml.safe_load((folder / "best.yml").read_text())["Lava-v0-logdet"]
     assert block["policy_kwargs"]["trv_dim"] == int(best["params_policy_kwargs.trv_dim"])
     assert block["n_timesteps"] == 400
-    assert block == {**block_of_trial(str(folder / "study.log"), folder.name[6:], int(best["number"])),
-                     "n_timesteps": 400}  # fmt: skip
+    assert block == block_of_trial(str(folder / "study.log"), folder.name[6:], int(best["number"]))
 
     assert main([*command, "--n-trials", "5", "-n", "500"]) == 2  # TINY's -n comes first
-    assert "exists with other settings, n_timesteps: 400 there, 500 here" in capsys.readouterr().err
+    assert "exists with other settings, block.n_timesteps: 400 there, 500 here" in capsys.readouterr().err
 
     results = {path.name: path.read_bytes() for path in folder.iterdir()}
     elsewhere = ["--storage", "another.log", "--cost-limit", "1e5"]  # of the same name
@@ -178,13 +178,26 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     assert not (here / "another.log").exists()
 
     train = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1"]
-    assert main([*train, "--conf-file", str(folder / "best.yml")]) == 0
-    where = ["--storage", str(folder / "study.log"), "--study-name", folder.name[6:], "--trial-id", best["number"]]
-    assert main([*train, *where, "-n", "400"]) == 0
-    for n in (1, 2):
+    where = ["--storage", str(folder / "study.log"), "--study-name", folder.name[6:]]
+    first = block_of_trial(str(folder / "study.log"), folder.name[6:], 0)
+    for n, (flags, trained) in enumerate((
+        (["--conf-file", str(folder / "best.yml")], block),
+        (where, block),  # the best one
+        ([*where, "--trial-id", "0"], first),
+    ), start=1):  # fmt: skip
+        assert main([*train, *flags]) == 0
         model = TDPG.load(here / "logs" / "tdpg" / f"Lava-v0_{n}" / "Lava-v0.zip", device="cpu")
-        if n == 1 or best["number"] != "0":  # the zoo takes no trial for trial 0
-            assert model.beta == pytest.approx(block["beta"])
+        assert (model.beta, model.num_timesteps) == (pytest.approx(trained["beta"]), 400)
+
+
+def test_keywords_of_the_environment_belong_to_the_study_and_its_best_block(here, capsys):
+    command = ["tune", *TINY, "--cost-limit", "1e6", "--n-trials", "1", "-f", "my logs", "--env-kwargs"]
+    assert main([*command, "action_cost:0.5"]) == 0
+    assert f"--conf-file '{next(Path('my logs').rglob('best.yml'))}'" in capsys.readouterr().out
+    (path,) = here.rglob("best.yml")
+    assert yaml.safe_load(path.read_text())["Lava-v0-logdet"]["env_kwargs"] == dict(action_cost=0.5)
+    line = error_line(capsys, *command, "action_cost:0.1")
+    assert "exists with other settings, block.env_kwargs.action_cost: 0.5 there, 0.1 here" in line
 
 
 def test_a_shifted_scenario_is_what_the_cost_is_of(here, tmp_path, monkeypatch):
@@ -247,16 +260,29 @@ def test_a_limit_that_no_trial_meets_is_told(here, capsys):
     assert main(["tune", *TINY, "--cost-limit", "1e-6", "--n-trials", "2"]) == 0
     assert "keeps the expected cost below" in capsys.readouterr().out
     assert not list(here.rglob("best.yml"))
+    (path,) = here.rglob("study.log")
+    where = ["--storage", path, "--study-name", "Lava-v0-logdet-information"]
+    line = error_line(capsys, "train", *TINY[:4], *where)
+    assert line.startswith("error: study 'Lava-v0-logdet-information' has no trial that meets its limit on the cost")
 
 
 @pytest.mark.parametrize("arguments, message", [
     (["--eval-env-kwargs", "foo:1"], "cannot be made with env_kwargs={'foo': 1}"),
     (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db cannot be opened"),
-], ids=["keyword", "storage"])  # fmt: skip
+    (["-params", "gamma:3"], "gamma=3 must"),
+    (["--eval-episodes", "33"], "--eval-episodes 33 are too few .* of up to 32 TRVs: give at least 34"),
+], ids=["keyword", "storage", "setting", "episodes"])  # fmt: skip
 def test_what_the_trials_would_fail_at_is_told_in_a_line(arguments, message, here, capsys):
     line = error_line(capsys, "tune", *TINY, *arguments)
     assert re.search(message, line)
     assert "secret" not in line
+    assert not list(here.rglob("study.log"))
+
+
+def test_why_no_trial_could_be_trained_is_told(here, capsys):
+    (here / "space.yml").write_text("gamma: {low: 2.0, high: 3.0}")
+    line = error_line(capsys, "tune", *TINY, "--space", "space.yml", "--n-trials", "1")
+    assert "no trial of Lava-v0-logdet-information could be trained (gamma=" in line
 
 
 def test_other_algorithms_are_tuned_as_the_zoo_does_it(here, capsys):

@@ -86,12 +86,15 @@ def test_a_resumed_training_ends_with_the_policy_of_an_uninterrupted_one(here):
     assert_same_training(here)
 
 
-def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, capsys):
+def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_settings(here, capsys, monkeypatch):
+    (here / "mine.yml").write_text(yaml.safe_dump({"CartPole-v1": load_hyperparams("CartPole-v1")}))
     arguments = ["train", "--env", "CartPole-v1", "-params", "epoch_steps:200", "batch_size:100", "n_epochs:1"]
-    arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1"]
+    arguments += ["--conf-file", "mine.yml", "-tb", "tensorboard"]
+    arguments += ["-n", "3600", "--eval-freq", "700", "--eval-episodes", "2", "--seed", "1", "--save-freq", "700"]
     with stopped_in_epoch(13):
-        assert main(arguments) == 130
-    folder = folder_of(here, 1, env="CartPole-v1")
+        assert main([*arguments, "-f", "my logs"]) == 130
+    assert "--resume 'my logs/tdpg/CartPole-v1_1'`" in capsys.readouterr().out
+    folder = (here / "my logs").rename(here / "logs") / "tdpg" / "CartPole-v1_1"
     n_episodes = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
     record = json.loads((folder / "run.json").read_text())
     record["hyperparams"]["n_epochs"] = 2
@@ -101,13 +104,18 @@ def test_a_resumed_training_keeps_its_evaluations_and_logs_and_refuses_other_set
     assert main(["train", "--resume", str(other)]) == 2
     assert "was trained with other settings than" in capsys.readouterr().err
 
+    monkeypatch.chdir(other)
     assert main(["train", "--resume", str(folder)]) == 0
+    assert not (other / "tensorboard").exists()
+    monkeypatch.chdir(here)
     assert main(arguments) == 0
     again = folder_of(here, 2, env="CartPole-v1")
     resumed, whole = (TDPG.load(each / "CartPole-v1.zip", device="cpu") for each in (folder, again))
     assert_same_parameters(parameters(resumed.policy), parameters(whole.policy))
     evaluations = [np.load(each / "evaluations.npz")["timesteps"] for each in (folder, again)]
     assert len(evaluations[0]) == len(evaluations[1])
+    saved = [{path.name for path in each.glob("rl_model_*.zip")} for each in (folder, again)]
+    assert saved[0] == saved[1]
     kept = sum(len(path.read_text().splitlines()) - 2 for path in folder.glob("*.monitor.csv"))
     assert kept > n_episodes
 
@@ -123,7 +131,7 @@ def test_a_model_of_the_zoo_loads_without_it_and_its_rates_may_end_anywhere(here
 
 @pytest.mark.slow
 def test_a_killed_training_with_normalised_observations_is_resumed_exactly(here):
-    settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)"]
+    settings = ["n_episodes:20", "normalize:dict(norm_obs=True,norm_reward=False)", "callback:[]"]
     arguments = ["train", *LAVA, "-params", *settings, "-n", "20000", "--seed", "1"]
     process = start(arguments, here)
     wait_for(here, "logs/tdpg/Lava-v0_1/checkpoint.zip", process)
@@ -172,10 +180,12 @@ def test_enjoy_without_the_ending_of_the_file_says_what_it_takes(here, capsys):
     assert "give the .zip file" in error_line(capsys, "enjoy", "logs/tdpg_lava", "--env", "Lava-v0")
 
 
-def test_plot_and_video_of_a_training(here):
+def test_plot_and_video_of_a_training(here, capsys):
     main(["train", *SHORT])
     assert main(["plot", "-e", "Lava-v0", "--save", "curve.png"]) == 0
     assert (here / "curve.png").stat().st_size > 5000
+    assert "-e Nope` gives an empty figure" in error_line(capsys, "plot", "-e", "Nope", "--save", "empty.png")
+    assert not (here / "empty.png").exists()
     assert main(["record-video", "--env", "Lava-v0", "-n", "5"]) == 0
     (film,) = here.rglob("*.mp4")
     assert film.stat().st_size > 1000

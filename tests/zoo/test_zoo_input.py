@@ -4,8 +4,10 @@ import json
 import pickle
 import re
 
+import gymnasium as gym
 import pytest
 import yaml
+from gymnasium.envs.registration import EnvSpec
 from programs import start
 from small_problems import error_line, tiny_tdpg
 
@@ -22,7 +24,19 @@ BAD = {
     "no steps": ([*TRAIN, "-n", "0"], "-n 0 must be at least 1"),
     "negative steps": ([*TRAIN, "-n", "-5"], "-n -5 must be at least 1"),
     "negative steps of a block": ([*TRAIN, "-params", "n_timesteps:-5"], "n_timesteps: -5, which must be a number of"),
-    "no environments": ([*TRAIN, "-params", "n_envs:0"], "n_envs: 0, which must be a number of at least 1"),
+    "no environments": ([*TRAIN, "-params", "n_envs:0"], "n_envs: 0, which must be an integer of at least 1"),
+    "parts of environments": ([*TRAIN, "-params", "n_envs:2.5"], "n_envs: 2.5, which must be an integer of at least 1"),
+    "frame stack": ([*TRAIN, "-params", "frame_stack:0"], "frame_stack: 0, which must be an integer of at least 1"),
+    "wrapper": ([*TRAIN, "-params", "env_wrapper:'gymnasium.Nope'"], "env_wrapper: 'gymnasium.Nope', which .* 'Nope'"),
+    "wrapper's keyword": ([*TRAIN, "-params", "env_wrapper:[{'gymnasium.wrappers.TimeLimit':{'foo':3}}]"],
+                          "Lava-v0 cannot be made with its keywords .*'foo'.*: correct env_kwargs, or"),
+    "callback's keyword": ([*TRAIN, "-params", "callback:[{'sb3_tdpg.SelectionCallback':{'cost_limt':3}}]"],
+                           "block Lava-v0-logdet of .* has callback: .* which rl-zoo3 cannot read .*'cost_limt'"),
+    "name of a policy": ([*TRAIN, "-params", "policy:'sb3_tdpg.Nope'"], "policy: 'sb3_tdpg.Nope', which .* 'Nope'"),
+    "normalize": ([*TRAIN, "-params", "normalize:'foo'"], "normalize: 'foo', which .*'foo' is not defined.*: correct"),
+    "monitor": ([*TRAIN, "-params", "monitor_kwargs:dict(foo=3)"], "monitor_kwargs: .* unexpected keyword .*'foo'"),
+    "evaluation": ([*TRAIN, "--n-eval-envs", "0"], "--n-eval-envs 0 must be at least 1"),
+    "lacking package": (["train", "--env", "Lacking-v0", "--conf-file", "lacking.yml"], "install Box2D"),
     "callback": ([*TRAIN, "-params", "callback:5"], "callback: 5, which must be a class or a list"),
     "seed": ([*TRAIN, "-params", "seed:5"], "seed: 5: give --seed"),
     "device": ([*TRAIN, "--device", "foo"], "device='foo' is unknown"),
@@ -32,6 +46,8 @@ BAD = {
     "log": ([*TUNE, "--space", "space.yml"], "log: 'maybe', which must be true or false"),
     "record": (["train", "--resume", "empty"], "does not say how its training was started"),
     "empty block": ([*TRAIN, "--block", "Empty-v0", "-conf", "empty.yml"], "has no readable block 'Empty-v0'"),
+    "storage": ([*TRAIN, "--storage", "none.log", "--study-name", "a"], "there is no storage none.log: give the --st"),
+    "study": ([*TRAIN, "--storage", "no.log", "--study-name", "a"], "has no study 'a' of tune: it has none"),
     "key of a space": ([*TUNE, "--space", "number.yml"], "5 of number.yml is no argument of TDPG"),
     "file of results": (["plot", "--kind", "from-file", "-i", "results.pkl"], "results.pkl` names no results"),
     "optimize": ([*TRAIN, "-optimize"], "sb3-tdpg tune"),
@@ -62,8 +78,12 @@ BLOCKS = {
 }
 
 
+def lacking():
+    raise gym.error.DependencyNotInstalled("install Box2D")
+
+
 @pytest.mark.parametrize("arguments, message", BAD.values(), ids=BAD)
-def test_bad_input_is_told_in_a_line_and_leaves_nothing_behind(arguments, message, here, capsys):
+def test_bad_input_is_told_in_a_line_and_leaves_nothing_behind(arguments, message, here, capsys, monkeypatch):
     (here / "empty").mkdir()
     (here / "empty" / "run.json").write_text("{}")
     (here / "space.yml").write_text(yaml.safe_dump({"learning_rate": dict(low=1.0e-4, high=1.0e-3, log="maybe")}))
@@ -73,7 +93,12 @@ def test_bad_input_is_told_in_a_line_and_leaves_nothing_behind(arguments, messag
     for name, settings in BLOCKS.items():
         (here / f"{name}.yml").write_text(f"Lava-v0: {{policy: TRVPolicy, n_timesteps: 100, {settings}}}\n")
     (here / "results.pkl").write_bytes(pickle.dumps({}))
+    (here / "no.log").touch()
+    (here / "lacking.yml").write_text("Lacking-v0: {policy: TRVPolicy, n_timesteps: 100}\n")
+    monkeypatch.setitem(gym.registry, "Lacking-v0", EnvSpec("Lacking-v0", entry_point=lacking))
+    given = set(here.iterdir())
     assert re.search(message, error_line(capsys, *arguments))
+    assert set(here.iterdir()) - given <= {here / "logs"}
     assert not list(here.glob("logs/*/*"))
 
 
