@@ -6,6 +6,7 @@ import math
 import warnings
 
 LEAST_SLACK = 0.01  # of the limit, or of the improvement: costs of an epoch scatter
+NO_SCALE = 1e-9  # costs that are all zero
 RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
 MAX_GROWTH = 1000.0  # of the starting weight; else it would grow forever where the task needs no information
 # Of a limit that is a share of the improvement.
@@ -91,16 +92,16 @@ class AutoWeight:
         scale, aim, low, high = abs(self.limit), self.limit, -2.0, 1.0
         if self.by_slack:
             slack = max(self.limit - self._lowest, 0.0)
-            if self.first_cost is not None:  # a share's scale must not depend on where costs have their zero
-                scale = min(scale, abs(self.first_cost - self._lowest))
-            scale = max(slack, LEAST_SLACK * scale, 1e-9)
+            if self.first_cost is not None and self.first_cost != self._lowest:
+                scale = min(scale, abs(self.first_cost - self._lowest))  # wherever costs have their zero
+            scale = max(slack, LEAST_SLACK * scale, NO_SCALE)
             aim, low, high = self.limit - slack / 2, -3.0, 0.3
         if self.share is not None:
             high *= min(1.0, progress_remaining / LATEST_START)
         if self.value > 0.0:
             self.value *= math.exp(RATE * min(max((aim - cost) / scale, low), high))
             self.value = min(self.value, MAX_GROWTH * self._start)
-        elif is_ready:
+        elif is_ready and scale > NO_SCALE:
             self.value = self._start = scale / max(information, 1.0)
             self.information_before = information
 

@@ -139,7 +139,8 @@ class SelectionCallback(TDPGCallback):
         return "lowest information" if self.mi_limit is None else "lowest cost"
 
     def _init_callback(self) -> None:
-        if (normalize := self.model.get_vec_normalize_env()) is not None and normalize.norm_obs:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None and normalize.norm_obs and normalize.training:
             raise ValueError(
                 "SelectionCallback keeps the policy of an epoch but not the statistics of VecNormalize, which go on "
                 "changing: give norm_obs=False and policy_kwargs=dict(normalize_observations=True)"

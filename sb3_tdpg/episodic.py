@@ -127,7 +127,6 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         self._problem = problem
         self.horizon, self.state_dim = problem.horizon, problem.state_dim
         self.n_steps = self.epoch_size // env.num_envs
-        self.normalizes = (normalize := unwrap_vec_normalize(env)) is not None and normalize.norm_obs
 
     @property
     def epoch_size(self) -> int:
@@ -246,7 +245,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         given = callback if isinstance(callback, list) else [callback]
         callbacks = [c if isinstance(c, BaseCallback) else ConvertCallback(c) for c in given]
         callbacks = [c for each in callbacks for c in (each.callbacks if type(each) is CallbackList else [each])]
-        first = [c for c in callbacks if isinstance(c, MINECallback)] or [MINECallback()]
+        first = [c for c in callbacks if _has_mine(c)] or [MINECallback()]
         callbacks = [*first, *(c for c in callbacks if c not in first)]  # the others see the information
         if progress_bar:
             callbacks.append(TDPGProgressBar())
@@ -262,6 +261,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         if self.env is None:
             raise ValueError("the model has no environment to learn in: set_env(...) first, or load(path, env=...)")
+        self.normalizes = (normalize := unwrap_vec_normalize(self.env)) is not None and normalize.norm_obs
         self._last_obs = None  # somebody may have stepped the environments since the last epoch
         if reset_num_timesteps:
             self.epoch = 0
@@ -333,7 +333,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to continue from a policy-gradient model.
         :raises ValueError: if the file is damaged or TDPG did not save it.
         """
-        kwargs = {**implied(kwargs), **kwargs}  # as in the constructor
+        kwargs |= implied(kwargs)  # as in the constructor
         known = {name for each in cls.__mro__[:-1] for name in signature(each).parameters}
         refuse_others({name: 0 for name in kwargs if name not in known and name[0] != "_"}, known)
         if "batch_size" in kwargs:
@@ -388,6 +388,10 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     @property
     def _defaults(self) -> Defaults:
         return DEFAULTS[self.preset or preset_of(self.observation_space, None)]
+
+
+def _has_mine(callback: BaseCallback) -> bool:
+    return isinstance(callback, MINECallback) or any(map(_has_mine, getattr(callback, "callbacks", ())))
 
 
 def check_policy(policy: Any, aliases: Collection[str]) -> None:

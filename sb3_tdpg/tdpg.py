@@ -397,6 +397,7 @@ class TDPG(EpisodicAlgorithm):
         for columns in (part for _ in range(self.n_epochs) for part in self._minibatches(passes)):
             part = passes.select(columns)
             log_prob, rebuilt = self.policy.evaluate_episodes(part, self.encoder_gradient, mi_coef > 0.0)
+            vars(self.policy.action_dist).pop("distribution", None)  # with its graph the policy could not be copied
             if old_log_prob is None:
                 policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
             else:
@@ -427,7 +428,6 @@ class TDPG(EpisodicAlgorithm):
             self.logger.record_mean("train/policy_loss", policy_loss.item())
             self.logger.record_mean("train/loss", loss.item())
             self.logger.record_mean("train/grad_norm", grad_norm.item())
-        vars(self.policy.action_dist).pop("distribution", None)  # with its graph the policy could not be copied
         # Last: the rollouts and all of their gradients saw the same inputs.
         self.policy.update_statistics(whole)
 

@@ -55,6 +55,16 @@ def test_a_constant_in_every_cost_does_not_change_the_weight_of_a_share():
     assert values[0] > 4.5 / 4  # it has grown since its start
 
 
+@pytest.mark.parametrize(("cost", "is_penalised"), [(5.0, True), (0.0, False)])
+def test_costs_that_never_change_have_a_penalty_unless_they_are_zero(cost, is_penalised, recwarn):
+    weight = AutoWeight("95%")
+    for epoch in range(40):
+        weight.update(cost, information=1.0, progress_remaining=1 - epoch / 40)
+    weight.warn_if_never_met()
+    assert (weight.value > 0.01) == is_penalised
+    assert (not recwarn) == is_penalised
+
+
 def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
     weight = AutoWeight(cost_limit=10.0)
     for _ in range(500):

@@ -129,6 +129,8 @@ def test_observations_whose_normalisation_would_not_be_selected_are_refused():
         train_epochs(tiny_tdpg(VecNormalize(lava_env(), norm_reward=False)), 1, callback=selection)
     train_epochs(tiny_tdpg(VecNormalize(lava_env(), norm_obs=False, norm_reward=False)), 1, callback=selection)
     assert selection.best is not None
+    frozen = VecNormalize(lava_env(), norm_reward=False, training=False)
+    train_epochs(tiny_tdpg(frozen), 1, callback=SelectionCallback(cost_limit=1e9))
 
 
 def test_the_selected_model_is_on_disk_with_its_record(tmp_path):

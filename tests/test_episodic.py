@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from sb3_tdpg import TDPG, TrainingDivergedError
+from sb3_tdpg import TDPG, MINECallback, TrainingDivergedError
 
 
 def test_the_last_epoch_takes_the_steps_that_are_left():
@@ -67,9 +67,13 @@ def test_a_list_of_callbacks_of_the_user_s_own_keeps_its_hooks():
             self.n_steps += 1
             return super()._on_step()
 
-    counting = Counting([])
-    tiny_tdpg(lava_env(4), n_episodes=4).learn(20, callback=counting)
+    counting = Counting([MINECallback()])
+    model = tiny_tdpg(lava_env(4), n_episodes=4)
+    fitted, fit = [], model.fit_critics
+    model.fit_critics = lambda: (fitted.append(1), fit())
+    model.learn(20, callback=counting)
     assert counting.n_steps == 5
+    assert len(fitted) == 1  # by the user's own MINECallback
 
 
 def test_a_policy_can_be_copied_in_mid_training():

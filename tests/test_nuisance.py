@@ -165,3 +165,4 @@ def test_a_nuisance_goes_inside_a_normalisation():
     for env in (normalized, VecMonitor(normalized)):
         with pytest.raises(ValueError, match=r"nuisance='vector_noise': .*VecNormalize\(PerturbedVecEnv"):
             tiny_tdpg(env, nuisance="vector_noise")
+    tiny_tdpg(VecMonitor(normalized), nuisance={"actuator_gain": 1})  # changes no observation

@@ -107,6 +107,7 @@ def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping
     (dict(cost_limit="90%", beta=0.5), {}),  # which is refused
     (dict(beta=0.5), dict(cost_limit=None)),
     (dict(beta="auto", cost_limit=None), {}),
+    (dict(cost_limit=3.0, beta=None), dict(beta="auto")),
     (dict(n_episodes=20, epoch_steps=None), dict(epoch_steps=None)),
     (dict(epoch_steps=100), dict(n_episodes=None)),
     (dict(epoch_steps=100, n_episodes=20), {}),  # as is this

@@ -25,6 +25,7 @@ from torch import nn
 import sb3_tdpg
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.networks import TimeMLP
+from sb3_tdpg.evaluation.environments import check_statistics
 from sb3_tdpg.evaluation.loading import statistics_beside
 from sb3_tdpg.policies import TRVPolicy
 from sb3_tdpg.tdpg import TDPG
@@ -252,11 +253,7 @@ def export_trained(model: Any, path: str | os.PathLike[str], format: str | None,
 
     :raises ValueError: if observations were normalised in its training, and there are no statistics.
     """
-    if model.normalizes and normalization is None:
-        raise ValueError(
-            "the policy was trained on normalised observations, and there is no VecNormalize to export with it: load "
-            "the model with env=VecNormalize.load(file, env), or put the file vecnormalize.pkl beside it"
-        )
+    check_statistics(model, normalization)
     return export_policy(model.policy, path, format=format, normalization=normalization)
 
 

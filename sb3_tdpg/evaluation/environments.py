@@ -32,7 +32,9 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
 
 def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
     """Wrap a new environment as an SB3 model needs it; see :func:`scenario_env`."""
-    if (normalize := model.get_vec_normalize_env()) is not None:
+    normalize = model.get_vec_normalize_env()
+    check_statistics(model, normalize)
+    if normalize is not None:
         if spaces.flatdim(normalize.observation_space) == spaces.flatdim(model.observation_space):
             env = stacked_for(model, env)  # below the normalisation
         normalize = copy.copy(normalize)  # without an environment
@@ -45,6 +47,15 @@ def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
     if any(is_image_space(p) and not is_image_space_channels_first(p) for p in parts if isinstance(p, spaces.Box)):
         env = VecTransposeImage(env)  # as SB3 wraps the environment that it trains on
     return env
+
+
+def check_statistics(model: Any, normalize: VecNormalize | None) -> None:
+    """Raise a ``ValueError`` if a model of TDPG was trained on normalised observations, and has no statistics."""
+    if normalize is None and getattr(model, "normalizes", False):
+        raise ValueError(
+            "the policy was trained on normalised observations, and there are no statistics of VecNormalize: load the "
+            "model with env=VecNormalize.load(file, env), or put the file vecnormalize.pkl beside its file"
+        )
 
 
 def stacked_for(model: Any, env: VecEnv) -> VecEnv:

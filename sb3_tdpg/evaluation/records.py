@@ -138,7 +138,7 @@ def rollout_states(
                 raise ValueError(f"{ended}: rollout_states needs episodes of equal length")
             states.append(step.states)
             costs -= step.rewards
-        states.append(np.stack([info["state"] for info in step.infos]))
+        states.append(np.stack([np.ravel(info["state"]) for info in step.infos]))
     return np.stack(states), costs
 
 

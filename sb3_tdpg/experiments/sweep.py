@@ -195,7 +195,8 @@ def sweep(
         import_module(module)
     block = block or name
     length = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
-    rows = PAPER_ROWS.get(name, (Scenario("Training", env_id),))
+    # Not the table's own first row: its keywords would replace those of the training.
+    rows = (Scenario("Training", env_id), *PAPER_ROWS.get(name, ())[1:])
     rows = tuple(replace(row, env_id=env_id) if row.env_id == name else row for row in rows)
     plan = _Plan(
         env_id,

@@ -169,7 +169,7 @@ def pull_from_hub(
     repo_id: str, out: str | os.PathLike[str], *, revision: str | None = None, token: str | None = None
 ) -> Path:
     """
-    Download a repository; nothing in it is run or unpickled. The folder appears only when it is complete.
+    Download a repository; nothing in it is run or unpickled. Nothing stays of a download that fails.
 
     :param repo_id: ``organization/name``.
     :param out: The folder; it must not exist, or be empty.
@@ -179,13 +179,17 @@ def pull_from_hub(
     :raises ValueError: if ``out`` is not empty, or the download fails.
     """
     out = _empty(out)
-    target = Path(os.path.abspath(out))  # "." has no name
-    with replaced_atomically(target) as folder:
-        folder.mkdir()
+    is_new = not out.exists()
+    try:
         with _one_line_errors(repo_id, "read"):
-            huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=folder, token=token, **LIBRARY)
-        if target.exists():
-            target.rmdir()
+            huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=out, token=token, **LIBRARY)
+    except BaseException:
+        # A folder that was there stays: it may be the working directory, a link or a mounted disk.
+        for each in out.iterdir() if out.exists() else ():
+            shutil.rmtree(each) if each.is_dir() else each.unlink()
+        if is_new and out.exists():
+            out.rmdir()
+        raise
     return out
 
 

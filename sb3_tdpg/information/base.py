@@ -81,11 +81,11 @@ class InformationEstimator(nn.Module):
 
         :return: ``(T,)``, nats
         """
-        if batch.alive is None:
+        has_enough = self.has_enough(batch).tolist()
+        if batch.alive is None and all(has_enough):
             return self._estimate(batch, None)
         zero = batch.trvs.new_zeros(1)
-        steps = enumerate(self.has_enough(batch).tolist())
-        return th.cat([self._estimate(batch.at(t), t) if enough else zero for t, enough in steps])
+        return th.cat([self._estimate(batch.at(t), t) if enough else zero for t, enough in enumerate(has_enough)])
 
     def has_enough(self, batch: InformationBatch) -> th.Tensor:
         """Return at which steps so many episodes are alive that there is an estimate: ``(T,)`` bool."""

@@ -40,7 +40,7 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
             if (before := seen.setdefault(path.resolve(), name)) != name or path in methods.get(name, ()):
                 raise ValueError(f"{path} is given twice, for {before!r} and for {name!r}: a model counts once")
             beside = [each for each in methods.get(name, ()) if each.parent.resolve() == path.parent.resolve()]
-            if beside and not label and SEED.sub("", path.stem) != name:
+            if beside and not label and _is_named_after_folder(path, env_id):
                 raise ValueError(
                     f"{path} and {beside[0]} are named after one folder, and would count as two trainings of {name!r}: "
                     f"give each a label, such as A={path}"
@@ -53,10 +53,7 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
 
 def label_of(path: Path, env_id: str = "") -> str:
     """Return the name of the method of a model file; see :func:`parse_models`."""
-    stem = path.name.removesuffix(".zip")
-    is_plain = PLAIN_NAMES.fullmatch(stem) is not None or stem == env_id.rpartition(":")[2]
-    folder = path.absolute().parent.name
-    name = folder if is_plain and folder else stem
+    name = path.absolute().parent.name if _is_named_after_folder(path, env_id) else path.name.removesuffix(".zip")
     name = SEED.sub("", name) or name
     if name != env_id.rpartition(":")[2]:
         return name
@@ -64,6 +61,12 @@ def label_of(path: Path, env_id: str = "") -> str:
     record = path.parent / "run.json"
     block = json.loads(record.read_text()).get("block") if record.exists() else None
     return f"{path.absolute().parent.parent.name} {block or name}"
+
+
+def _is_named_after_folder(path: Path, env_id: str) -> bool:
+    stem = path.name.removesuffix(".zip")
+    is_plain = PLAIN_NAMES.fullmatch(stem) is not None or stem == env_id.rpartition(":")[2]
+    return is_plain and path.absolute().parent.name != ""
 
 
 def _split(argument: str) -> tuple[str, str]:

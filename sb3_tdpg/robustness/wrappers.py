@@ -47,10 +47,11 @@ class PerturbedVecEnv(VecEnvWrapper):
         if not isinstance(venv, VecEnv):
             name = type(venv).__name__
             raise ValueError(f"{name} is not a VecEnv of Stable-Baselines3: use make_vec_env, or DummyVecEnv")
-        if (normalize := unwrap_vec_normalize(venv)) is not None and normalize.norm_obs:
-            raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         super().__init__(venv)
         family, self._seed = Family(perturbation, venv, severity, scale), seed
+        normalize = unwrap_vec_normalize(venv)
+        if normalize is not None and normalize.norm_obs and not family.is_plant:
+            raise ValueError("perturb observations before they are normalised: VecNormalize(PerturbedVecEnv(env, ...))")
         self._is_plant, self._perturber = family.is_plant, family.members(venv.num_envs, seed)
         self._depth, inner = 0, venv
         while isinstance(inner, VecEnvWrapper):

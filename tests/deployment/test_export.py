@@ -18,6 +18,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_tdpg import TDPG
 from sb3_tdpg.cli import main
 from sb3_tdpg.deployment.export import METADATA, ExportedStep, export_policy
+from sb3_tdpg.envs.scenarios import Scenario
+from sb3_tdpg.evaluation import evaluate_scenarios
 
 onnxruntime = pytest.importorskip("onnxruntime")
 pytestmark = [
@@ -252,6 +254,11 @@ def test_without_the_statistics_of_the_training_nothing_is_exported(tmp_path):
     normalized().save(tmp_path / "model")
     with pytest.raises(ValueError, match=r"trained on normalised observations.*VecNormalize\.load"):
         TDPG.load(tmp_path / "model", device="cpu").export(tmp_path / "p.pt")
+    plain = TDPG.load(tmp_path / "model", env=make_vec_env("Pendulum-v1"), device="cpu")
+    with pytest.raises(ValueError, match="trained on normalised observations"):
+        plain.export(tmp_path / "p.pt")
+    with pytest.raises(ValueError, match="trained on normalised observations"):
+        evaluate_scenarios(plain, [Scenario("Training", "Pendulum-v1")], 1)
 
 
 @pytest.mark.parametrize(

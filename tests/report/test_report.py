@@ -208,8 +208,9 @@ def test_models_are_grouped_by_label_or_folder(tmp_path):
     assert label_of(folder / "Lava-v0.zip", "sb3_tdpg:Lava-v0") == "ppo Lava-v0-wide"
     with pytest.raises(ValueError, match="given twice"):
         parse_models([f"A={tmp_path}/c/ppo_s.zip", f"B={tmp_path}/c/ppo_s.zip"])
-    for name in ("rl_model_10_steps", "rl_model_20_steps", "sac_1", "sac_2"):
+    for name in ("rl_model_10_steps", "rl_model_20_steps", "sac_1", "sac_2", "Lava-v0_seed0", "Lava-v0_seed1"):
         (folder / f"{name}.zip").touch()
+    assert len(parse_models([f"{folder}/Lava-v0_*.zip"], "Lava-v0")["ppo Lava-v0-wide"]) == 2
     assert len(parse_models([f"{folder}/sac_*.zip", f"A={folder}/rl_*.zip"])["sac"]) == 2
     with pytest.raises(ValueError, match="count as two trainings of 'ppo Lava-v0-wide': give each a label"):
         parse_models([f"{folder}/rl_*.zip"], "Lava-v0")
