@@ -1,4 +1,4 @@
-"""Configure Sphinx: MyST Markdown, the theme Furo, and the docstrings of the code."""
+"""Configure Sphinx: MyST Markdown, the Furo theme, and the docstrings of the code."""
 
 import configparser
 import re
@@ -22,16 +22,16 @@ copyright = f"2026, {author}"
 release = version = sb3_tdpg.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
-exclude_patterns = ["_build", "results/*/*"]  # the pages beside these folders include their files
-nitpicky = True  # a broken reference is a warning, and with -W an error
-nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium|pathlib)\..*")]  # documented elsewhere
+exclude_patterns = ["_build", "results/*/*"]  # other pages include the files in these folders
+nitpicky = True  # a broken reference is a warning, and with -W it is an error
+nitpick_ignore_regex = [("py:.*", r"(stable_baselines3|gymnasium|pathlib)\..*")]  # documented on other sites
 
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.header"]  # the changelog's headings are SB3's
+suppress_warnings = ["myst.header"]  # the changelog uses SB3's headings
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # types would make the signatures too long; the text describes them
+autodoc_typehints = "none"  # types would make the signatures too long, and the text describes them
 autodoc_class_signature = "mixed"
 
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
@@ -39,7 +39,7 @@ copybutton_prompt_is_regexp = True
 
 html_theme = "furo"
 html_title = project
-# Links to edit a page, once setup.cfg names the repository.
+# Add links to edit a page when setup.cfg contains the repository's address.
 setup_cfg = configparser.ConfigParser()
 setup_cfg.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
 repository = re.search(r"^Source = (\S+)", setup_cfg["metadata"]["project_urls"], re.MULTILINE)
@@ -50,7 +50,8 @@ html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 
 
-# No line break before a unit, in an interval, or in an exponent ("43.9 ms", "[8.20, 9.04]", "7.6 to 10", "1e-3").
+# Texts without a line break: a number with its unit, an interval, an exponent ("43.9 ms", "[8.20, 9.04]", "7.6 to 10",
+# "1e-3").
 TOGETHER = re.compile(
     r"(?<=\d) (?=%|(?:[nµm]?s|min|nat)\b)|(?<=\d,) (?=[^\s\]]+\])|(?<=\d) (?=to [\d.])|(?<=\d to) (?=[\d.])"
 )
@@ -58,7 +59,7 @@ EXPONENT = re.compile(r"(?<=\de-)(?=\d)")
 
 
 def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
-    """Keep the browser from breaking lines within numbers in tables."""
+    """Prevent line breaks within numbers in tables."""
     for entry in doctree.findall(nodes.entry):
         for text in list(entry.findall(nodes.Text)):
             if not isinstance(text.parent, nodes.literal):
@@ -66,12 +67,12 @@ def keep_numbers_together(app: Sphinx, doctree: nodes.document) -> None:
                 text.parent.replace(text, nodes.Text(kept))
 
 
-# Browsers ignore the attribute mathvariant, which the converter writes: the letter itself must change.
+# Browsers ignore the attribute mathvariant that the converter writes, so the letter itself must change.
 LETTER = re.compile(r'mathvariant="(double-struck|script|monospace)">([A-Za-z])(?=<)')
 
 
 def in_its_alphabet(match: re.Match[str]) -> str:
-    """Replace a plain letter with a mathvariant by the letter of that mathematical alphabet."""
+    """Replace a plain letter with a mathvariant by the letter from that mathematical alphabet."""
     alphabet, letter = match[1].upper(), match[2]
     name = f"{alphabet} {'CAPITAL' if letter.isupper() else 'SMALL'} {letter.upper()}"
     return f">{unicodedata.lookup(f'MATHEMATICAL {name}')}"
@@ -82,7 +83,7 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
     display = "block" if isinstance(node, nodes.math_block) else "inline"
     tex = node.astext().strip()
     if display == "block" and r"\\" in tex and r"\begin" not in tex:
-        tex = rf"\begin{{split}}{tex}\end{{split}}"  # lines aligned at &, as in Sphinx
+        tex = rf"\begin{{split}}{tex}\end{{split}}"  # align the lines at &, as Sphinx does
     mathml = latex_to_mathml(tex, display=display)
     if unknown := re.findall(r"<m[io][^>]*>(\\.+?|&amp;|&#x00026;|&)</m[io]>", mathml):
         logger.warning("%s in a formula: %s", unknown, node.astext(), location=node)
@@ -92,7 +93,7 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
 
 
 class FigureIfMade(Figure):
-    """Insert a figure, or a note while the script that draws it has not been run."""
+    """Insert a figure, or insert a note if the figure's file does not exist yet."""
 
     def run(self) -> list[nodes.Node]:
         if "alt" not in self.options:

@@ -1,4 +1,4 @@
-"""Film two policies side by side, without and with a sensor fault; ``make pictures`` makes the film."""
+"""Make a video of two policies side by side, without and with a sensor fault; ``make pictures`` runs this module."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,20 +26,20 @@ FAULT = dict(perturbation="vector_dropout", severity=5, scale=1.0, seed=0)
 FAULT_SAID = ("Sensor fault: 7 of 10 readings lost", GHOST)
 N_EPISODES = 1000
 JAMS = 0.1  # rad
-BETWEEN = 6  # frames from one step to the next
+BETWEEN = 6  # number of frames from one step to the next
 MIDDLE: dict[str, Any] = dict(ha="center", va="center")
-TITLE = dict(MIDDLE, fontsize=21, weight="bold")  # legible at the 358 pixels that a phone has for 800
+TITLE = dict(MIDDLE, fontsize=21, weight="bold")  # legible on a phone, which shows the 800 pixels as 358
 
 
 @dataclass(frozen=True, kw_only=True)
 class Take:
     """
-    Episodes of one policy, in the order of their starts, which are the same for all policies.
+    Episodes of one policy, sorted by their initial states, which are the same for all policies.
 
     :param states: True states ``(T + 1, N, X)``.
-    :param reports: What the sensor says of them, of the same shape.
-    :param actions: ``(T, N, U)``.
-    :param costs: ``(N,)``.
+    :param reports: Sensor readings of the states ``(T + 1, N, X)``.
+    :param actions: Actions ``(T, N, U)``.
+    :param costs: Episode costs ``(N,)``.
     """
 
     states: np.ndarray
@@ -48,11 +48,11 @@ class Take:
     costs: np.ndarray
 
 
-Takes = dict[tuple[str, str, bool], Take]  # by task, policy, and whether the sensor is at fault
+Takes = dict[tuple[str, str, bool], Take]  # keys: task, policy, and whether the sensor has the fault
 
 
 def play(model: TDPG, env_id: str, faulty: bool) -> Take:
-    set_random_seed(0)  # of the policy's noise
+    set_random_seed(0)  # for the policy's noise
     env = make_episodes_env(env_id, N_EPISODES, seed=0)
     if faulty:
         env = PerturbedVecEnv(env, **FAULT)
@@ -72,7 +72,7 @@ def play(model: TDPG, env_id: str, faulty: bool) -> Take:
 
 
 def representative(costs: np.ndarray, n: int) -> np.ndarray:
-    """Choose n episodes whose starts are evenly spread and whose mean cost is the nearest to that of all."""
+    """Choose n episodes with evenly spread starts whose mean cost is closest to the mean cost of all episodes."""
     every = len(costs) // n
     choices = [first + every * np.arange(n) for first in range(every)]
     return min(choices, key=lambda chosen: abs(costs[chosen].mean() - costs.mean()))
@@ -91,32 +91,32 @@ def box(
     across: float = 0.0,
     **looks: object,
 ) -> None:
-    """Draw a box of this length and width, turned by an angle in rad about the middle of its cell."""
+    """Draw a box with this length and width, rotated by an angle in rad about the middle of its cell."""
     patch = Rectangle((-size[0] / 2, across - size[1] / 2), *size, **looks)
     patch.set_transform(Affine2D().rotate(angle).translate(*middle) + axes.transData)
     axes.add_patch(patch)
 
 
 def label(axes: Axes | Figure, x: float, y: float, words: str, colour: str, pad: float = 0.25, **looks: Any) -> None:
-    """Write white words on a coloured label."""
+    """Write white text on a coloured label."""
     plate = dict(boxstyle=f"round,pad={pad}", facecolor=colour, edgecolor="none")
     axes.text(x, y, words, bbox=plate, color="white", **{**TITLE, **looks})
 
 
 def tell_fault(figure: Figure, height: float, faulty: bool) -> None:
-    """Write at this height of the figure whether the sensor works."""
+    """Write at this height in the figure whether the sensor works."""
     label(figure, 0.5, height, *FAULT_SAID if faulty else ("The sensor works", GREEN))
 
 
 def drawn(figure: Figure) -> Image.Image:
-    """Draw the figure, RGB."""
+    """Return the figure as an RGB image."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def draw_squeeze(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float) -> None:
-    """Draw twelve parts from above: slot, part, what the sensor says of it, fingers; and which part does not fit."""
+    """Draw twelve parts from above: slot, part, sensor reading and fingers, and a mark on parts that do not fit."""
     axes.set(xlim=(-0.55, 5.55), ylim=(-1.6, 0.5), aspect="equal")
     is_end = step == len(take.actions)
     for place, i in enumerate(shown):
@@ -137,7 +137,7 @@ def draw_squeeze(axes: Axes, take: Take, shown: np.ndarray, step: int, share: fl
 
 
 def draw_lava(axes: Axes, take: Take, shown: np.ndarray, step: int, share: float) -> None:
-    """Draw robots on lines of their own between wall and lava, and where the sensor says that they are."""
+    """Draw each robot on its own line between wall and lava, and the position that its sensor shows."""
     n = len(shown)
     axes.set(xlim=(-1.0, 6.0), ylim=(-0.8, n - 0.2))
     axes.add_patch(Rectangle((-1, -1), 1, n + 1, facecolor="#8C8C96"))
@@ -164,7 +164,7 @@ TASKS = {
 
 
 def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float) -> Image.Image:
-    """Draw both tasks by both policies at a time in steps; an episode that has ended stands still."""
+    """Draw both tasks with both policies at a time in steps; an episode that has ended does not move."""
     figure = Figure(figsize=(8.0, 5.6), dpi=100, facecolor="white")
     tell_fault(figure, 0.955, faulty)
     for column, name in enumerate(POLICIES):
@@ -185,7 +185,7 @@ def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float)
 
 
 def sensor_fault(path: Path) -> None:
-    """Train both policies on two tasks with seed 0, two minutes in all, and film them without and with the fault."""
+    """Train both policies on two tasks with seed 0 (two minutes in total), and film them without and with the fault."""
     takes = {}
     for task, (env_id, n_steps, _, _) in TASKS.items():
         for name, settings in POLICIES.items():
@@ -195,7 +195,7 @@ def sensor_fault(path: Path) -> None:
 
 
 def film(path: Path, takes: Takes) -> None:
-    """Write the episodes as a GIF: first those without the fault."""
+    """Write the episodes as a GIF; the episodes without the fault come first."""
     sensing = next(iter(POLICIES))
     shown = {task: representative(takes[task, sensing, True].costs, n) for task, (_, _, _, n) in TASKS.items()}
     n_steps = max(len(take.actions) for take in takes.values())

@@ -24,7 +24,7 @@ LONG_ONLY = ("skip", "skip_changes", "normalize_observations", "scale_actions", 
 
 
 def shown(name: str, kind: str, value: Any) -> str:
-    """Write a value as a reader would type it, or say what it stands for."""
+    """Return a value as a user would type it, or text that explains the value."""
     if name == "batch_size":
         defaults = DEFAULTS[kind]
         return f"the steps of {defaults.batch_episodes} episodes" if defaults.batch_episodes else str(value or "all")
@@ -52,7 +52,7 @@ def shown(name: str, kind: str, value: Any) -> str:
 
 
 def table() -> str:
-    """Make the table: a row for each argument whose default depends on the kind of problem."""
+    """Make the table, which has a row for each argument whose default depends on the kind of problem."""
     rows = [(NAMES.get(name, f"`{name}`"), DEFAULTS, name) for name in Defaults._fields if name != "batch_episodes"]
     rows += [
         (f"policy: {OF_ARCH.get(name, f'`{name}`')}", POLICY_DEFAULTS, name)
@@ -71,7 +71,7 @@ def table() -> str:
 
 
 def page() -> str:
-    """Return the page with the table of today's presets."""
+    """Return the page with the table of the current presets."""
     text = PAGE.read_text(encoding="utf-8")
     return re.sub(f"(?<={re.escape(BEGIN)}).*?(?={re.escape(END)})", lambda _: table(), text, flags=re.DOTALL)
 

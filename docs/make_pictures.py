@@ -1,8 +1,8 @@
 """
 Draw the pictures of the front page, the environments and the guide: ``make pictures``.
 
-``python docs/make_pictures.py lava.gif when.png`` draws these only. All of them take half an hour: the films train
-their policies first.
+``python docs/make_pictures.py lava.gif when.png`` draws only these two. All pictures take half an hour, because the
+policies in the videos are trained first.
 """
 
 import sys
@@ -37,11 +37,11 @@ from sb3_tdpg.robustness import perturbation_gallery
 Policy = Callable[[np.ndarray, int], Sequence[float] | np.ndarray]
 STARTS = (0.5, 2.0, 3.5, 4.5)  # m
 OPEN_LOOP = (-5.0, 0.0, 1.5, 0.0, -1.5)
-MUG = (0.5, 0.02, 0.0, 0.6)  # m and rad; the handle points to the viewer
+MUG = (0.5, 0.02, 0.0, 0.6)  # m and rad; the handle points towards the viewer
 
 
 def lava(path: Path) -> None:
-    """Animate the open-loop strategy from four start positions: to the wall, and from there to the goal."""
+    """Animate the open-loop strategy, which drives to the wall and then to the goal, from four initial positions."""
     rows_of_frames = []
     for start in STARTS:
         env = LavaEnv(render_mode="rgb_array")
@@ -59,9 +59,10 @@ def lava(path: Path) -> None:
 
 def ways(path: Path, env: POMDPEnv, starts: Sequence[Sequence[float]], look: Policy, blind: Policy) -> None:
     """
-    Animate a policy that looks at the state, above, and one that does not, below, from the same states.
+    Animate two policies from the same initial states: above a closed-loop policy, below an open-loop policy.
 
-    :param look: The action at time t in a state.
+    :param look: The closed-loop policy, which returns the action for a state and a time.
+    :param blind: The open-loop policy, which has the same arguments but uses only the time.
     """
     rows = []
     for policy in (look, blind):
@@ -82,7 +83,7 @@ def ways(path: Path, env: POMDPEnv, starts: Sequence[Sequence[float]], look: Pol
 
 
 def squeeze_insert(path: Path) -> None:
-    """Turn four parts, by looking and by the best fixed angles."""
+    """Animate four parts that are turned by a closed-loop policy and by the best fixed angles."""
     turn, basin, fixed = 0.85, np.deg2rad(64), (0.428, -0.073, -3.14, -3.123)
 
     def look(state: np.ndarray, t: int) -> list[float]:
@@ -97,7 +98,7 @@ def squeeze_insert(path: Path) -> None:
 
 
 def peg_corner(path: Path) -> None:
-    """Bring four pegs to the hole, straight and by way of the corner."""
+    """Animate four pegs that move to the hole, on a straight line and via the corner."""
     fixed = ((-2.5, -2.5), (-1.27, -1.34), (-2.35, -2.19), (0.94, 0.92))
     starts = [(5.6, 5.2), (2.4, 5.0), (4.0, 2.6), (3.2, 3.8)]
     env = PegCornerEnv(render_mode="rgb_array")
@@ -105,7 +106,7 @@ def peg_corner(path: Path) -> None:
 
 
 def when(path: Path) -> None:
-    """Draw the decision tree of "When to use what"."""
+    """Draw the decision tree of the page "When to use what"."""
     figure = new_figure(9.0, 2.9)
     figure.set_layout_engine("none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -147,9 +148,9 @@ def side_by_side(images: list[np.ndarray], gap: int = 6) -> np.ndarray:
 
 def fly(texture: str = TRAINING_TEXTURE) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
-    Run an episode of a scripted oracle that drives to the landing point of the ball at a constant speed.
+    Run an episode of a scripted oracle that drives at a constant speed to the point where the ball lands.
 
-    :return: the 26 pictures of ``render`` and the 26 images of the camera
+    :return: 26 pictures from ``render`` and 26 images from the camera
     """
     env = BallCatchEnv(render_mode="rgb_array", texture=texture, robot_range=(-1.7, -1.7))
     observation, info = env.reset(seed=0)
@@ -165,7 +166,7 @@ def fly(texture: str = TRAINING_TEXTURE) -> tuple[list[np.ndarray], list[np.ndar
 
 
 def ball_textures(path: Path) -> None:
-    """Draw the eight textures, upright as on the wall, and below each the image of the camera."""
+    """Draw the eight textures upright, as on the wall, with the camera's image below each texture."""
     columns = []
     for name in (TRAINING_TEXTURE, *TEST_TEXTURES):
         (observation, _) = BallCatchEnv(renderer="fast", texture=name, robot_range=(0, 0)).reset(seed=0)
@@ -182,14 +183,14 @@ def ball_camera(path: Path) -> None:
 
 
 def ball_catch(path: Path) -> None:
-    """Animate the scene from the side and the image of the camera, at two thirds of the real speed."""
+    """Animate the scene from the side and the camera's image, at two thirds of the real speed."""
     pictures, observations = fly()
     frames = []
     for picture, observation in zip(pictures, observations, strict=True):
         scene = Image.fromarray(picture[:, :512]).resize((320, 160), Image.Resampling.LANCZOS)
         seen = Image.fromarray(observation).resize((160, 160), Image.Resampling.NEAREST)
         frames.append(Image.fromarray(side_by_side([np.array(scene), np.array(seen)])))
-    # Extra patches keep the colours of small parts.
+    # Additional patches keep the colours of small parts in the palette.
     rare = np.array([(0, 120, 0), (0, 155, 0), (0, 190, 0), (10, 30, 80), (15, 60, 130), (35, 35, 40)], np.uint8)
     patches = rare[None].repeat(81, axis=1)[:, : frames[0].width].repeat(600, axis=0)
     palette = Image.fromarray(np.concatenate([*frames[::6], patches])).quantize(64)
@@ -198,7 +199,7 @@ def ball_catch(path: Path) -> None:
 
 
 def grasp(motion: str) -> PandaGraspEnv:
-    """Grasp a mug by its rim with a scripted oracle that knows its pose."""
+    """Let a scripted oracle, which knows the mug's pose, grasp a mug by its rim; return the environment."""
     env = PandaGraspEnv(motion=motion, render_mode="rgb_array")
     env.reset(seed=0)
     env._state = np.array([MUG])
@@ -209,7 +210,7 @@ def grasp(motion: str) -> PandaGraspEnv:
 
 
 def panda_depth(path: Path) -> None:
-    """Draw the scene before a grasp from a third person's view, and the depth image."""
+    """Draw the scene before a grasp from the side, and the depth image."""
     env = grasp("fast")
     env._view.place(env._film[0])
     scene = env._view.scene_picture(768, 1152)
@@ -220,7 +221,7 @@ def panda_depth(path: Path) -> None:
 
 
 def panda_camera(path: Path) -> None:
-    """Draw the same mug from five camera heights: the usual one, and the lowest and highest of training and test."""
+    """Draw a mug from five camera heights: the usual one, and the lowest and highest in training and in the test."""
     (test, train) = (PANDA_GRASP_CAMERA[i].env_kwargs["camera_range"] for i in (1, 0))
     env = PandaGraspEnv()
     heights = [test[0], train[0], 0.0, train[1], test[1]]
@@ -234,14 +235,14 @@ def panda_grasp(path: Path) -> None:
     env = grasp("reference")
     pictures = list(env.film())
     env.close()
-    # Moving down and closing take more than half of the time; the lift is what matters.
+    # Moving down and closing take more than half of the time, but the lift is more important.
     shown = [*range(40, 126, 6), *range(126, 139, 2), *range(139, len(pictures), 3)]
     durations = [80] * (len(shown) - 1) + [2000]  # ms
     save_gif(path, [Image.fromarray(pictures[i]) for i in shown], durations)
 
 
 def learned(path: Path, env_id: str, **shown: Any) -> None:
-    """Train TDPG by its defaults, and film episodes with the TRVs below."""
+    """Train TDPG with its defaults, and film episodes with the TRVs below the scene."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.zip")
         TDPG("TRVPolicy", env_id, seed=0).learn().save(model)
@@ -252,7 +253,7 @@ def perturbations(path: Path, env_id: str, **env_kwargs: object) -> None:
     """Draw one image under each perturbation at five severities."""
     perturbation_gallery(env_id, env_kwargs=env_kwargs).savefig(path, dpi=80)
     with Image.open(path) as picture:
-        # No palette: it would turn the blurs into bands of colour.
+        # The picture has no palette, which would turn blurs into bands of colour.
         picture.convert("RGB").save(path, optimize=True)
 
 

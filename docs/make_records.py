@@ -1,9 +1,10 @@
 """
 Check the records of single episodes and pack them for a release: ``make records``.
 
-The tree holds summaries, seeds, configurations and pictures of the results, and the checksums of the records, in
-``docs/results/records.sha256``. The records themselves are one file of a release, which unpacks in ``docs/results``.
-After a study was published again, ``python docs/make_records.py --update`` writes the checksums of what it wrote.
+The repository contains summaries, seeds, configurations and pictures of the results. It also contains the checksums of
+the records, in ``docs/results/records.sha256``. The records themselves are in one file of a release, which is unpacked
+in ``docs/results``. After a study is published again, ``python docs/make_records.py --update`` writes the checksums of
+its new records.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ PATTERNS = ("episodes*.csv.*", "shifts.csv.*", "random.csv.*", "nuisance.csv.*")
 
 
 def read_checksums(results: Path) -> tuple[list[str], dict[str, str]]:
-    """Return the comments of the file of checksums, and the checksum of each path in the folder of results."""
+    """Return the comments in the file of checksums, and the checksum of each path in the folder of results."""
     lines = (results / CHECKSUMS).read_text(encoding="utf-8").splitlines()
     pairs = [line.split("  ", 1) for line in lines if line and not line.startswith("#")]
     return [line for line in lines if line.startswith("#")], {name: digest for digest, name in pairs}
 
 
 def found(results: Path) -> dict[str, str]:
-    """Return the checksum of every record that lies in the folder."""
+    """Return the checksum of every record in the folder."""
     paths = {path for pattern in PATTERNS for path in results.glob(f"*/{pattern}")}
     return {path.relative_to(results).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
 def update(results: Path) -> None:
-    """Write the checksums of the records that lie in the folder; those of the others stay."""
+    """Write the checksums of the records in the folder; the checksums of all other records do not change."""
     comments, digests = read_checksums(results)
     digests.update(found(results))
     lines = [f"{digest}  {name}" for name, digest in sorted(digests.items())]
@@ -45,9 +46,9 @@ def update(results: Path) -> None:
 
 def pack(results: Path, target: Path) -> None:
     """
-    Write all records to a tar file, the same bytes whenever they are packed.
+    Write all records to a tar file; the same records always give the same bytes.
 
-    :raises ValueError: if a record is missing, differs from its checksum or has none; nothing is written then.
+    :raises ValueError: if a record is missing, differs from its checksum or has no checksum; no file is written.
     """
     comments, digests = read_checksums(results)
     there = found(results)
@@ -64,7 +65,7 @@ def pack(results: Path, target: Path) -> None:
                        "If a study was published again, `python docs/make_records.py --update` takes its records."])
         )  # fmt: skip
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tarfile.open(target, "w", format=tarfile.PAX_FORMAT) as tar:  # its members are compressed
+    with tarfile.open(target, "w", format=tarfile.PAX_FORMAT) as tar:  # the members are already compressed
         for name in sorted(digests):
             member = tarfile.TarInfo(name)
             member.size, member.mode = (results / name).stat().st_size, 0o644
@@ -74,7 +75,7 @@ def pack(results: Path, target: Path) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--update", action="store_true", help="write the checksums of the records that are there")
+    parser.add_argument("--update", action="store_true", help="write the checksums of the records in the folder")
     if parser.parse_args().update:
         update(RESULTS)
     target = ROOT / "dist" / f"sb3_tdpg-records-{__version__}.tar"

@@ -1,4 +1,4 @@
-"""Film the Panda with two policies of the batched model, without and with a sensor fault; see ``make pictures``."""
+"""Film the Panda with two policies from the batched model, without and with a sensor fault; see ``make pictures``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from sb3_tdpg.envs.scenarios import PANDA_SQUEEZE
 from sb3_tdpg.evaluation.animation import save_gif
 from sb3_tdpg.robustness.families import Family
 
-EVERY = 5  # of the 30 pictures a second
+EVERY = 5  # use every fifth of the 30 pictures per second
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +23,9 @@ class Shot:
     """
     One episode of one policy.
 
-    :param steps: The pictures of each squeeze; those of the insertion belong to the last one.
-    :param yaws: Of the part before each squeeze, in rad ``(T,)``.
-    :param reports: The yaw that the sensor shows, in rad ``(T,)``.
+    :param steps: The pictures of each squeeze; the last squeeze also has the pictures of the insertion.
+    :param yaws: The part's yaw before each squeeze, in rad ``(T,)``.
+    :param reports: The yaw that the sensor shows before each squeeze, in rad ``(T,)``.
     :param success: Whether the part is in the slot.
     """
 
@@ -36,10 +36,10 @@ class Shot:
 
 
 def shoot(model: TDPG, seed: int, faulty: bool, film: bool = True) -> Shot:
-    """Play an episode in PyBullet; without film, only its outcome and readings."""
+    """Run an episode in PyBullet; if ``film`` is false, leave out the pictures."""
     env = PandaSqueezeEnv(render_mode="rgb_array" if film else None)
     fault = Family(FAULT["perturbation"], env, FAULT["severity"], FAULT["scale"]).members(1, FAULT["seed"])
-    set_random_seed(seed)  # of the policy's noise
+    set_random_seed(seed)  # for the policy's noise
     observation, info = env.reset(seed=seed)
     fault.reseed(seed)
     fault.begin(np.arange(1))
@@ -58,7 +58,7 @@ def shoot(model: TDPG, seed: int, faulty: bool, film: bool = True) -> Shot:
 
 
 def frame(shots: list[Shot], faulty: bool, step: int, i: int) -> Image.Image:
-    """Draw both policies side by side: picture i of a squeeze, or the end of the episode if there are no more."""
+    """Draw both policies side by side: picture i of a squeeze, or the last picture if there is no picture i."""
     figure = Figure(figsize=(8.0, 3.65), dpi=100, facecolor="white")
     tell_fault(figure, 0.93, faulty)
     for column, (shot, name) in enumerate(zip(shots, POLICIES, strict=True)):
@@ -71,7 +71,7 @@ def frame(shots: list[Shot], faulty: bool, step: int, i: int) -> Image.Image:
         if is_end:
             verdict, colour = ("in the slot", GREEN) if shot.success else ("jams", RED)
             label(axes, 0.5, 0.13, verdict, colour, fontsize=23, transform=axes.transAxes)
-        else:  # the part from above before this squeeze, and what the sensor says of it
+        else:  # draw the part from above before this squeeze, and the sensor's reading of its yaw
             inset = axes.inset_axes((0.0, 0.62, 0.36, 0.38))
             inset.set(xlim=(-0.62, 0.62), ylim=(-0.5, 0.5), aspect="equal", xticks=[], yticks=[])
             box(inset, (0, 0), (0.86, 0.28), shot.yaws[step], facecolor="#E69F00")
@@ -81,7 +81,7 @@ def frame(shots: list[Shot], faulty: bool, step: int, i: int) -> Image.Image:
 
 
 def panda_squeeze(path: Path) -> None:
-    """Train both policies in the batched model, a minute in all, and film the same part with and without the fault."""
+    """Train both policies in the batched model (a minute in total), and film one part with and without the fault."""
     models = []
     for settings in POLICIES.values():
         env = make_episodes_env("SqueezeInsert-v0", env_kwargs=dict(PANDA_SQUEEZE))
@@ -90,7 +90,7 @@ def panda_squeeze(path: Path) -> None:
     def outcomes(seed: int) -> list[bool]:
         return [shoot(model, seed, faulty, film=False).success for faulty in (False, True) for model in models]
 
-    # The first part that shows the difference; the results say how often there is one.
+    # Choose the first part that shows the difference. The page of results says how often a part does.
     seed = next(seed for seed in range(1000) if outcomes(seed) == [True, True, False, True])
     print(f"the part of seed {seed}")
     frames, durations = [], []

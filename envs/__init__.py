@@ -1,8 +1,8 @@
-"""The environments, the paper's and three of our own; importing this package registers their Gymnasium ids."""
+"""Register the Gymnasium ids of the environments: three problems of the paper and three of our own."""
 
 import gymnasium as gym
 
-# String entry points: an environment's module (and with it PyBullet) is imported only when it is made.
+# The entry points are strings, so that gym.make imports only the modules of one environment (and PyBullet if needed).
 ENTRY_POINTS = {
     "Lava-v0": "sb3_tdpg.envs.lava:LavaEnv",
     "BallCatch-v0": "sb3_tdpg.envs.ball_catch:BallCatchEnv",
@@ -12,11 +12,11 @@ ENTRY_POINTS = {
     "PegCorner-v0": "sb3_tdpg.envs.peg_corner:PegCornerEnv",
 }
 
-# Returns at which a problem counts as solved: the default limit of a sweep's selection. The ball is caught within 5 cm;
-# of a hundred mugs 97 are lifted.
+# A problem counts as solved from this return on. It sets the default cost limit of a sweep. At this return the robot
+# stops within 5 cm of the ball, and the arm lifts 97 of 100 mugs.
 REWARD_THRESHOLDS = {"BallCatch-v0": -5.0, "PandaGrasp-v0": -0.03}
 
 for _env_id, _entry_point in ENTRY_POINTS.items():
-    # No max_episode_steps: the horizon belongs to the problem and ends as `terminated`, not as a time limit.
+    # max_episode_steps is not set, because the horizon is part of the problem: an episode ends with `terminated`.
     if _env_id not in gym.registry:
         gym.register(id=_env_id, entry_point=_entry_point, reward_threshold=REWARD_THRESHOLDS.get(_env_id))

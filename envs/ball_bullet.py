@@ -1,4 +1,4 @@
-"""The ball-catching scene in PyBullet: the reference of the camera's images, and the view from the side."""
+"""Draw the ball-catching scene with PyBullet: the reference images of the camera, and a side view for pictures."""
 
 from typing import Any
 
@@ -8,13 +8,13 @@ from .ball_scene import FAR, IMAGE_SIZE, LIGHT, NEAR, PLANE_COPIES, PLANE_HALF, 
 from .bullet import UNTURNED, BulletWorld, beside
 from .textures import floor_texture
 
-HEIGHT, WIDTH = 256, 512  # pixels of the view from the side
-MIDDLE = (4.0, 0.0, 2.6)  # m, its target
-BESIDE = 9.5  # m, its distance
+HEIGHT, WIDTH = 256, 512  # pixels of the side view
+MIDDLE = (4.0, 0.0, 2.6)  # m, the point at which the side view looks
+BESIDE = 9.5  # m, distance between the side view's camera and the line of the robot
 
 
 class BulletScene(BulletWorld):
-    """Floor, wall and ball in a Bullet world of their own."""
+    """Floor, wall and ball in their own Bullet world."""
 
     def __init__(self, scene: BallScene, *, gui: bool = False) -> None:
         super().__init__(gui=gui)
@@ -22,7 +22,7 @@ class BulletScene(BulletWorld):
         self._add_plane(PLANE_HALF, floor_texture())
         self._wall = self._add_plane(WALL_SCALE * PLANE_HALF, scene.texture)
         self._ball = self._add(scene.ball_color, 1.0, shapeType=self.client.GEOM_SPHERE, radius=scene.ball_radius)
-        # Level to upright: the plane's x axis points up, its normal towards the robot.
+        # Turn a level plane upright: its x axis then points up, and its normal points towards the robot.
         self._upright = self.client.getQuaternionFromEuler([0.0, -np.pi / 2, 0.0])
 
     def _move(self, body: int, position: tuple[float, ...], orientation: tuple[float, ...] = UNTURNED) -> None:
@@ -34,7 +34,7 @@ class BulletScene(BulletWorld):
         return int(self.client.createMultiBody(baseVisualShapeIndex=shape_id))
 
     def _add_plane(self, half: float, texture: np.ndarray) -> int:
-        """Add a level textured square; return its body's id."""
+        """Add a horizontal textured square; return the id of its body."""
         corners = [(half, -half), (half, half), (-half, half), (-half, -half)]
         shape = self.client.createVisualShape(
             self.client.GEOM_MESH,
@@ -49,7 +49,7 @@ class BulletScene(BulletWorld):
 
 
 class BulletRenderer(BulletScene):
-    """Render the robot's camera. The camera stands still; wall and ball move."""
+    """Render the robot's camera. The camera is fixed; wall and ball move relative to it."""
 
     def __init__(self, scene: BallScene) -> None:
         super().__init__(scene)
@@ -69,7 +69,7 @@ class BulletRenderer(BulletScene):
 
 
 class SideView(BulletScene):
-    """The scene from the side, with a body for the robot; for pictures and PyBullet's window, never an observation."""
+    """Draw the scene from the side, with a body for the robot, for pictures and PyBullet's window (no observations)."""
 
     def __init__(self, scene: BallScene, *, gui: bool = False) -> None:
         super().__init__(scene, gui=gui)
@@ -84,7 +84,7 @@ class SideView(BulletScene):
         return self._add(color, 0.0, shapeType=self.client.GEOM_BOX, halfExtents=half_sizes)
 
     def place(self, state: np.ndarray) -> None:
-        """Move robot and ball to a state, ``(5,)``."""
+        """Move robot and ball to their positions in a state, ``(5,)``."""
         d, ball_x, ball_y = state[:3].tolist()
         height = self.scene.camera_height
         tilt = self.client.getQuaternionFromEuler([0.0, -np.deg2rad(self.scene.camera_pitch), 0.0])

@@ -18,9 +18,9 @@ from .textures import TRAINING_TEXTURE, load_texture
 Range = tuple[float, float]  # lowest and highest
 PlaneRange = tuple[tuple[float, float], tuple[float, float]]  # lowest and highest (x, y)
 
-# By name, so that PyBullet is imported only where it draws.
+# Modules and classes are given by name, so that PyBullet is imported only if it renders.
 RENDERERS = {"pybullet": ("ball_bullet", "BulletRenderer"), "fast": ("ball_fast", "FastRenderer")}
-NOISE_CHUNK = 64  # images to which noise is added at once: bounds the memory
+NOISE_CHUNK = 64  # number of images to which noise is added at once, which limits the memory
 
 
 class BallCatchEnv(SharedEnv):
@@ -36,29 +36,31 @@ class BallCatchEnv(SharedEnv):
         b_{t+1} = b_t + \Delta t\, v_t, \qquad v_{t+1} = v_t - (0, \Delta t\, g), \\
         c_t &= 0.01\, |u_t|, \qquad c_T = 100\, |d_T - b^x_T|.
 
-    The defaults follow the paper's text. Another definition fits the published numbers better:
+    The defaults follow the paper's text. Another control gain, gravity and horizon fit the published numbers better:
     ``BallCatchEnv(**sb3_tdpg.envs.scenarios.BALL_PUBLISHED_READING)``.
 
-    :param control_gain: The robot moves by ``control_gain * u`` a step; ``None``: by ``dt * u``.
+    :param control_gain: The robot moves by ``control_gain * u`` in each step. ``None`` means ``dt``.
     :param dt: Time step in s.
-    :param gravity: In m/s^2.
+    :param gravity: Acceleration of gravity in m/s^2.
     :param horizon: Number of controls T.
-    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, but SB3 needs
-        bounds; it is large because an action beyond the bound gives no gradient. The task needs about 2 m/s.
+    :param max_action: Bound of the action space ``[-max_action, max_action]``. The paper's action space is unbounded,
+        but SB3 needs bounds. The default bound is large, because an action beyond it gives no gradient. The task needs
+        about 2 m/s.
     :param robot_range: The robot starts uniformly in ``(low, high)``, in m.
     :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m.
-    :param ball_speed_range: Likewise its velocity, in m/s.
+    :param ball_speed_range: Range of the ball's initial velocity, in m/s, in the form of ``ball_start_range``.
     :param ball_color: Red, green and blue, each in [0, 1].
-    :param ball_radius: In m.
-    :param camera_height: Above the floor, in m.
-    :param camera_pitch: Upward tilt in degrees, between -90 and 90.
-    :param fov: The camera's field of view in degrees.
+    :param ball_radius: Radius of the ball in m.
+    :param camera_height: Height of the camera above the floor, in m.
+    :param camera_pitch: Upward tilt of the camera in degrees, between -90 and 90.
+    :param fov: Field of view of the camera in degrees.
     :param texture: The wall's texture, for :func:`~sb3_tdpg.envs.textures.load_texture`: a name, a path or an array.
-    :param pixel_noise_std: Standard deviation of the noise on every pixel of an image with values in [0, 1].
-    :param noise_mode: How noisy images come back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``.
-    :param wall_stands_still: For diagnosis: only the ball shows where the robot is; the rest looks as from d = 0.
-    :param renderer: ``"fast"``, a batched ray caster, or ``"pybullet"``, the reference; they agree in 99.8 % of pixels.
-    :param n_processes: Number of processes that share PyBullet's images of a batch; the results are the same.
+    :param pixel_noise_std: Standard deviation of the noise on every pixel, for pixel values in [0, 1].
+    :param noise_mode: How noisy images are mapped back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``.
+    :param wall_stands_still: Draw wall, floor and sky as seen from d = 0, so that only the ball shows where the robot
+        is (for diagnosis).
+    :param renderer: ``"fast"``, a batched ray caster, or ``"pybullet"``, the reference. They agree in 99.8 % of pixels.
+    :param n_processes: Number of processes that render a batch with PyBullet. This number does not change the results.
     :param render_mode: ``None``, ``"rgb_array"`` (scene and camera image) or ``"human"`` (PyBullet's window).
     """
 

@@ -1,13 +1,13 @@
 """
 A batched ray caster in NumPy that draws the ball-catching scene as PyBullet's TinyRenderer does.
 
-It agrees with TinyRenderer in 99.8 % of the pixels and is 65 times as fast, because:
+It agrees with TinyRenderer in 99.8 % of the pixels and is 65 times as fast. It uses these facts:
 
-- A pixel's ray goes through its corner, not its centre.
+- The ray of a pixel goes through the pixel's corner, not through its centre.
 - The camera does not turn about the vertical, so that depth and height on floor and wall are constant in a row of
   pixels. Each row of an image is sky, wall or floor; only the ball is drawn pixel by pixel.
-- Textures are not interpolated, and a flat surface has one brightness, which is multiplied into its texels once.
-- TinyRenderer's sphere is a mesh inside the sphere: it looks like a sphere of 0.965 times the radius.
+- Textures are not interpolated. A flat surface has a single brightness, so its texels are multiplied by it in advance.
+- TinyRenderer draws a sphere as a mesh inside the sphere, which looks like a sphere of 0.965 times the radius.
 
 Dimension key: N images, K side of the window around a ball; images are ``(N, 3, 64, 64)``.
 """
@@ -19,24 +19,24 @@ from .textures import floor_texture
 
 MESH_RADIUS = 0.965  # visible radius of a sphere mesh, as a fraction of its radius
 WINDOWS = (4, 8, 16, 32, IMAGE_SIZE)  # K
-CHUNK = 64  # images whose walls are drawn at once
-WINDOW_PIXELS = 12_800  # pixels of balls drawn at once
+CHUNK = 64  # number of images whose walls are drawn at once
+WINDOW_PIXELS = 12_800  # number of ball pixels that are drawn at once
 SKY = 255
 
-# A pixel is texel * (ambient + diffuse * max(0, n.l) + specular * max(0, r_z)^2) with the normal n, the direction l to
-# the light and that of its reflection, r.
+# A pixel is texel * (ambient + diffuse * max(0, n.l) + specular * max(0, r_z)^2), where n is the surface normal, l the
+# direction to the light and r the direction of the reflected light.
 AMBIENT, DIFFUSE, SPECULAR = 0.6, 0.35, 0.05
 TO_LIGHT = LIGHT / np.linalg.norm(LIGHT)
 
 
 def brightness(towards_light: np.ndarray, upward: np.ndarray) -> np.ndarray:
-    """Compute the factor on a texel from the normal's components towards the light and upward."""
+    """Return the factor by which a texel is multiplied, from the normal's components towards the light and upward."""
     reflected_up = 2 * upward * towards_light - TO_LIGHT[2]
     return AMBIENT + DIFFUSE * np.maximum(towards_light, 0) + SPECULAR * np.maximum(reflected_up, 0) ** 2
 
 
 def shade(texture: np.ndarray, normal: tuple[float, float, float]) -> np.ndarray:
-    """Multiply a flat surface's brightness into its texels."""
+    """Multiply the texels of a flat surface by its brightness."""
     return np.minimum(texture * brightness(normal @ TO_LIGHT, np.asarray(normal[2])), 255).astype(np.uint8)
 
 
@@ -47,7 +47,7 @@ def pack(colours: np.ndarray) -> np.ndarray:
 
 
 class FastRenderer:
-    """A batched ray caster of the scene."""
+    """Render the robot's camera with a batched ray caster."""
 
     def __init__(self, scene: BallScene) -> None:
         self.scene = scene
@@ -56,7 +56,8 @@ class FastRenderer:
         self._behind, self._floor_depth = self._draw_floor()
         self._behind_packed = pack(self._behind.transpose(1, 2, 0))
         self._nearest_floor = self._floor_depth.min(axis=1)
-        # Fresh arrays of this size come from the operating system page by page, which takes longer than the arithmetic.
+        # These arrays are reused: the operating system would provide new ones page by page, which takes longer than the
+        # arithmetic.
         size = CHUNK * IMAGE_SIZE**2
         self._scratch = tuple(np.empty(size, dtype) for dtype in (np.float32, np.float32, np.int32, np.uint32))
 
@@ -71,7 +72,7 @@ class FastRenderer:
         self._ray_x, self._ray_y, self._ray_z = x, y, z  # (64,)
         self._ray_length_squared = (x**2 + z**2)[:, None] + y**2  # (64, 64)
         self._ray_to_light = (x * TO_LIGHT[0] + z * TO_LIGHT[2])[:, None] + y * TO_LIGHT[1]  # (64, 64)
-        # x and z of the camera's own directions
+        # x and z of the camera's forward and upward direction
         self._axis = np.array([np.cos(pitch), np.sin(pitch)])
         self._up = np.array([-np.sin(pitch), np.cos(pitch)])
 
@@ -81,21 +82,21 @@ class FastRenderer:
         self._texels_v, self._texels_u = shaded.shape[:2]
         # u (upward) is the slow index, v (to the left) the fast one.
         self._wall_texels = pack(shaded[::-1].transpose(1, 0, 2)).ravel()
-        copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m of wall to a copy of the texture
-        self._ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)  # from behind the wall is not seen
+        copy = 2 * WALL_SCALE * PLANE_HALF / PLANE_COPIES  # m of wall per copy of the texture
+        self._ahead = np.where(self._ray_x > 0, self._ray_x, np.inf)  # the wall is not visible from behind
         self._u_at_zero = PLANE_COPIES / 2 + (self.scene.camera_height - WALL_Z) / copy
         self._u_per_metre = self._ray_z / self._ahead / copy  # (64,)
         self._v_per_metre = (self._ray_y / copy / self._ahead[:, None]).astype(np.float32)  # (64, 64)
 
     @staticmethod
     def _depth_of(distance: float | np.ndarray, ray: np.ndarray) -> np.ndarray:
-        """Depth at which rays have gone a distance along an axis; infinite where they never do."""
+        """Return the depth at which rays reach a distance along an axis; it is infinite for rays that never do."""
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = distance / ray
         return np.where(depth > NEAR, depth, np.inf)
 
     def _draw_floor(self) -> tuple[np.ndarray, np.ndarray]:
-        """Draw floor and sky, ``(3, 64, 64)``; also return the floor's depth, infinite where there is none."""
+        """Draw floor and sky, ``(3, 64, 64)``; also return the floor's depth, which is infinite outside the floor."""
         texture = shade(floor_texture(), (0.0, 0.0, 1.0))
         depth = self._depth_of(-self.scene.camera_height, self._ray_z)[:, None]
         depth[depth > FAR] = np.inf
@@ -124,8 +125,9 @@ class FastRenderer:
         """Do nothing: there is nothing to release."""
 
     def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
-        """Draw one wall for each image, from its distance ``(N,)`` and its depth in each row of pixels, ``(N, 64)``."""
-        first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)  # (64,); equal but at its sides
+        """Draw the wall in each image, given its distance ``(N,)`` and its depth in each row of pixels, ``(N, 64)``."""
+        # (64,); they differ only in rows that show the sides of the floor
+        first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)
         with_wall = np.flatnonzero((depth < last).any(axis=0))
         if not len(with_wall):
             return
@@ -139,18 +141,18 @@ class FastRenderer:
             is_wall = depth[image, row, None] < self._floor_depth[rows][row]
             colours[image, row] = np.where(is_wall, colours[image, row], behind[row])
         for channel in range(3):
-            # The cast keeps the lowest byte. An assignment would do the same, six times slower.
+            # The cast keeps the lowest byte. An assignment would have the same result but take six times as long.
             np.right_shift(colours, np.uint32(8 * channel), out=shifted)
             np.copyto(images[:, channel, rows], shifted, casting="unsafe")
 
     def _wall_colours(self, distance: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Look up the packed colours of the wall, ``(N, rows, 64)``; the second array is room to work with."""
+        """Look up the packed colours of the wall, ``(N, rows, 64)``; the second array is scratch space."""
         u = self._u_at_zero + np.multiply.outer(distance, self._u_per_metre[rows])  # (N, rows)
         u -= np.floor(u)
         line = (u * self._texels_u).astype(np.int32) * np.int32(self._texels_v)
         shape = (*u.shape, IMAGE_SIZE)
         v, whole, texel, colours = (buffer[: np.prod(shape)].reshape(shape) for buffer in self._scratch)
-        # Single precision is off by less than a thousandth of a texel.
+        # The error of single precision is less than a thousandth of a texel.
         np.multiply(distance.astype(np.float32)[:, None, None], self._v_per_metre[rows], out=v)
         np.add(v, np.float32(PLANE_COPIES / 2), out=v)
         np.floor(v, out=whole)
@@ -161,8 +163,8 @@ class FastRenderer:
         return self._wall_texels.take(texel, mode="clip", out=colours), texel.view(np.uint32)
 
     def _draw_balls(self, images: np.ndarray, state: np.ndarray, wall_depth: np.ndarray) -> None:
-        """Draw the balls, each in the smallest window that holds it; windows of a size are drawn at once."""
-        # Straight ahead and upward from the camera: (N, 2). The ball stays in the camera's plane.
+        """Draw the balls, each in the smallest window that contains it; windows of equal size are drawn together."""
+        # Forward and upward distance of the ball from the camera: (N, 2). The ball is never to the left or right of it.
         centre = np.stack([state[:, 1] - state[:, 0], state[:, 2] - self.scene.camera_height], axis=1)
         first, last = self._bounding_box(centre)  # (N, 2): row and column
         size = (last - first).max(axis=1)
@@ -178,18 +180,18 @@ class FastRenderer:
                 self._draw_windows(images, chosen, corner, window, centre[chosen], wall_depth)
 
     def _bounding_box(self, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First, and one past the last, row and column of the pixels that a ball may cover: ``(N, 2)`` each."""
+        """Return the first row and column that a ball may cover, and one past the last: ``(N, 2)`` each."""
         radius = MESH_RADIUS * self.scene.ball_radius
         depth = centre @ self._axis
         across = np.stack([-(centre @ self._up), np.zeros(len(centre))], axis=1)  # (N, 2): downward, to the right
-        # A line through the eye with this slope touches the circle that the ball is from above or from the side.
+        # The ball is a circle, seen from above or from the side. Lines through the eye with these slopes touch it.
         room = np.maximum(depth**2 - radius**2, 1e-12)[:, None]
         root = radius * np.sqrt(np.maximum(across**2 + depth[:, None] ** 2 - radius**2, 0))
         slopes = np.stack([across * depth[:, None] - root, across * depth[:, None] + root]) / room
         pixels = (slopes / self._slope + 1) * IMAGE_SIZE / 2
         pixels[..., 0] -= 1  # the lowest row is 63, at ndc -1
         first, last = np.clip(np.stack([np.floor(pixels[0]), np.ceil(pixels[1]) + 1]), 0, IMAGE_SIZE).astype(int)
-        is_around = abs(depth) <= radius + NEAR  # the ball is at the eye: no bounds
+        is_around = abs(depth) <= radius + NEAR  # the ball is at the eye and may cover every pixel
         first[is_around], last[is_around] = 0, IMAGE_SIZE
         is_out = (depth < -radius) | (depth > FAR + radius)
         last[is_out] = first[is_out]
@@ -204,7 +206,7 @@ class FastRenderer:
         centre: np.ndarray,
         wall_depth: np.ndarray,
     ) -> None:
-        """Draw the balls of the chosen images, each in a window of K x K pixels from its corner on."""
+        """Draw the balls of the chosen images, each in a window of K x K pixels, given its upper left corner."""
         radius = MESH_RADIUS * self.scene.ball_radius
         steps = np.arange(window)
         rows, columns = corner[:, :1] + steps, corner[:, 1:] + steps  # (n, K)
@@ -215,9 +217,9 @@ class FastRenderer:
         discriminant = (along**2 - (x**2 + z**2) * excess)[:, :, None] - (y**2 * excess)[:, None]  # (n, K, K)
         behind = np.minimum(wall_depth[chosen[:, None], rows], self._nearest_floor[rows])
 
-        # From here one entry for each pixel of a ball. K is a power of two, and so are these divisors.
+        # From here on, arrays have one entry for each pixel of a ball. The divisors are K, which is a power of two.
         found = np.flatnonzero(discriminant > 0)
-        row = found // window  # of the n * K rows of all windows
+        row = found // window  # index among the n * K rows of all windows
         ball = row // window
         pixel = rows.take(row) * IMAGE_SIZE + columns.take(ball * window + found % window)
         depth = (along.take(row) - np.sqrt(discriminant.take(found))) / self._ray_length_squared.take(pixel)

@@ -1,29 +1,29 @@
 """
-The ball-catching scene as data, for every renderer.
+The ball-catching scene as data, which all renderers use.
 
-Coordinates: x forward, y to the left, z upward; the floor is z = 0, and the camera at (d, 0, camera_height) looks along
-+x. Lengths are in metres.
+Coordinates: x points forward, y to the left and z upward. The floor is at z = 0. The camera is at
+(d, 0, camera_height) and looks along +x. Lengths are in metres.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-IMAGE_SIZE = 64  # pixels a side
-NEAR, FAR = 0.1, 20.0  # depth beyond which nothing is drawn; FAR cuts the top of the wall to white sky
+IMAGE_SIZE = 64  # pixels per side
+NEAR, FAR = 0.1, 20.0  # only points between these depths are drawn, so that white sky replaces the top of the wall
 
-# A plane is a square mesh, 30 m and 15 copies of its texture a side, like PyBullet's plane in 2020. (That of PyBullet
-# 3.2.7 shifts the texture by half a copy.) The wall is four times as large.
+# A plane is a square mesh. Its side is 30 m long and has 15 copies of the texture, like PyBullet's plane in 2020. (The
+# plane of PyBullet 3.2.7 shifts the texture by half a copy.) The sides of the wall are four times as long.
 PLANE_HALF, PLANE_COPIES = 15.0, 15
 WALL_SCALE = 4.0
-WALL_X, WALL_Z = 10.0, 42.0  # its centre
+WALL_X, WALL_Z = 10.0, 42.0  # centre of the wall
 
 LIGHT = np.array([-50.0, 30.0, 100.0])  # PyBullet's default position of the light
 
 
 @dataclass(frozen=True, eq=False)
 class BallScene:
-    """A wall, a floor, a ball and a camera."""
+    """The wall, the ball and the camera of a scene."""
 
     texture: np.ndarray  # of the wall, (H, W, 3) uint8
     ball_color: tuple[float, ...]  # red, green and blue, each in [0, 1]

@@ -1,6 +1,6 @@
-"""The common base of the environments: a finite-horizon POMDP whose core is batched NumPy.
+"""The base class of the environments: a finite-horizon POMDP in batched NumPy.
 
-Dimension key: N episodes side by side, X state, U action; observations have shape ``(N, *obs)``.
+Dimension key: N parallel episodes, X state, U action; observations have shape ``(N, *obs)``.
 """
 
 from abc import abstractmethod
@@ -15,12 +15,12 @@ from . import checks
 
 
 class BatchStep(NamedTuple):
-    """What one step of N episodes returns."""
+    """The results of one step of N episodes."""
 
     state: np.ndarray  # (N, X), x_{t+1}
     observation: np.ndarray  # (N, *obs), y_{t+1}
     cost: np.ndarray  # (N,), c_t, plus c_T on the last step
-    details: Sequence[Mapping[str, Any]] = ()  # N of them, or none: further entries for the info of the step
+    details: Sequence[Mapping[str, Any]] = ()  # additional entries of the info: one mapping per episode, or nothing
 
 
 class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -31,12 +31,13 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     episodes at once: :meth:`initial_state`, :meth:`dynamics`, :meth:`sensor`, :meth:`cost`, :meth:`terminal_cost`.
     All random numbers must come from ``self.np_random``.
 
-    This class turns them into ``reset``/``step`` for one episode; :class:`sb3_tdpg.vec_env.BatchedVecEnv` turns them
-    into an SB3 ``VecEnv`` for many. The end of the horizon is ``terminated=True``: it is part of the problem, so that
-    algorithms do not bootstrap there. The reward is the negative cost; only this class negates it.
+    This class uses these methods to provide ``reset`` and ``step`` for one episode.
+    :class:`sb3_tdpg.vec_env.BatchedVecEnv` uses them to provide an SB3 ``VecEnv`` for many episodes. The last step of
+    the horizon returns ``terminated=True``, because the horizon is part of the problem; algorithms do not bootstrap
+    there. The reward is the negative cost; subclasses return costs.
 
-    ``info["state"]`` holds a copy of the true state (after ``reset`` x_0, after ``step`` x_{t+1}), ``info["cost"]``
-    the cost of the step. A subclass may add to the info of a step by :attr:`_details`.
+    ``info["state"]`` is a copy of the true state: x_0 after ``reset``, and x_{t+1} after ``step``. ``info["cost"]`` is
+    the cost of the step. A subclass can add entries to the info of a step with :attr:`_details`.
 
     :param horizon: Number of controls T in an episode.
     :param render_mode: ``None`` or one of ``metadata["render_modes"]``.
@@ -46,13 +47,13 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
 
     state_space: spaces.Box
     action_space: spaces.Box
-    #: Optional: names of the state's components in figures, with units: ``("d (m)", "v (m/s)")``.
+    #: Names of the state's components in figures, with units: ``("d (m)", "v (m/s)")``. Optional.
     state_names: tuple[str, ...]
-    #: Whether the constructor has a keyword ``n_processes``: the processes that share the work of a batch.
+    #: Whether the constructor has a keyword ``n_processes``, the number of processes that share the work of a batch.
     shares_work: bool = False
-    #: Cached properties that hold a Bullet world or processes, made by the process that first uses them.
+    #: Names of cached properties that hold a Bullet world or processes. The process that first uses one creates it.
     resources: frozenset[str] = frozenset()
-    #: Further entries for the info of each episode of the last :meth:`dynamics`, or none.
+    #: Additional entries of each episode's info after the last call of :meth:`dynamics`; the sequence can be empty.
     _details: Sequence[Mapping[str, Any]] = ()
 
     def __init__(self, *, horizon: int, render_mode: str | None = None) -> None:
@@ -65,16 +66,16 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         self._is_closed = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out worlds and processes: a copy makes its own."""
+        """Return the attributes without Bullet worlds and processes, because a copy creates its own."""
         return {name: value for name, value in self.__dict__.items() if name not in self.resources}
 
     def check_open(self) -> None:
         """Raise a ``RuntimeError`` after :meth:`close`."""
-        if self._is_closed:  # perhaps before there was a BulletClient, which says the same
+        if self._is_closed:  # a BulletClient raises the same error, but there may be none yet
             raise RuntimeError("this environment has been closed: make a new one")
 
     def close(self) -> None:
-        """Close worlds, processes and windows; closing twice is fine."""
+        """Close Bullet worlds, processes and windows; a second call does nothing."""
         self._is_closed = True
         for name in self.resources & set(self.__dict__):
             getattr(self, name).close()
@@ -86,9 +87,9 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     @abstractmethod
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         """
-        Return a new array x_{t+1} ~ p(. | x_t, u_t): ``(N, X)`` from ``(N, X)`` and ``(N, U)``.
+        Draw x_{t+1} ~ p(. | x_t, u_t) as a new array: ``(N, X)`` from ``(N, X)`` and ``(N, U)``.
 
-        Actions of a ``Discrete`` space are ``(N,)``, here and in :meth:`cost`.
+        Actions of a ``Discrete`` space have the shape ``(N,)``, here and in :meth:`cost`.
         """
 
     @abstractmethod
@@ -97,11 +98,11 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
 
     @abstractmethod
     def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """c_t(x_t, u_t): ``(N,)``."""
+        """Return the stage cost c_t(x_t, u_t): ``(N,)``."""
 
     @abstractmethod
     def terminal_cost(self, state: np.ndarray) -> np.ndarray:
-        """c_T(x_T): ``(N,)``."""
+        """Return the terminal cost c_T(x_T): ``(N,)``."""
 
     def _current_state(self) -> np.ndarray:
         """Return the state to render, ``(1, X)``."""
@@ -120,8 +121,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
 
         :param state: x_t, ``(N, X)``
         :param action: u_t, ``(N, U)``; it is clipped to the action space
-        :param is_last: Whether this is control T - 1, so that the terminal cost is due.
-        :raises ValueError: if the actions have another shape, or one is NaN or infinite.
+        :param is_last: Whether this is the last control, T - 1, whose cost includes the terminal cost.
+        :raises ValueError: if the actions have a wrong shape, or an action is NaN or infinite.
         """
         action, expected = np.asarray(action, dtype=np.float64), (len(state), *self.action_space.shape)
         if action.shape != expected:
@@ -158,7 +159,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
             )
         terminated = self._time + 1 == self.horizon
         action, shape = np.asarray(action, dtype=np.float64), self.action_space.shape
-        if action.size == np.prod(shape):  # step_batch refuses others
+        if action.size == np.prod(shape):  # step_batch raises an error for other sizes
             action = action.reshape(shape)
         self._state, observation, cost, details = self.step_batch(self._state, action[None], is_last=terminated)
         self._time += 1

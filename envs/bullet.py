@@ -1,4 +1,4 @@
-"""A connection to a Bullet world of its own, and what all pictures of such a world share."""
+"""Connect to separate Bullet worlds, and draw pictures of them."""
 
 import functools
 import os
@@ -19,19 +19,20 @@ UNTURNED = (0.0, 0.0, 0.0, 1.0)  # quaternion (x, y, z, w)
 
 class BulletClient:
     """
-    One Bullet world. ``client.createMultiBody(...)`` is ``pybullet.createMultiBody(..., physicsClientId=...)``.
+    Connect to a new Bullet world and call PyBullet's functions for this world.
 
-    Several clients exist side by side and do not see each other's bodies. A client is closed by :meth:`close`, by
-    garbage collection, or when Python exits.
+    ``client.createMultiBody(...)`` calls ``pybullet.createMultiBody(..., physicsClientId=...)``. A process can have
+    several clients; each world has its own bodies. A client is closed by :meth:`close`, by garbage collection, or when
+    Python exits.
 
-    :param gui: Open PyBullet's window; a process can have one.
+    :param gui: Open PyBullet's window; a process can have only one window.
     :raises ValueError: if there is no display for the window.
-    :raises RuntimeError: if no connection is left.
+    :raises RuntimeError: if PyBullet has no free connection.
     """
 
     def __init__(self, *, gui: bool = False) -> None:
         if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            # PyBullet would end the whole process.
+            # Without a display PyBullet would end the whole process.
             raise ValueError(
                 "render_mode='human' opens a window, but the environment variable DISPLAY is not set: run it in a "
                 "desktop session, or use render_mode='rgb_array'"
@@ -46,7 +47,7 @@ class BulletClient:
         self._close = weakref.finalize(self, pybullet.disconnect, client_id)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # copy and pickle ask before __init__ has run
+        if name.startswith("_"):  # copy and pickle look up such names before __init__ has run
             raise AttributeError(name)
         attribute = getattr(pybullet, name)
         if not callable(attribute):
@@ -59,7 +60,7 @@ class BulletClient:
         """
         Upload an image, ``(H, W, 3)`` uint8, and return its texture id.
 
-        PyBullet reads textures from files only, and misreads grey ones: the file is RGB.
+        PyBullet reads textures only from files. It misreads grey images, so the file is written as RGB.
         """
         with tempfile.TemporaryDirectory(prefix="sb3_tdpg_") as folder:
             path = os.path.join(folder, "texture.png")
@@ -80,23 +81,23 @@ class BulletClient:
         self.resetDebugVisualizerCamera(distance, yaw, pitch, target)
 
     def close(self) -> None:
-        """Close the world; later calls do nothing."""
+        """Close the world; a second call does nothing."""
         self._close()
 
 
 class BulletWorld:
-    """A base class for what has a Bullet world of its own, :attr:`client`."""
+    """Base class of objects that have their own Bullet world, :attr:`client`."""
 
     def __init__(self, *, gui: bool = False) -> None:
         self.client = BulletClient(gui=gui)
 
     def close(self) -> None:
-        """Close the Bullet world; closing twice is fine."""
+        """Close the Bullet world; a second call does nothing."""
         self.client.close()
 
 
 def enlarge(image: np.ndarray, factor: int) -> np.ndarray:
-    """Repeat every pixel of an image ``(H, W, 3)``."""
+    """Enlarge an image ``(H, W, 3)`` by an integer factor: each pixel is repeated."""
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 

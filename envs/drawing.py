@@ -1,4 +1,4 @@
-"""Pictures of the planar environments: boxes on a light ground, in NumPy."""
+"""Draw the planar environments with NumPy, as boxes on a light background."""
 
 import math
 
@@ -14,14 +14,14 @@ def paint_box(
     span: tuple[float, float, float, float] = (-1.0, 1.0, -1.0, 1.0),
 ) -> None:
     """
-    Paint a turned box in place.
+    Paint a rotated box into an image, in place.
 
     :param image: ``(H, W, 3)`` uint8.
-    :param middle: x and y of its middle, in the units of ``span``.
-    :param size: Its length and its width.
-    :param angle: Between its length and the x-axis, in rad.
+    :param middle: x and y of the box's middle, in the units of ``span``.
+    :param size: Length and width of the box, in the units of ``span``.
+    :param angle: Angle between the length of the box and the x-axis, in rad.
     :param colour: Red, green and blue, 0 to 255.
-    :param span: Left, right, lower and upper edge of the picture.
+    :param span: Coordinates of the left, right, lower and upper edge of the picture.
     """
     height, width = image.shape[:2]
     left, right, low, high = span

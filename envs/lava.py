@@ -18,28 +18,28 @@ class LavaEnv(POMDPEnv):
     r"""
     Reach ``d = 3 m`` and stop there, without falling into the lava at ``d = 5 m``.
 
-    State ``x = (d, v)``: distance from the wall in metres, velocity in metres a step. Observation
+    State ``x = (d, v)``: distance from the wall in metres, and velocity in metres per step. Observation
     ``y ~ N(x, sensor_noise_std^2 I)``. Action ``u``: the change of velocity. With ``T = 5`` controls,
 
     .. math::
         x_{t+1} = (d_t + v_t,\ v_t + u_t), \qquad
         c_t = \lVert x_t - g \rVert, \qquad c_T = 100 \lVert x_T - g \rVert, \qquad g = (3, 0).
 
-    The robot starts with ``v = 0`` and ``d`` uniform in [0, 5] m. The wall stops it, ``v = 0``, and cancels the control
-    of that step. A robot that passes 5 m is in the lava and stays at ``(5, 0)`` for ever.
+    The robot starts with ``v = 0`` and ``d`` uniform in [0, 5] m. If it hits the wall, it stops (``v = 0``), and the
+    control of that step has no effect. If it passes 5 m, it falls into the lava and stays at ``(5, 0)``.
 
     The defaults follow the paper's text. Another cost definition fits the numbers of Table I better:
     ``LavaEnv(**sb3_tdpg.envs.scenarios.LAVA_TABLE_READING)``.
 
     :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
-    :param sensor_bias: Added to every observation, in m and m/s.
-    :param start_beta: ``(a, b)``: the robot starts at 5 m times a Beta(a, b) number; ``None``: uniformly.
-    :param action_cost: Weight of ``|u_t|`` in the stage cost (0 in the text, 1 in the table's definition).
-    :param lava_stage_cost: Stage cost once in the lava; ``None``: the distance to the goal, which is 2 there.
-    :param lava_terminal_cost: Terminal cost in the lava; ``None``: 100 times the distance, which is 200 there.
+    :param sensor_bias: Vector that is added to every observation, in m and m/s.
+    :param start_beta: ``(a, b)``: the robot starts at 5 m times a random number from Beta(a, b). ``None``: uniformly.
+    :param action_cost: Weight of ``|u_t|`` in the stage cost: 0 in the paper's text, 1 in the other cost definition.
+    :param lava_stage_cost: Stage cost in the lava. ``None``: the distance from the goal, which is 2 in the lava.
+    :param lava_terminal_cost: Terminal cost in the lava. ``None``: 100 times the distance, which is 200 in the lava.
     :param horizon: Number of controls T.
-    :param max_action: The action space is ``[-max_action, max_action]``. The paper's is unbounded, but SB3 needs
-        bounds; it is large because an action beyond the bound gives no gradient.
+    :param max_action: Bound of the action space ``[-max_action, max_action]``. The paper's action space is unbounded,
+        but SB3 needs bounds. The default bound is large, because an action beyond it gives no gradient.
     :param render_mode: ``None`` or ``"rgb_array"``.
     """
 
@@ -86,8 +86,8 @@ class LavaEnv(POMDPEnv):
         """
         Upper bound on the cost of an episode.
 
-        A robot that is neither at the wall nor in the lava moved within [0, 5] m in the last step. So its speed was at
-        most 5 m a step, and the last control adds at most ``max_action``.
+        A robot that is neither at the wall nor in the lava stayed within [0, 5] m in the last step. So its speed was at
+        most 5 m per step, and the last control adds at most ``max_action`` to this speed.
         """
         max_action = float(self.action_space.high[0])
         farthest = float(np.hypot(GOAL[0] - WALL, LAVA - WALL + max_action))
@@ -106,7 +106,7 @@ class LavaEnv(POMDPEnv):
         d, v = state.T
         next_state = np.stack([d + v, v + action[:, 0]], axis=1)
         next_d = next_state[:, 0]
-        # Strictly beyond the wall: a robot *at* the wall must be able to leave it.
+        # The wall stops only a robot strictly beyond it: a robot *at* the wall must be able to leave.
         next_state[next_d < WALL] = (WALL, 0.0)
         next_state[(d >= LAVA) | (next_d >= LAVA)] = (LAVA, 0.0)
         return next_state

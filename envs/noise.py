@@ -1,4 +1,4 @@
-"""Noise on the pixels of images, in the two modes of the ball-catching problem."""
+"""Add noise to the pixels of images, in the two modes of the ball-catching problem."""
 
 import numpy as np
 
@@ -7,9 +7,10 @@ NOISE_MODES = ("minmax", "clip")
 
 def noisy_pixels(images: np.ndarray, std: float, mode: str, rng: np.random.Generator) -> np.ndarray:
     """
-    Add Gaussian noise to every pixel of images in [0, 1], ``(N, C, H, W)`` float32, and bring them back to [0, 1].
+    Add Gaussian noise to every pixel of images in [0, 1], ``(N, C, H, W)`` float32, and map them back to [0, 1].
 
-    ``"minmax"``, as in the paper, subtracts the minimum of each image, then divides by its maximum; ``"clip"`` clips.
+    ``"minmax"``, as in the paper, subtracts each image's minimum and then divides by the maximum. ``"clip"`` clips each
+    pixel to [0, 1].
     """
     noisy: np.ndarray = std * rng.standard_normal(images.shape, dtype=np.float32) + images
     if mode == "minmax":

@@ -1,4 +1,4 @@
-"""The simulated Panda arm, for a grasp and for a squeeze: phases of motion that a body on the table takes part in."""
+"""Simulate the phases of motion of a Panda arm that grasps or squeezes a body on a table."""
 
 import functools
 from abc import abstractmethod
@@ -12,20 +12,20 @@ Joints = tuple[float, ...]  # rad, of the arm
 Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position in m, and orientation as a quaternion (x, y, z, w)
 
 TIME_STEP = 1 / 240  # s
-HAND = 8  # link
+HAND = 8  # link number
 ARM_JOINTS = tuple(range(7))
-FINGER_JOINTS = (9, 10)  # and links
-HOME: Joints = (0.0, -0.215, 0.0, -2.57, 0.0, 2.356, -0.785)  # rad, from where inverse kinematics starts
-FINGER_OPEN = 0.04  # m, of each of the two
+FINGER_JOINTS = (9, 10)  # the finger links have the same numbers
+HOME: Joints = (0.0, -0.215, 0.0, -2.57, 0.0, 2.356, -0.785)  # rad, where inverse kinematics starts
+FINGER_OPEN = 0.04  # m, position of each finger in the open gripper
 ARM_FORCE, FINGER_FORCE = 70.0, 20.0
 FINGERTIPS_BELOW_HAND = 0.1123  # m
-LOOK_EVERY = 8  # steps, after which a phase can end early
-NEAR_TARGET = 0.01  # rad: the arm has arrived
+LOOK_EVERY = 8  # number of steps between two checks whether a phase can end
+NEAR_TARGET = 0.01  # rad: the arm has arrived if all joints are closer than this to their goals
 FAR_AWAY = (5.0, 5.0, 5.0)  # m
 
 
 class Phase(NamedTuple):
-    """A part of a motion."""
+    """The length and the speeds of one phase of a motion."""
 
     max_steps: int
     arm_speed: float  # rad/s, of each joint
@@ -33,9 +33,9 @@ class Phase(NamedTuple):
 
 
 class Configuration(NamedTuple):
-    """Positions of everything that moves, at one instant."""
+    """The positions of the joints and of the body at one time."""
 
-    joints: tuple[float, ...]  # seven of the arm, two of the fingers
+    joints: tuple[float, ...]  # seven of the arm and two of the fingers
     position: tuple[float, ...]  # of the mug's frame or of the part's middle
     orientation: tuple[float, ...]  # quaternion (x, y, z, w)
 
@@ -45,17 +45,17 @@ Watch = Callable[[Configuration], object]
 
 class ArmSimulation(BulletWorld):
     """
-    Table, robot and a body in a Bullet world of their own, without visual shapes of table and robot.
+    Simulate table, robot and one body in their own Bullet world, in which table and robot have no visual shapes.
 
-    A subclass loads the robot and the body, and sets all positions before a motion, so that its outcome is a function
-    of its arguments alone.
+    A subclass loads the robot and the body. It sets all positions before a motion, so that the outcome of the motion
+    depends only on the arguments.
     """
 
     _robot: int
     _body: int
     _watch: Watch | None = None
-    _ends_early = True  # phases end when they are over, not after all of their steps
-    _still = 0.01  # m/s: slower fingers stand still
+    _ends_early = True  # a phase ends when its goal is reached, not after all its steps
+    _still = 0.01  # m/s: slower fingers count as standing still
 
     def __init__(self, solver_iterations: int) -> None:
         super().__init__()
@@ -64,8 +64,8 @@ class ArmSimulation(BulletWorld):
         client.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
             numSolverIterations=solver_iterations,
-            # By default the order in which contacts are solved depends on earlier simulations, and changes the body's
-            # final pose in one trial of fifteen.
+            # By default Bullet solves contacts in an order that depends on earlier simulations. This changes the body's
+            # final pose in one of fifteen trials.
             deterministicOverlappingPairs=1,
         )
         self._unseen = client.URDF_IGNORE_VISUAL_SHAPES
@@ -73,10 +73,10 @@ class ArmSimulation(BulletWorld):
 
     @abstractmethod
     def _pose(self) -> Pose:
-        """Return the pose of the body that a picture shows."""
+        """Return the pose of the body for pictures."""
 
     def _run(self, phase: Phase, joints: Joints, fingers: float, is_over: Callable[[], bool]) -> None:
-        """Move arm and fingers towards a goal until a phase is over."""
+        """Move arm and fingers towards their goals until a phase is over."""
         control = functools.partial(self.client.setJointMotorControl2, self._robot)
         position = self.client.POSITION_CONTROL
         for joint, goal, speed in zip(ARM_JOINTS, joints, self._speeds(phase, joints), strict=True):
@@ -93,7 +93,7 @@ class ArmSimulation(BulletWorld):
         self._show()
 
     def _speeds(self, phase: Phase, joints: Joints) -> Sequence[float]:
-        """Return the speed of each joint on its way to a goal, in rad/s."""
+        """Return the maximum speed of each joint on its way to its goal, in rad/s."""
         return [phase.arm_speed] * len(joints)
 
     def _show(self) -> None:
@@ -102,16 +102,16 @@ class ArmSimulation(BulletWorld):
             self._watch(Configuration(tuple(state[0] for state in states), *self._pose()))
 
     def _states(self, joints: Sequence[int]) -> list[tuple[float, ...]]:
-        """Return position and velocity, and more, of each joint."""
+        """Return PyBullet's state of each joint, which begins with its position and velocity."""
         return self.client.getJointStates(self._robot, joints)
 
     def _clear_contacts(self) -> None:
-        """Take a step in which nothing touches: the contacts of the last motion would change the next one."""
+        """Simulate a step without contacts, because contacts of the last motion would change the next motion."""
         self.client.resetBasePositionAndOrientation(self._body, FAR_AWAY, UNTURNED)
         self.client.stepSimulation()
 
     def _put_body(self, position: tuple[float, ...], yaw: float) -> None:
-        """Put the body somewhere, upright and at rest."""
+        """Put the body at a position, upright and at rest."""
         client = self.client
         upright = client.getQuaternionFromEuler((0.0, 0.0, yaw))
         client.resetBasePositionAndOrientation(self._body, position, upright)
@@ -122,7 +122,7 @@ class ArmSimulation(BulletWorld):
             self.client.resetJointState(self._robot, joint, angle, 0.0)
 
     def _joints_for(self, position: tuple[float, ...], orientation: tuple[float, ...], accuracy: float) -> Joints:
-        """Solve for the arm's joints by inverse kinematics, starting from the present ones."""
+        """Compute the arm's joint angles for a pose of the hand by inverse kinematics, from the present angles."""
         joints = self.client.calculateInverseKinematics(
             self._robot, HAND, position, orientation,
             jointDamping=[1e-5] * 9, maxNumIterations=200, residualThreshold=accuracy,

@@ -1,7 +1,8 @@
 """
-The simulation of a grasp: PyBullet moves the arm down, closes the gripper, and lifts.
+Simulate a grasp with PyBullet: move the arm down, close the gripper, and lift.
 
-A *pose* is that of the hand at the grasp, ``(x, y, z, yaw)``; a *state* is that of the mug's frame, also ``(4,)``.
+A *pose* is the pose of the hand at the grasp, ``(x, y, z, yaw)``. A *state* is the pose of the mug's frame, also
+``(4,)``.
 """
 
 from typing import NamedTuple
@@ -12,23 +13,23 @@ from .panda_arm import FINGER_JOINTS, FINGER_OPEN, FINGERTIPS_BELOW_HAND, HOME, 
 from .panda_scene import ROBOT_FILE, PandaScene, add_mug_body
 
 FINGER_SPINNING_FRICTION = 0.1
-HAND_ABOVE_GRASP = 0.1  # m: the height of a grasp is that of a point between the fingers, near their tips
-# Half a turn does not change the gripper. This turn is in the middle of the last joint's range, so that the arm reaches
-# all yaws of a half circle to either side of the nominal one.
+HAND_ABOVE_GRASP = 0.1  # m: the height of a grasp is the height of a point between the fingers, near their tips
+# Half a turn does not change the gripper. This yaw of the hand is in the middle of the last joint's range, so that the
+# arm reaches all yaws of a half circle to either side of the nominal yaw.
 HAND_TURN = np.pi / 4 - np.pi
-LIFTED = 0.05  # m: higher than this a mug counts as lifted
+LIFTED = 0.05  # m: a mug above this height counts as lifted
 LIFTED_FOR_GOOD = 0.06  # m
 ACCURACY = 1e-6  # of inverse kinematics
 
 
 class Motion(NamedTuple):
-    """How a grasp is carried out."""
+    """The solver setting and the phases of a grasp."""
 
     solver_iterations: int
     approach: Phase
     close: Phase
     lift: Phase
-    start_height: float  # m, of the hand above the grasp
+    start_height: float  # m, height of the hand above the grasp at the start
     is_fast: bool  # start above the rim, lift by LIFT_BY instead of to LIFT_TO, and end each phase as early as possible
 
 
@@ -46,9 +47,9 @@ Outcome = tuple[np.ndarray, int]
 
 class GraspSimulation(ArmSimulation):
     """
-    Robot, table and mug in a Bullet world of their own, without visual shapes.
+    Simulate grasps: robot, table and mug in their own Bullet world, without visual shapes.
 
-    Every grasp starts from the same state of the world, so that its outcome is a function of state and pose alone.
+    Every grasp starts from the same state of the world, so that the outcome depends only on state and pose.
     """
 
     def __init__(self, scene: PandaScene, motion: Motion) -> None:
@@ -65,7 +66,7 @@ class GraspSimulation(ArmSimulation):
         self._start = client.saveState()
 
     def grasp(self, state: np.ndarray, pose: np.ndarray, watch: Watch | None = None) -> Outcome:
-        """Carry out a grasp; ``watch`` is called 30 times a second and does not change the outcome."""
+        """Carry out a grasp; ``watch`` is called 30 times per simulated second and does not change the outcome."""
         motion, client, self._watch = self.motion, self.client, watch
         self._restore(state)
         x, y, z, yaw = pose.tolist()
@@ -89,7 +90,7 @@ class GraspSimulation(ArmSimulation):
 
     def _restore(self, state: np.ndarray) -> None:
         """Restore the saved state of the world, and move the mug to its state."""
-        self._clear_contacts()  # which restoreState keeps
+        self._clear_contacts()  # restoreState keeps contacts
         self.client.restoreState(self._start)
         x, y, z, yaw = state.tolist()
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -106,13 +107,13 @@ class GraspSimulation(ArmSimulation):
         return sum(len(points(self._robot, self._body, finger, -1)) for finger in FINGER_JOINTS)
 
     def _mug_frame(self) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
-        """Origin ``(3,)`` and axes ``(3, 3)`` of the mug's frame, and its orientation as a quaternion."""
+        """Return origin ``(3,)``, axes ``(3, 3)`` and orientation (a quaternion) of the mug's frame."""
         centre, orientation = self.client.getBasePositionAndOrientation(self._body)
         axes = np.array(self.client.getMatrixFromQuaternion(orientation)).reshape(3, 3)
         return np.array(centre) - axes @ self.scene.centre_of_mass, axes, orientation
 
     def _mug_state(self, yaw_before: float) -> np.ndarray:
-        """State of the mug; its yaw continues from the one before, without a jump by a whole turn."""
+        """Return the state of the mug; its yaw differs from ``yaw_before`` by at most half a turn."""
         origin, axes, _ = self._mug_frame()
         turned = np.arctan2(axes[1, 0], axes[0, 0]) - yaw_before
         return np.append(origin, yaw_before + (turned + np.pi) % (2 * np.pi) - np.pi)

@@ -1,11 +1,11 @@
-"""The depth camera of the grasping scene: PyBullet draws only the mug; the depth of the table is known."""
+"""The depth camera of the grasping scene: PyBullet draws the mug, and geometry gives the depth of the table."""
 
 import numpy as np
 
 from .bullet import BulletWorld
 from .panda_scene import PandaScene, add_mug_picture
 
-IMAGE_SIZE = 128  # pixels a side
+IMAGE_SIZE = 128  # pixels per side
 
 TARGET, DISTANCE, YAW, PITCH = (0.5, 0.0, 0.02), 0.4, 225.0, -45.0  # m and degrees
 NEAR, FAR = 0.01, 1000.0  # m
@@ -15,10 +15,11 @@ EDGES = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
 
 class DepthCamera(BulletWorld):
     """
-    A Bullet world of its own that contains only the mug's mesh.
+    Draw depth images of table and mug in a separate Bullet world.
 
-    To draw table and mug takes 5 ms an image. The table's depth follows from geometry, so that PyBullet draws only the
-    mug, in 1.4 ms, and the smaller depth of the two counts: the same to 3e-6 m.
+    PyBullet takes 5 ms for an image of table and mug, but 1.4 ms for the mug alone. So the world contains only the mug,
+    and the depth of the table is computed. Each pixel has the smaller of the two depths, which agrees with PyBullet's
+    depth to 3e-6 m.
     """
 
     def __init__(self, scene: PandaScene) -> None:
@@ -34,7 +35,7 @@ class DepthCamera(BulletWorld):
         turn_and_shift = np.array(view).reshape(4, 4).T
         self.rotation = turn_and_shift[:3, :3]  # from the world's axes to right, up and backward
         self.eye = -self.rotation.T @ turn_and_shift[:3, 3]
-        # Each pixel's ray to a depth of 1 m, uppermost row first. TinyRenderer samples pixels at the lower left corner.
+        # The ray of each pixel to a depth of 1 m, top row first. TinyRenderer samples a pixel at its lower left corner.
         left, right, bottom, top = EDGES
         corner = np.arange(IMAGE_SIZE) / IMAGE_SIZE
         to_right = (left + (right - left) * corner) / NEAR
@@ -43,19 +44,19 @@ class DepthCamera(BulletWorld):
         self._rays_z = (rays @ self.rotation)[..., 2]  # (128, 128)
 
     def table_depth(self, below: float = 0.0) -> np.ndarray:
-        """Depth of the table, ``(128, 128)``, along the optical axis, as if it were lower by a distance."""
+        """Return the depth of the table along the optical axis, ``(128, 128)``, if it were lower by ``below`` m."""
         return (-below - self.eye[2]) / self._rays_z
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """
         Draw a depth image for each state of the mug: ``(N, 1, 128, 128)`` float32 in m.
 
-        States are ``(N, 4)``, or ``(N, 5)`` with the height of the camera above its usual position, in m.
+        States are ``(N, 4)`` or ``(N, 5)``. A fifth component raises the camera above its usual height, in m.
         """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client
         for image, (x, y, z, yaw, *raised) in zip(images, state.tolist(), strict=True):
-            below = sum(raised)  # a higher camera sees what this one sees of a lower scene
+            below = sum(raised)  # raising the camera has the same effect as lowering the scene
             orientation = client.getQuaternionFromEuler((0, 0, yaw))
             client.resetBasePositionAndOrientation(self._mug, (x, y, z - below), orientation)
             buffer = client.getCameraImage(*self._camera, shadow=0, renderer=client.ER_TINY_RENDERER)[3]

@@ -1,4 +1,4 @@
-"""The grasping problem (Section IV-C of the paper): lift a mug by its rim, from one depth image."""
+"""The grasping problem (Section IV-C of the paper): lift a mug by its rim, given one depth image."""
 
 import time
 from collections.abc import Iterator
@@ -18,18 +18,18 @@ from .pool import SharedEnv
 
 NOMINAL_GRASP = np.array([0.5, 0.0, 0.06, np.pi / 6])  # m and rad: the action 0
 ACTION_SCALE = 0.1
-# In units of the action. x and y: the arm's reach. z, between 0.05 and 0.16 m: lower, the palm presses on the rim. yaw:
-# 1 rad to either side.
+# Bounds in units of the action. x and y: the reach of the arm. z: 0.05 to 0.16 m, because at lower heights the palm
+# presses on the rim. yaw: 1 rad to either side.
 LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
 HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
-# m, the range of the sensor. Table and mug are 0.31 to 0.61 m away.
+# Range of the sensor in m. Table and mug are 0.31 to 0.61 m away.
 MIN_DEPTH, MAX_DEPTH = 0.2, 0.7
 MAX_CAMERA_SHIFT = 0.1  # m
-WORKSPACE = np.array([0.5, 0.0])  # m, its middle
+WORKSPACE = np.array([0.5, 0.0])  # m, middle of the workspace
 
 
 class GraspWorld:
-    """Simulation and camera of one process; each is made when it is first used."""
+    """The simulation and the camera of one process; each is created at its first use."""
 
     def __init__(self, scene: PandaScene, motion: Motion) -> None:
         self.scene, self.motion = scene, motion
@@ -45,7 +45,7 @@ class GraspWorld:
         return DepthCamera(self.scene)
 
     def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
-        """Carry out one grasp for each mug, ``(N, 4)``, at its pose, ``(N, 4)``; ``watch`` as in ``grasp``."""
+        """Grasp each mug in ``states``, ``(N, 4)``, with the hand at the pose in ``poses``, ``(N, 4)``."""
         return [self.simulation.grasp(mug, pose, watch) for mug, pose in zip(states, poses, strict=True)]
 
     def images(self, states: np.ndarray) -> np.ndarray:
@@ -62,31 +62,33 @@ class PandaGraspEnv(SharedEnv):
     r"""
     Grasp a mug on a table, and lift it.
 
-    State ``x = (x, y, z, yaw)`` of the mug's frame, in m and rad; with a ``camera_range`` also the camera's height.
-    Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``. Action ``u``: the hand grasps at
-    ``(0.5, 0, 0.06, pi/6) + 0.1 u``, its position in m and its yaw in rad. There is one control, ``T = 1``, and
-    PyBullet simulates its result:
+    State ``x = (x, y, z, yaw)``: the pose of the mug's frame in m and rad. With a ``camera_range`` the height of the
+    camera is a fifth component. Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``. Action ``u``: the
+    hand grasps at the pose ``(0.5, 0, 0.06, pi/6) + 0.1 u``, its position in m and its yaw in rad. There is one
+    control, ``T = 1``, and PyBullet simulates its result:
 
     .. math::
         c_0 = 0, \qquad c_1 = \begin{cases} 0 & \text{if the mug's frame is more than 5 cm above the table},\\
         1 & \text{otherwise.} \end{cases}
 
-    After the step, ``info`` has ``success`` (``is_success`` for SB3), ``mug`` (its pose before the grasp),
-    ``mug_height`` (in m, after it), ``grasp`` (the clipped pose of the hand) and ``contacts`` (points in which the
-    fingers touch the mug at the end).
+    After the step, ``info`` has ``success`` (``is_success`` for SB3), ``mug`` (the mug's pose before the grasp),
+    ``mug_height`` (after the grasp, in m), ``grasp`` (the clipped pose of the hand) and ``contacts`` (number of points
+    in which the fingers touch the mug at the end).
 
-    The outcome is a function of state and action alone: it depends neither on earlier trials nor on the process.
+    The outcome depends only on state and action, not on earlier trials or on the process.
 
     :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
-    :param yaw_range: Its yaw starts uniformly in ``(low, high)``, in rad; 0: the handle points to the left.
-    :param camera_range: Each trial raises the camera uniformly in ``(low, high)``, in m: the fifth state component.
-    :param camera_shift: Every trial raises the camera by this distance, in m, which the state does not contain.
-    :param mug_scale: Size of the mug, as a multiple of the paper's (93 mm across, 81 mm high).
+    :param yaw_range: The mug's yaw starts uniformly in ``(low, high)``, in rad. At yaw 0 the handle points to the left.
+    :param camera_range: Each trial raises the camera by a distance that is uniform in ``(low, high)``, in m. This
+        distance is the fifth state component.
+    :param camera_shift: Every trial raises the camera by this distance, in m. The state does not contain it.
+    :param mug_scale: Size of the mug, as a multiple of the size of the paper's mug (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
-    :param friction: Coefficient of friction of mug and fingers. (Bullet multiplies those of two bodies that touch.)
+    :param friction: Friction coefficient of the mug and of the fingers. (Bullet multiplies the coefficients of two
+        bodies that touch.)
     :param motion: ``"fast"``, or ``"reference"``, the paper's slow motion.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
-    :param n_processes: Number of processes that share a batch; the results are the same.
+    :param n_processes: Number of processes that share a batch. This number does not change the results.
     :param render_mode: ``None``, ``"rgb_array"`` (the scene and the depth image) or ``"human"`` (PyBullet's window).
     """
 
@@ -128,7 +130,7 @@ class PandaGraspEnv(SharedEnv):
         self.state_space = spaces.Box(-np.inf, np.inf, (len(self.state_names),), np.float64)
         self.observation_space = spaces.Box(MIN_DEPTH, MAX_DEPTH, (1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         self.action_space = spaces.Box(LOWEST_ACTION, HIGHEST_ACTION, dtype=np.float32)
-        self._film: list[Configuration] = []  # of the last grasp, if there is a render_mode
+        self._film: list[Configuration] = []  # the last grasp, recorded only with a render_mode
 
     def _make_world(self) -> tuple[Any, ...]:
         return GraspWorld, self.scene, MOTIONS[self.motion]
@@ -164,7 +166,7 @@ class PandaGraspEnv(SharedEnv):
         return self._with_noise(self._shared("images", self._seen(state)), self.np_random)
 
     def _seen(self, state: np.ndarray) -> np.ndarray:
-        """Return the states for the depth camera: the mug's, with the height of a raised camera."""
+        """Return the states for the depth camera: the mug's pose and, if it is not constant, the camera's height."""
         if self.camera_shift == 0:
             return state
         raised = state[:, 4:] if self.camera_range is not None else np.zeros((len(state), 1))
@@ -187,9 +189,9 @@ class PandaGraspEnv(SharedEnv):
         """
         Show the scene before or after the grasp.
 
-        ``"rgb_array"``: return the scene beside the depth image, ``(256, 644, 3)`` uint8, near points bright; see also
-        :meth:`film`. ``"human"``: show the scene in PyBullet's window, and the grasp in real time. The sensor noise in
-        the picture is a new sample, so that rendering does not change an episode.
+        ``"rgb_array"``: return the scene beside the depth image, ``(256, 644, 3)`` uint8, in which near points are
+        bright. See also :meth:`film`. ``"human"``: show the scene in PyBullet's window, and the grasp in real time. The
+        sensor noise in the picture is a new sample, so that rendering does not change an episode.
         """
         if self.render_mode is None:
             return None
@@ -204,7 +206,7 @@ class PandaGraspEnv(SharedEnv):
 
     def film(self) -> Iterator[np.ndarray]:
         """
-        Yield the frames of the last grasp, at 30 frames per second, beside the depth image before it.
+        Yield the frames of the last grasp, at 30 frames per second, beside the depth image from before the grasp.
 
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """
@@ -220,7 +222,7 @@ class PandaGraspEnv(SharedEnv):
             yield self._view.picture(depth)
 
     def _shown(self) -> list[Configuration]:
-        """Return the last grasp, or the robot at rest before it."""
+        """Return the configurations of the last grasp, or the robot at rest if there was no grasp."""
         if self._time > 0:
             return self._film
         *position, yaw = self._current_state()[0, :4].tolist()
@@ -233,7 +235,7 @@ class PandaGraspEnv(SharedEnv):
 
 
 def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float] | None:
-    """Return the range in floats if the mug is visible from all of it."""
+    """Check that the mug is visible from every camera height; return the range as floats."""
     limit, why = MAX_CAMERA_SHIFT, "from further away the mug is not visible"
     try:
         low, high = map(float, (0.0, 0.0) if camera_range is None else camera_range)

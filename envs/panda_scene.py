@@ -1,8 +1,8 @@
 """
-The grasping scene as data, for the simulation and for every picture.
+The grasping scene as data, which the simulation and all pictures use.
 
-Coordinates: the robot is at the origin and looks along +x, y is to its left, z upward; the table's top is z = 0.
-Lengths are in metres, angles in radians.
+Coordinates: the robot is at the origin and looks along +x. y points to its left and z upward. The table's top is at
+z = 0. Lengths are in metres, angles in radians.
 """
 
 import os
@@ -22,14 +22,14 @@ MUG_FILE = os.path.join(ASSETS, "objects", "mug.obj")
 TABLE_POSITION = (0.4, 0.0, -0.625)  # puts the table's top at z = 0
 MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
 
-# PyBullet's mug, scaled to the size of the paper's: 93 mm across and 81 mm high. It is wider than the open gripper, so
-# that it can be grasped only by its rim, with one finger inside.
+# PyBullet's mug, scaled to the size of the paper's mug: 93 mm across and 81 mm high. It is wider than the open gripper,
+# so that it can be grasped only by its rim, with one finger inside.
 MESH_SCALE = np.array([1.134, 1.134, 0.81])
 MESH_RADIUS, MESH_HEIGHT = 0.041, 0.1  # of the cup in the file
-N_STAVES = 12  # with base and handle 16 shapes; PyBullet silently drops more
+N_STAVES = 12  # with base and handle the mug has 16 shapes; PyBullet silently drops further shapes
 WALL_THICKNESS = 0.0075
 BASE_HEIGHT = 0.006
-# Ends (y, z) of the handle's three bars in the file, their half width and thickness.
+# The ends (y, z) of the handle's three bars in the file, and the half width and the thickness of a bar.
 HANDLE_BARS = (
     ((0.0768, 0.0225), (0.0768, 0.0775)),
     ((0.039, 0.0775), (0.0768, 0.0775)),
@@ -38,7 +38,7 @@ HANDLE_BARS = (
 BAR_HALF_WIDTH, BAR_THICKNESS = 0.0055, 0.0085
 MASS = 0.1  # kg
 INERTIA = 2e-4  # kg m^2, about each axis
-CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame: a little towards the handle
+CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame; it is slightly towards the handle
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class PandaScene:
     """
     The mug: its size, its frame and its friction.
 
-    The cup's frame has the cup's axis as z axis and the handle along +y. The origin of the mug's frame, whose position
-    and rotation are the state, is beside the axis.
+    The z axis of the cup's frame is the cup's axis, and the handle points along +y. The pose of the mug's frame is the
+    state; its origin is beside the cup's axis.
 
     The parameters are those of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv`.
     """
@@ -58,7 +58,7 @@ class PandaScene:
 
     @property
     def mesh_scale(self) -> np.ndarray:
-        """Scale of the mesh in the file, ``(3,)``."""
+        """Scale factors of the mesh file, ``(3,)``."""
         return self.mug_scale * MESH_SCALE
 
     @property
@@ -89,7 +89,7 @@ class PandaScene:
         """
         radius, height, thickness = self.mug_radius, self.mug_height, self.mug_scale * WALL_THICKNESS
         base = self.mug_scale * BASE_HEIGHT
-        # Only the base touches the table: the staves begin at half its height.
+        # Only the base touches the table: the staves begin at half the height of the base.
         shapes = [dict(radius=0.93 * radius, length=base, position=(0.0, 0.0, base / 2), yaw=0.0)]
         stave = (thickness / 2, radius * np.tan(np.pi / N_STAVES), (height - base / 2) / 2)
         for yaw in 2 * np.pi * np.arange(N_STAVES) / N_STAVES:
@@ -105,7 +105,7 @@ class PandaScene:
 
 
 def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
-    """Add the mug's visual mesh; return its body's id. The base position is that of the mug's frame."""
+    """Add the mug's visual mesh; return its body's id. Its base position is the position of the mug's frame."""
     shape = client.createVisualShape(
         client.GEOM_MESH,
         fileName=MUG_FILE,
@@ -118,7 +118,7 @@ def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
 
 
 def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
-    """Add the mug's collision shapes; return its body's id. The base position is that of its centre of mass."""
+    """Add the mug's collision shapes; return its body's id. Its base position is the mug's centre of mass."""
     shapes = scene.collision_shapes()
     body = client.createCollisionShapeArray(
         [client.GEOM_BOX if "half_extents" in shape else client.GEOM_CYLINDER for shape in shapes],

@@ -1,4 +1,4 @@
-"""SqueezeInsert-v0 with a simulated arm: a Franka Panda squeezes a part in PyBullet, and presses it into a slot."""
+"""SqueezeInsert-v0 with a simulated arm: a Franka Panda in PyBullet squeezes a part and presses it into a slot."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -15,39 +15,38 @@ from .squeeze_bullet import SqueezeSimulation
 from .squeeze_insert import SqueezeInsertEnv
 from .squeeze_scene import SqueezeScene
 
-MAX_CENTRING_ERROR = 0.0035  # m: further off, a jaw may come down on the part
+MAX_CENTRING_ERROR = 0.0035  # m: with a larger error a jaw may come down on the part
 
 
 class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
     r"""
-    Squeeze a part with the arm until its orientation is known, then press it into a slot that is hardly wider.
+    Squeeze a part with the arm until its orientation is known, then press it into a slot that is only slightly wider.
 
-    State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv`: a policy
-    for one acts in the other. Here PyBullet finds the yaw after a squeeze. In each control the hand comes down
-    over the part with open jaws at the yaw ``u`` (modulo pi), closes them, opens them and moves up.
+    State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv`, so that a
+    policy for one environment can act in the other. Here PyBullet simulates the squeezes. In each control the hand
+    moves down over the part with open jaws at the yaw ``u`` (modulo pi), closes the jaws, opens them and moves up.
 
-    The hand is centred on the part before each squeeze, up to a random ``centring_error``. Only the place of the part
-    relative to the hand matters, so that every squeeze is simulated at the same place on the table, and the yaw alone
-    is the state. After the last squeeze the part is laid on the mouth of the slot as it is turned, and the closed jaws
-    press on it. The cost depends on the yaw before this, and not on whether the part goes in.
+    Before each squeeze the hand is centred on the part, up to a random ``centring_error``. Only the position of the
+    part relative to the hand matters. So every squeeze is simulated at the same place on the table, and the yaw alone
+    is the state. After the last squeeze the part is put on the mouth of the slot with the yaw that it has, and the
+    closed jaws press on it. The cost depends on the yaw before this insertion, not on whether the part enters the slot.
 
     After a step, ``info`` has ``offset`` (of the part from the middle of the hand, ``(2,)`` in m) and ``tilt`` (of the
-    part's vertical axis, in rad); after the last one also ``success`` (``is_success`` for SB3: whether the part went
-    into the slot) and ``height`` (of its lower side above the table, in m).
+    part's vertical axis, in rad). After the last step it also has ``success`` (whether the part entered the slot;
+    ``is_success`` for SB3) and ``height`` (of the part's lower side above the table, in m).
 
-    A step is a function of the state, the action and the centring error alone: it depends neither on earlier steps nor
-    on the process.
+    A step depends only on the state, the action and the centring error, not on earlier steps or on the process.
 
-    :param friction: Coefficient of friction between part and jaws, and between part and slot.
+    :param friction: Friction coefficient between part and jaws, and between part and slot.
     :param centring_error: The part lies uniformly within this distance of the middle of the hand, along x and along y,
         in m.
-    :param tolerance: Angle in rad that the slot forgives; its chamfer is as wide as a part turned by it needs. (Below
-        0.01 rad the slot is more forgiving, because of its clearance.)
-    :param sensor_noise_std: Standard deviation of the noise of both components of the yaw.
+    :param tolerance: Angle in rad between part and slot that the slot tolerates. This angle determines the width of
+        the chamfer. (Below 0.01 rad the slot tolerates larger angles than this, because of its clearance.)
+    :param sensor_noise_std: Standard deviation of the noise on each of the two components of the yaw.
     :param horizon: Number of squeezes T.
-    :param n_processes: Number of processes that share a batch; the results are the same.
+    :param n_processes: Number of processes that share a batch. This number does not change the results.
     :param render_mode: ``None`` or ``"rgb_array"``.
-    :raises ValueError: for a keyword out of its range.
+    :raises ValueError: if a keyword is out of its range.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -76,7 +75,7 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
             " m: else a jaw may come down on the part",
         )
         self.n_processes = checks.count("n_processes", n_processes)
-        self._film: list[Configuration] = []  # of the last step, if there is a render_mode
+        self._film: list[Configuration] = []  # the last step, recorded only with a render_mode
 
     def _make_world(self) -> tuple[Any, ...]:
         return SqueezeSimulation, self.scene
@@ -102,7 +101,7 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
         return self._with_yaw(np.array([outcome.yaw for outcome in outcomes]), state[:, 2:])
 
     def step_batch(self, state: np.ndarray, action: np.ndarray, *, is_last: bool) -> BatchStep:
-        """Squeeze N parts, and after the last squeeze press them into the slot; see :class:`POMDPEnv`."""
+        """Squeeze N parts; after the last squeeze, press them into the slot. See :class:`POMDPEnv`."""
         step = super().step_batch(state, action, is_last=is_last)
         if not is_last:
             return step

@@ -1,4 +1,4 @@
-"""The scenes of the arm from the side, for pictures, videos and PyBullet's window; never an observation."""
+"""Draw the scenes of the arm from the side, for pictures, videos and PyBullet's window (no observations)."""
 
 import os
 from collections.abc import Callable
@@ -21,12 +21,13 @@ NEAREST, FURTHEST = 0.30, 0.61  # m, white and black in the picture of the depth
 
 class ArmView(BulletWorld):
     """
-    Floor, table and robot in a Bullet world of their own, without physics.
+    Draw floor, table and robot, which are in their own Bullet world without physics.
 
-    :param load_robot: Loads it into the world, and returns its body's id.
+    :param load_robot: Function that loads the robot into the world and returns the id of its body.
     """
 
-    # Of the camera: its target in m; its distance from it in m, yaw and pitch in degrees; the least depth in m.
+    # The camera: its target in m; its distance from the target in m, with yaw and pitch in degrees; the smallest depth
+    # that is drawn, in m.
     middle: tuple[float, float, float]
     viewpoint: tuple[float, float, float]
     near = 0.1
@@ -52,7 +53,7 @@ class ArmView(BulletWorld):
 
 
 class PandaView(ArmView):
-    """Robot, table and mug."""
+    """Draw robot, table and mug."""
 
     middle = (0.38, 0.0, 0.2)
     viewpoint = (0.82, 145.0, -18.0)  # robot, mug and handle are visible
@@ -62,7 +63,8 @@ class PandaView(ArmView):
         client = self.client
         self._mug = add_mug_picture(client, scene)
         self._scene = scene
-        # TinyRenderer draws no shadow on the table; without one, the picture does not show whether the mug is lifted.
+        # A disc is the mug's shadow, because TinyRenderer draws none on the table. Without a shadow the picture does
+        # not show whether the mug is lifted.
         shadow = client.createVisualShape(
             client.GEOM_CYLINDER, radius=scene.mug_radius, length=0.001, rgbaColor=SHADOW_COLOR, specularColor=[0, 0, 0]
         )
@@ -83,7 +85,7 @@ class PandaView(ArmView):
 
 
 class SqueezeView(ArmView):
-    """Robot, table, part and slot."""
+    """Draw robot, table, part and slot."""
 
     middle = (0.5, 0.085, 0.06)
     viewpoint = (0.46, 150.0, -30.0)
@@ -102,6 +104,6 @@ class SqueezeView(ArmView):
 
 
 def depth_picture(depth: np.ndarray) -> np.ndarray:
-    """Draw a depth image, ``(1, H, W)`` in m, as a grey one, ``(H, W, 3)`` uint8; near points are bright."""
+    """Convert a depth image, ``(1, H, W)`` in m, to a grey image, ``(H, W, 3)`` uint8, with bright near points."""
     brightness = np.clip((FURTHEST - depth[0]) / (FURTHEST - NEAREST), 0.0, 1.0)
     return np.rint(255 * brightness).astype(np.uint8)[..., None].repeat(3, axis=2)

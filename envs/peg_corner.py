@@ -1,4 +1,4 @@
-"""Push a peg into the corner of a fence, then move blindly into the hole: a mechanical funnel in two dimensions."""
+"""Push a peg into the corner of a fence, then move it over a hole: a mechanical funnel in two dimensions."""
 
 from typing import Any
 
@@ -16,27 +16,27 @@ HOLE = np.array([1.2, 1.2])  # cm
 
 class PegCornerEnv(POMDPEnv):
     r"""
-    Bring a peg, which slides on a fenced table, over a hole near one corner.
+    Slide a peg on a fenced table over a hole near one corner.
 
-    State ``x = (x, y)``: position on a table of 6 cm by 6 cm, which starts uniformly in [2, 6]^2 cm. Action ``u``: the
-    displacement, at most ``max_action`` in each direction. The fence stops the peg; where a displacement would lead
-    beyond one side by ``b``, friction takes :math:`\mu b` off the component along that side. With
+    State ``x = (x, y)``: position of the peg on a table of 6 cm by 6 cm. It starts uniformly in [2, 6]^2 cm. Action
+    ``u``: the displacement, at most ``max_action`` in each direction. The fence stops the peg. If a displacement would
+    cross one side by a distance ``b``, friction subtracts :math:`\mu b` from the component along that side. With
     :math:`d_t = \lVert x_t - g \rVert`, ``g = (1.2, 1.2)`` cm, and T = 4 controls,
 
     .. math::
         c_t = d_t, \qquad c_T = 30 \max(0, d_T - \text{tolerance}).
 
-    A policy that looks can go to the hole; one that does not look can push the peg into the corner with three moves,
-    wherever it was, and go on to the hole with the fourth.
+    A policy that uses the sensor can move the peg straight to the hole. An open-loop policy can push the peg into the
+    corner with three moves from any start, and move it to the hole with the fourth.
 
-    :param friction: Coefficient :math:`\mu` of the fence.
-    :param tolerance: Distance from the hole that costs nothing at the end, in cm.
+    :param friction: Friction coefficient :math:`\mu` of the fence.
+    :param tolerance: Distance from the hole up to which the terminal cost is zero, in cm.
     :param sensor_noise_std: Standard deviation of the sensor noise in cm.
     :param max_action: The longest displacement in each direction, in cm.
-    :param actuator_gain: The displacements are this many times the action.
+    :param actuator_gain: Factor between the action and the displacement.
     :param horizon: Number of controls T.
     :param render_mode: ``None`` or ``"rgb_array"``.
-    :raises ValueError: for a keyword out of its range.
+    :raises ValueError: if a keyword is out of its range.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
@@ -70,7 +70,7 @@ class PegCornerEnv(POMDPEnv):
         move = self.actuator_gain * action
         aim = state + move
         beyond = np.abs(aim - np.clip(aim, 0.0, SIZE))
-        # The push against one side brakes the motion along it, which is the other component.
+        # A push against one side slows the motion along this side, which is the other component.
         move = np.sign(move) * np.maximum(0.0, np.abs(move) - self.friction * beyond[:, ::-1])
         return np.clip(state + move, 0.0, SIZE)
 

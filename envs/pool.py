@@ -1,4 +1,4 @@
-"""Work of a batch that several processes share: grasps, images."""
+"""Share the work of a batch, such as grasps or images, among several processes."""
 
 import multiprocessing
 import os
@@ -17,18 +17,18 @@ import numpy as np
 
 from .base import POMDPEnv
 
-SHARES = 8  # parts of a batch for each process, so that all end at about the same time
+SHARES = 8  # number of parts of a batch per process; small parts let all processes end at about the same time
 
 
 class WorkPool:
     """
-    Share a batch among several processes with one worker each; the results are the same bit for bit.
+    Share a batch among several processes with one worker each; the results are bit for bit those of one process.
 
-    The processes ignore Ctrl-C and end with this one. If one dies, the next call raises
+    The processes ignore Ctrl-C and end when this process ends. If one of them dies, the next call raises
     :class:`concurrent.futures.process.BrokenProcessPool`.
 
     :param n_processes: Number of processes.
-    :param make_worker: Called once in each process, for instance a class.
+    :param make_worker: Class or function that makes a worker. Each process calls it once.
     :param arguments: Arguments of ``make_worker``.
     """
 
@@ -42,11 +42,11 @@ class WorkPool:
         )
 
     def call(self, method: str, *arrays: np.ndarray) -> Any:
-        """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the arrays or lists."""
+        """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the results."""
         n_parts = min(len(arrays[0]), SHARES * self._n_processes)
         parts = [np.array_split(array, n_parts) for array in arrays]
         with warnings.catch_warnings():
-            # Python 3.12 warns of PyTorch's threads in a forked process; these processes do not call PyTorch.
+            # Python 3.12 warns about PyTorch's threads in a forked process, but these processes do not call PyTorch.
             warnings.filterwarnings("ignore", message=".*multi-threaded.*fork.*", category=DeprecationWarning)
             results = list(self._executor.map(_call, repeat(method), *parts))
         return np.concatenate(results) if isinstance(results[0], np.ndarray) else list(chain(*results))
@@ -57,13 +57,13 @@ class WorkPool:
 
 
 class SharedEnv(POMDPEnv):
-    """An environment in which an object, such as a Bullet world, does the work of a batch; processes may share it."""
+    """Base class of environments that compute a batch with objects, such as Bullet worlds, in one or more processes."""
 
     shares_work = True
     resources = frozenset({"_world", "_pool", "_view"})
     n_processes: int
 
-    # Worlds are made at their first use, and so in the process that uses them.
+    # A world is created at its first use, in the process that uses it.
 
     @abstractmethod
     def _make_world(self) -> tuple[Any, ...]:
@@ -80,26 +80,26 @@ class SharedEnv(POMDPEnv):
         return WorkPool(self.n_processes, *self._make_world())
 
     def _shared(self, method: str, *arrays: np.ndarray, **here: Any) -> Any:
-        """Call a method with arrays of N episodes, in several processes, or with further keywords in this one."""
+        """Call a method with arrays of N episodes in the pool, or in this process with the keywords ``here``."""
         self.check_open()
         if self.n_processes > 1 and len(arrays[0]) > 1:
             return self._pool.call(method, *arrays)
         return getattr(self._world, method)(*arrays, **here)
 
 
-_worker: Any  # of a process of a pool
+_worker: Any  # the worker of this process, if it belongs to a pool
 
 
 def _begin(parent: int, make_worker: Callable[..., Any], *arguments: Any) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a handler of the parent is forked with it
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the fork has copied the parent's handler
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     _worker = make_worker(*arguments)
 
 
 def _end_with(parent: int) -> None:
-    """End this process once its parent is gone: a parent that was killed has not shut its pool down."""
+    """End this process once its parent is gone, because a killed parent does not shut down its pool."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Every training and test variant of the paper, as data: a table's row is a :class:`Scenario`."""
+"""The training and test variants of the paper as data: each row of a table is a :class:`Scenario`."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from .textures import TEST_TEXTURES
 LAVA_TABLE_READING: Mapping[str, Any] = MappingProxyType(
     dict(action_cost=1.0, lava_stage_cost=3.0, lava_terminal_cost=300.0)
 )
-"""Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv`: the cost definition that fits Table I better than the text."""
+"""Keywords of :class:`~sb3_tdpg.envs.lava.LavaEnv`: the cost definition that fits Table I better than the text does."""
 
 BALL_PUBLISHED_READING: Mapping[str, Any] = MappingProxyType(dict(control_gain=0.1, gravity=9.8, horizon=24))
 """
-Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` that fit Table II better than the paper's text. In the 24
-controls of this definition the ball flies from 8.0 m to 0.8 m.
+Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` that fit Table II better than the paper's text does. In the
+24 controls of this definition the ball flies from 8.0 m to 0.8 m.
 """
 
 BALL_VARYING_LAUNCH: Mapping[str, Any] = MappingProxyType(
     dict(ball_start_range=((7.0, 1.0), (9.0, 1.0)), ball_speed_range=((-5.0, 7.85), (-4.0, 7.85)))
 )
 """
-Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` for a launch that varies (not in the paper): the ball lands
-between -1.3 m and 2.3 m, so that the robot must see it. With the paper's fixed launch it needs only its own position.
+Keywords of :class:`~sb3_tdpg.envs.ball_catch.BallCatchEnv` for a varying launch (not in the paper). The ball lands
+between -1.3 m and 2.3 m, so that the robot must see the ball. With the paper's fixed launch the robot needs only its
+own position.
 """
 
 
 @dataclass(frozen=True)
 class PaperResult:
     """
-    The paper's numbers in a row of a table.
+    The paper's numbers in one row of a table.
 
     :param mean: Mean cost over episodes.
-    :param std: Standard deviation of the cost over episodes; ``None`` where the paper has none (Table II).
-    :param distance: Mean distance between robot and ball at the end, in m (Table II only).
+    :param std: Standard deviation of the cost over episodes; ``None`` if the paper does not report it (Table II).
+    :param distance: Mean distance between robot and ball at the end, in m (only in Table II).
     """
 
     mean: float
@@ -50,12 +51,12 @@ class Scenario:
     """
     One row of a results table: a variant of an environment.
 
-    :param name: The row's title.
+    :param name: Title of the row.
     :param env_id: A registered Gymnasium id.
     :param env_kwargs: Keywords of the environment's constructor.
     :param paper: The paper's numbers by method ("PG", "TDPG").
-    :param sensor: A wrapper of an SB3 ``VecEnv`` that changes what the sensor shows.
-    :param n_episodes: Episodes of this row; default: those of the table.
+    :param sensor: A wrapper of an SB3 ``VecEnv`` that changes the observations.
+    :param n_episodes: Number of episodes for this row; default: the number for the table.
     """
 
     name: str
@@ -66,7 +67,7 @@ class Scenario:
     n_episodes: int | None = None
 
     def with_kwargs(self, **env_kwargs: Any) -> Scenario:
-        """Return the same row with further keywords (the row's own win)."""
+        """Return a copy of the row with additional keywords; the row's own keywords have priority."""
         return replace(self, env_kwargs={**env_kwargs, **self.env_kwargs})
 
 
@@ -90,8 +91,8 @@ def _ball(name: str, pg: tuple[float, float], tdpg: tuple[float, float], **env_k
     return Scenario(name, "BallCatch-v0", env_kwargs, paper)
 
 
-# Table II: cost and final distance of PG, then of TDPG. The textures are ours: seven other hues and patterns than the
-# training brick, the last one reddish, too.
+# Table II: cost and final distance of PG, then of TDPG. The textures are ours. Their hues and patterns differ from the
+# training brick, except that the last one is also reddish.
 BALL_CATCH: tuple[Scenario, ...] = (
     _ball("Training", (8.702, 0.085), (18.577, 0.184)),
     _ball("Sensor noise 0.10", (19.12, 0.189), (19.48, 0.193), pixel_noise_std=0.10),
@@ -103,19 +104,19 @@ BALL_CATCH: tuple[Scenario, ...] = (
     _ball("Test background 3", (138.7, 1.385), (26.62, 0.264), texture=TEST_TEXTURES[2]),
     _ball("Test background 4", (95.38, 0.952), (28.11, 0.279), texture=TEST_TEXTURES[3]),
     _ball("Test background 5", (82.01, 0.818), (36.95, 0.367), texture=TEST_TEXTURES[4]),
-    # 0.166 m cannot cost 166.4: the paper probably means 1.66 m.
+    # A distance of 0.166 m cannot cost 166.4: the paper probably means 1.66 m.
     _ball("Test background 6", (208.5, 2.083), (166.4, 0.166), texture=TEST_TEXTURES[5]),
     _ball("Test background 7", (9.180, 0.090), (14.92, 0.147), texture=TEST_TEXTURES[6]),
 )
 
-# Does a policy use the ball or the wall? Not in the paper.
+# Scenarios that show whether a policy uses the ball or the wall (not in the paper).
 BALL_CATCH_DIAGNOSIS: tuple[Scenario, ...] = (
     Scenario("Ball and wall", "BallCatch-v0"),
     Scenario("Ball hidden", "BallCatch-v0", dict(ball_radius=1e-3)),
     Scenario("Wall stands still", "BallCatch-v0", dict(wall_stands_still=True)),
 )
 
-# The same rows with a launch that varies; not in the paper.
+# The rows of Table II with the varying launch (not in the paper).
 BALL_CATCH_VARYING_LAUNCH: tuple[Scenario, ...] = tuple(
     Scenario(row.name, row.env_id, {**BALL_VARYING_LAUNCH, **row.env_kwargs}) for row in BALL_CATCH
 )
@@ -135,10 +136,10 @@ PANDA_GRASP: tuple[Scenario, ...] = (
 PANDA_CAMERA: Mapping[str, Any] = MappingProxyType(dict(camera_range=(-0.03, 0.03)))
 """
 Keywords of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv` for a camera whose height varies from trial to trial (not
-in the paper): it changes every depth in the image, but not the best grasp.
+in the paper). The height changes every depth in the image, but not the best grasp.
 """
 
-# The heights of the training, twice their range, and the height of Table III.
+# Camera heights: the training range, twice this range, and the fixed height of Table III.
 PANDA_GRASP_CAMERA: tuple[Scenario, ...] = (
     Scenario("Training", "PandaGrasp-v0", dict(PANDA_CAMERA)),
     Scenario("Twice the range", "PandaGrasp-v0", dict(camera_range=(-0.06, 0.06))),
@@ -149,11 +150,11 @@ PANDA_SQUEEZE: Mapping[str, Any] = MappingProxyType(dict(turn=(0.995, 0.999), ba
 """
 Keywords of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv` that fit the squeezes of
 :class:`~sb3_tdpg.envs.panda_squeeze.PandaSqueezeEnv`, by :func:`~sb3_tdpg.envs.squeeze_fit.fit_squeeze` with 720
-squeezes. The model's error has a root mean square of 0.2 degrees (at most 0.7) for the parts that turn. It does not
-have the 6 % of the yaws, between 62.6 and 67.4 degrees from the jaws, at which friction holds the part as it is.
+squeezes. For the parts that turn, the model's error has a root mean square of 0.2 degrees and is at most 0.7 degrees.
+The model neglects that friction holds the part at 6 % of the yaws, between 62.6 and 67.4 degrees from the jaws.
 """
 
 PAPER_ROWS: Mapping[str, Sequence[Scenario]] = MappingProxyType(
     {"Lava-v0": LAVA, "BallCatch-v0": BALL_CATCH, "PandaGrasp-v0": PANDA_GRASP}
 )
-"""The rows of the paper's table, by environment."""
+"""The rows of the paper's table for each environment id."""

@@ -1,4 +1,4 @@
-"""The simulation of a squeeze: PyBullet moves the arm down, closes the jaws on the part, opens them, and moves up."""
+"""Simulate a squeeze with PyBullet: move the arm down, close the jaws on the part, open them, and move up."""
 
 import math
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ from .squeeze_scene import (
 
 SOLVER_ITERATIONS = 50
 TABLE_FRICTION = 0.3  # between table and part
-GEAR_FORCE = 100.0  # N, of the gear that couples the fingers
-JAW_ABOVE_TABLE = 0.002  # m, during the squeeze
-HOVER = 0.045  # m, above the pose of the squeeze: the jaws are above the part
-ABOVE_SLOT = 0.002  # m, between the part on the slot and the jaws before the insertion
-PRESS_FORCE = 20.0  # N, at which the insertion ends; harder, a part that does not fit is turned until it does
-INSERTED = 0.003  # m, above the table: an inserted part is lower
-SLOWEST = 0.02  # rad/s, of a joint that has hardly any way to go
+GEAR_FORCE = 100.0  # N, force of the gear that couples the fingers
+JAW_ABOVE_TABLE = 0.002  # m, height of the jaws during the squeeze
+HOVER = 0.045  # m, lift above the pose of the squeeze, so that the jaws are above the part
+ABOVE_SLOT = 0.002  # m, gap between the part on the slot and the jaws before the insertion
+PRESS_FORCE = 20.0  # N, at which the insertion ends: more force would turn a part that does not fit until it fits
+INSERTED = 0.003  # m: an inserted part is below this height
+SLOWEST = 0.02  # rad/s, lowest speed of a joint
 
 APPROACH = Phase(80, 1.0, 0.2)
 CLOSE = Phase(240, 1.0, 0.1)
@@ -51,17 +51,17 @@ INSERT = Phase(240, 0.05, 0.2)
 
 
 class Squeezed(NamedTuple):
-    """What a squeeze leaves."""
+    """The pose of a part after a squeeze."""
 
-    yaw: float  # of the part, in rad; modulo pi it does not matter
-    offset: tuple[float, float]  # m, of the part's middle from the hand's, in the table's axes
+    yaw: float  # rad; half a turn does not change the part
+    offset: tuple[float, float]  # m, from the middle of the hand to the middle of the part, in the table's axes
     tilt: float  # rad, between the part's vertical axis and the vertical
 
 
 class Inserted(NamedTuple):
-    """What a push into the slot leaves."""
+    """The pose of a part after the push into the slot."""
 
-    height: float  # m, of the middle of the part's lower side above the table
+    height: float  # m, height of the middle of the part's lower side above the table
     yaw: float  # rad
 
     @property
@@ -72,9 +72,9 @@ class Inserted(NamedTuple):
 
 class SqueezeSimulation(ArmSimulation):
     """
-    Robot, table, part and slot in a Bullet world of their own, without visual shapes of the robot.
+    Simulate squeezes: robot, table, part and slot in their own Bullet world, in which the robot has no visual shapes.
 
-    Every squeeze sets all positions and velocities, so that its outcome is a function of its arguments alone.
+    Every squeeze sets all positions and velocities, so that its outcome depends only on its arguments.
     """
 
     _still = 0.001
@@ -85,13 +85,13 @@ class SqueezeSimulation(ArmSimulation):
         self._robot = load_robot(client, flags=self._unseen)
         self._slot = add_slot(client, scene)
         self._body = add_part(client)
-        # Bullet multiplies the coefficients of two bodies that touch; the part's is 1.
+        # Bullet multiplies the friction coefficients of two bodies that touch, so the part's coefficient is 1.
         client.changeDynamics(self._body, -1, lateralFriction=1.0, spinningFriction=0.0, rollingFriction=0.0)
         client.changeDynamics(self._table, -1, lateralFriction=TABLE_FRICTION)
         client.changeDynamics(self._slot, -1, lateralFriction=scene.friction)
         for finger in FINGER_JOINTS:
             client.changeDynamics(self._robot, finger, lateralFriction=scene.friction, spinningFriction=0.0)
-        # The Panda's fingers move together; PyBullet ignores the `mimic` of its file.
+        # The two fingers of a Panda move together, but PyBullet ignores the `mimic` entry in the robot's file.
         gear = client.createConstraint(
             self._robot, FINGER_JOINTS[0], self._robot, FINGER_JOINTS[1],
             client.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0),
@@ -103,8 +103,8 @@ class SqueezeSimulation(ArmSimulation):
         self._slot_low, self._slot_high = self._solve(SLOT_PLACE, press, press + SLOT_HEIGHT + ABOVE_SLOT)
 
     def _solve(self, place: tuple[float, float], *heights: float) -> list[Joints]:
-        """Return the joints of the arm with the jaws along x for each height of the hand."""
-        # Of the two yaws of the hand with the jaws along x, this one is in the middle of the wrist's range.
+        """Return the joint angles of the arm for each height of the hand, with the jaws along x."""
+        # Two yaws of the hand put the jaws along x; this one is in the middle of the wrist's range.
         down = self.client.getQuaternionFromEuler((math.pi, 0.0, 0.0))
         joints = HOME
         solutions = []
@@ -117,9 +117,9 @@ class SqueezeSimulation(ArmSimulation):
 
     def _turned(self, yaw: float) -> tuple[Joints, Joints]:
         """
-        Return the joints of the squeeze and above it for a yaw of the jaws.
+        Return the joint angles for a yaw of the jaws, at the squeeze and above it.
 
-        The hand's axis is vertical, so that the last joint alone turns it; half a turn does not change the jaws.
+        The hand's axis is vertical, so that only the last joint turns the hand. Half a turn does not change the jaws.
         """
         wanted = self._low[6] - yaw
         turn = (wanted + math.pi / 2) % math.pi - math.pi / 2 - self._low[6]
@@ -130,9 +130,9 @@ class SqueezeSimulation(ArmSimulation):
         Squeeze a part once.
 
         :param yaw: Yaw of the part, in rad.
-        :param jaws: Their yaw, in rad.
+        :param jaws: Yaw of the jaws, in rad.
         :param offset: Vector from the middle of the hand to the part, in m, in the table's axes.
-        :param watch: Called 30 times a second; it does not change the outcome.
+        :param watch: Function that is called 30 times per simulated second; it does not change the outcome.
         """
         self._watch = watch
         x, y = WORK_PLACE
@@ -150,9 +150,9 @@ class SqueezeSimulation(ArmSimulation):
 
     def insert(self, yaw: float, watch: Watch | None = None) -> Inserted:
         """
-        Press a part into the slot: it lies on the mouth, and the closed jaws come down on it.
+        Press a part, which lies on the mouth of the slot, into the slot with the closed jaws.
 
-        :param yaw: Between part and slot, in rad.
+        :param yaw: Angle between part and slot, in rad.
         :param watch: As in :meth:`squeeze`.
         """
         self._watch = watch
@@ -166,12 +166,12 @@ class SqueezeSimulation(ArmSimulation):
     def squeezes(
         self, yaws: np.ndarray, jaws: np.ndarray, offsets: np.ndarray, watch: Watch | None = None
     ) -> list[Squeezed]:
-        """Squeeze N parts: arrays ``(N,)``, ``(N,)`` and ``(N, 2)``; see :meth:`squeeze`."""
+        """Squeeze N parts; the arrays are ``(N,)``, ``(N,)`` and ``(N, 2)``. See :meth:`squeeze`."""
         given = zip(yaws.tolist(), jaws.tolist(), offsets.tolist(), strict=True)
         return [self.squeeze(yaw, jaw, (x, y), watch) for yaw, jaw, (x, y) in given]
 
     def inserts(self, yaws: np.ndarray, watch: Watch | None = None) -> list[Inserted]:
-        """Press N parts into the slot: ``(N,)``; see :meth:`insert`."""
+        """Press N parts with the given yaws, ``(N,)``, into the slot. See :meth:`insert`."""
         return [self.insert(yaw, watch) for yaw in yaws.tolist()]
 
     def at_rest(self, yaw: float) -> Configuration:
@@ -180,13 +180,13 @@ class SqueezeSimulation(ArmSimulation):
         return Configuration((*self._high, FINGER_OPEN, FINGER_OPEN), (*WORK_PLACE, PART[2] / 2), upright)
 
     def _speeds(self, phase: Phase, joints: Joints) -> Sequence[float]:
-        # All joints arrive together: otherwise the hand would swerve by some millimetres on its way down.
+        # All joints arrive at the same time. Otherwise the hand would leave the vertical by some millimetres.
         ways = [abs(state[0] - goal) for state, goal in zip(self._states(ARM_JOINTS), joints, strict=True)]
         longest = max(*ways, NEAR_TARGET)
         return [max(phase.arm_speed * way / longest, SLOWEST) for way in ways]
 
     def _put_part(self, position: tuple[float, ...], yaw: float) -> None:
-        """Put the part somewhere; the arm must be put somewhere after this."""
+        """Put the part at a position. After this call, the arm must be put at a position, too."""
         self._clear_contacts()
         self._put_body(position, yaw)
 
@@ -197,7 +197,7 @@ class SqueezeSimulation(ArmSimulation):
         return self._pose()[0][2] - PART[2] / 2 < INSERTED
 
     def _presses_hard(self) -> bool:
-        """Return whether the hand presses on the part with the force at which it gives up."""
+        """Return whether the hand presses on the part with more than ``PRESS_FORCE``."""
         return sum(point[9] for point in self.client.getContactPoints(self._robot, self._body)) > PRESS_FORCE
 
     def _pose(self) -> Pose:

@@ -12,20 +12,20 @@ import numpy as np
 from .panda_squeeze import PandaSqueezeEnv
 from .squeeze_insert import RIGHT_ANGLE, wrap
 
-NEAR = math.radians(3.0)  # a part that is nearer to the jaws, or to lying across them, has been turned
-FAR = math.radians(20.0)  # a part that starts nearer to its rest says little about the share of the way
+NEAR = math.radians(3.0)  # a part within this angle of the jaws, or of lying across them, has been turned
+FAR = math.radians(20.0)  # a part that starts within this angle of its final yaw says little about `turn`
 
 
 class SqueezeFit(NamedTuple):
-    """Keywords of SqueezeInsert-v0, and how well they describe PyBullet's squeezes; angles in rad."""
+    """Fitted keywords of SqueezeInsert-v0, and their errors against PyBullet's squeezes; angles in rad."""
 
-    turn: tuple[float, float]  # 5 % and 95 % quantile of the share of the way that a squeeze turns the part
-    basin: float  # middle of the gap between the two
-    aligned_up_to: float  # largest angle between part and jaws at which the part turned towards them
-    across_from: float  # smallest angle at which it turned across them
-    stuck: float  # share of the parts that a squeeze turned neither way
-    residual: float  # root mean square of the error of the model with the mean turn, without the stuck parts
-    worst: float  # largest error of the same
+    turn: tuple[float, float]  # 5 % and 95 % quantiles of the fraction of the way that a squeeze turns the part
+    basin: float  # middle of the gap between aligned_up_to and across_from
+    aligned_up_to: float  # largest angle between part and jaws at which the part turned towards the jaws
+    across_from: float  # smallest angle between part and jaws at which the part turned across the jaws
+    stuck: float  # fraction of the parts that a squeeze turned neither way
+    residual: float  # root mean square error of the model with the mean turn, without the stuck parts
+    worst: float  # largest error of this model, without the stuck parts
 
 
 def fit_squeeze(env: PandaSqueezeEnv, n: int = 720, seed: int = 0) -> SqueezeFit:
@@ -33,7 +33,7 @@ def fit_squeeze(env: PandaSqueezeEnv, n: int = 720, seed: int = 0) -> SqueezeFit
     Squeeze parts in PyBullet, and fit ``turn`` and ``basin``.
 
     :param env: The environment whose squeezes are to be fitted.
-    :param n: Number of squeezes: the angles between part and jaws are a grid in (-pi/2, pi/2), the yaws of the jaws
+    :param n: Number of squeezes. The angles between part and jaws form a grid in (-pi/2, pi/2); the yaws of the jaws
         are uniform.
     :param seed: Seed of the yaws of the jaws and of the centring errors.
     """
@@ -50,8 +50,8 @@ def fit_angles(away: np.ndarray, left: np.ndarray) -> SqueezeFit:
     """
     Fit ``turn`` and ``basin`` to angles between part and jaws.
 
-    :param away: Before a squeeze, ``(N,)`` in rad.
-    :param left: After it, ``(N,)`` in rad.
+    :param away: Angles before a squeeze, ``(N,)`` in rad.
+    :param left: Angles after the squeeze, ``(N,)`` in rad.
     :raises ValueError: if no part turned towards the jaws, or none across them.
     """
     is_aligned, is_across = np.abs(left) < NEAR, np.abs(left) > RIGHT_ANGLE - NEAR
@@ -61,7 +61,7 @@ def fit_angles(away: np.ndarray, left: np.ndarray) -> SqueezeFit:
     rest = np.where(is_aligned, 0.0, np.sign(away) * RIGHT_ANGLE)
     is_turned = is_aligned | is_across
     far = is_turned & (np.abs(rest - away) > FAR)
-    # Beyond its rest a part has been turned as far as it would go: the share is at most 1.
+    # The absolute values keep the fraction at 1 or below, also for a part that turned beyond its final yaw.
     share = 1 - np.abs(wrap(rest - left))[far] / np.abs(rest - away)[far]
     low, high = np.quantile(share, [0.05, 0.95]).tolist()
     predicted = away + (low + high) / 2 * (rest - away)
@@ -78,7 +78,7 @@ def fit_angles(away: np.ndarray, left: np.ndarray) -> SqueezeFit:
 
 
 def main() -> None:
-    """Print the fit of the environment's defaults."""
+    """Print the fit to the default PandaSqueeze-v0."""
     env = PandaSqueezeEnv()
     fit = fit_squeeze(env)
     env.close()

@@ -21,33 +21,34 @@ def wrap(angle: np.ndarray) -> np.ndarray:
 
 class SqueezeInsertEnv(POMDPEnv):
     r"""
-    Turn a rectangular part with the fingers of a gripper, then push it into a slot that is hardly wider.
+    Turn a rectangular part with the fingers of a gripper, then push it into a slot that is only slightly wider.
 
-    The part lies on a table with the unknown yaw :math:`\theta`. The action is the yaw ``u`` of a parallel gripper,
-    which closes: a part within ``basin`` of the fingers turns towards them, any other part until it lies across
-    them. Let :math:`r = \theta_t - u_t`, wrapped to a half turn; then
+    The part lies on a table with an unknown yaw :math:`\theta`. The action is the yaw ``u`` at which a parallel gripper
+    closes. A part whose angle to the fingers is below ``basin`` turns towards the fingers; any other part turns until
+    it lies across them. With :math:`r = \theta_t - u_t`, wrapped to a half turn,
 
     .. math::
         \theta_{t+1} = \theta_t + \alpha_t (r^* - r), \qquad
         r^* = 0 \text{ if } |r| < \text{basin, else } \operatorname{sgn}(r)\, \pi/2, \qquad
         \alpha_t \sim U[\text{turn}].
 
-    With :math:`e_t` the angle between the part and the slot, in rad, the cost is :math:`c_t = 5 |e_t|` and at
-    the end, when the part is inserted, :math:`c_T = 100 \max(0, |e_T| - \text{tolerance})`. A policy that looks at
-    the part can turn it at once; one that does not look can squeeze twice, across and then along.
+    Let :math:`e_t` be the angle between the part and the slot in rad. Each step costs :math:`c_t = 5 |e_t|`, and the
+    insertion at the end costs :math:`c_T = 100 \max(0, |e_T| - \text{tolerance})`. A policy that uses the sensor can
+    turn the part directly. An open-loop policy can squeeze twice, first across the slot and then along it.
 
-    State ``(sin 2 theta, cos 2 theta)``, and with a cue the kind of the part, -1 or 1; observation: the state with
-    noise on the first two.
+    The state is ``(sin 2 theta, cos 2 theta)``, and with a cue also the kind of the part, -1 or 1. The observation is
+    the state with noise on the first two components.
 
     :param cue: Whether the kind of the part decides how it must lie: along the slot (1) or across it (-1). Without a
         cue every part must lie along the slot.
-    :param turn: ``(low, high)``: the share of the way that a squeeze turns the part, drawn uniformly for each squeeze.
-    :param basin: The largest angle between part and fingers, in rad, at which the part turns towards them.
-    :param tolerance: Angle in rad that the slot forgives.
-    :param sensor_noise_std: Standard deviation of the noise of both components of the yaw.
+    :param turn: ``(low, high)``: range of :math:`\alpha_t`, the fraction of the way to :math:`r^*` that a squeeze turns
+        the part. The fraction is drawn uniformly for each squeeze.
+    :param basin: The largest angle between part and fingers, in rad, at which the part turns towards the fingers.
+    :param tolerance: Angle in rad between part and slot up to which the insertion costs nothing.
+    :param sensor_noise_std: Standard deviation of the noise on each of the two components of the yaw.
     :param horizon: Number of squeezes T.
     :param render_mode: ``None`` or ``"rgb_array"``.
-    :raises ValueError: for a keyword out of its range.
+    :raises ValueError: if a keyword is out of its range.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
@@ -97,7 +98,7 @@ class SqueezeInsertEnv(POMDPEnv):
         return self._with_yaw(yaw, kind)
 
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        self._fingers = float(action[0, 0]) if len(action) == 1 else None  # a batch has many grippers
+        self._fingers = float(action[0, 0]) if len(action) == 1 else None  # render() draws only one gripper
         yaw = self.yaw(state)
         away = wrap(yaw - action[:, 0])
         rest = np.where(np.abs(away) < self.basin, 0.0, np.sign(away) * RIGHT_ANGLE)

@@ -1,7 +1,7 @@
 """
-The squeezing scene as data, for the simulation and for the pictures: a part, two jaws and a slot.
+The squeezing scene as data, which the simulation and the pictures use: a part, two jaws and a slot.
 
-Coordinates as in :mod:`.panda_scene`: the robot stands at the origin and looks along +x, the table's top is z = 0.
+Coordinates are as in :mod:`.panda_scene`: the robot is at the origin and looks along +x. The table's top is at z = 0.
 Lengths are in metres, angles in radians.
 """
 
@@ -17,14 +17,15 @@ import numpy as np
 from .bullet import BulletClient
 from .panda_scene import ROBOT_FILE
 
-# Without friction a part turns to the jaws from up to atan(length / width), here 65 degrees, away (Goldberg, "Orienting
-# polygonal parts without sensors", 1993). Its diagonal, 66 mm, is shorter than the opening of the jaws, 77 mm.
+# Without friction a part turns towards the jaws from angles of up to atan(length / width), here 65 degrees (Goldberg,
+# "Orienting polygonal parts without sensors", 1993). The part's diagonal (66 mm) is shorter than the opening of the
+# jaws (77 mm).
 PART = (0.060, 0.028, 0.030)  # length, width, height
 PART_MASS = 0.1  # kg
 PART_COLOR = (0.92, 0.51, 0.12, 1.0)
 
-# Each finger carries a jaw, a plate that is longer than the part. The finger's pad is curved by a millimetre; the jaw's
-# face is in front of it.
+# Each finger carries a jaw, a plate that is longer than the part. The jaw's face is in front of the finger's pad, which
+# is curved by a millimetre.
 JAW = (0.090, 0.008, 0.030)  # along the face, thickness, height
 JAW_BEFORE_PAD = 0.0015
 JAW_BELOW_FINGER = 0.004  # the jaw ends below the fingertip
@@ -33,7 +34,7 @@ FINGERTIP_IN_FINGER = 0.0539  # from the origin of the finger's link
 
 WORK_PLACE = (0.5, 0.0)  # where the parts are squeezed
 SLOT_PLACE = (0.5, 0.18)
-SLOT_CLEARANCE = 0.0003  # between part and slot, on each side
+SLOT_CLEARANCE = 0.0003  # gap between part and slot on each side
 SLOT_HEIGHT = 0.020
 SLOT_RIM = 0.012  # width of the walls around the mouth
 SLOT_COLOR = (0.42, 0.44, 0.48, 1.0)
@@ -42,7 +43,7 @@ SLOT_COLOR = (0.42, 0.44, 0.48, 1.0)
 @dataclass(frozen=True)
 class SqueezeScene:
     """
-    Part, jaws and slot. The slot lies along x.
+    The part, the jaws and the slot, which lies along x.
 
     The parameters are those of :class:`~sb3_tdpg.envs.panda_squeeze.PandaSqueezeEnv`.
     """
@@ -53,23 +54,23 @@ class SqueezeScene:
     @property
     def chamfer(self) -> float:
         """
-        Width of the chamfer, on each side of the slot.
+        Width of the chamfer on each side of the slot.
 
-        The corners of a part that is turned by the tolerance are just above the edge of the mouth.
+        With this width, the corners of a part that is turned by the tolerance are just above the edge of the mouth.
         """
         length, width, _ = PART
         reach = (length * math.sin(self.tolerance) + width * math.cos(self.tolerance)) / 2
         return max(reach - width / 2 - SLOT_CLEARANCE, 0.0)
 
     def slot_boxes(self) -> list[dict[str, Any]]:
-        """Build the slot from boxes, in a frame on the table with x along the slot: wall, rim and chamfer per side."""
+        """Return boxes for wall, rim and chamfer of each side of the slot; in their frame, x is along the slot."""
         boxes: list[dict[str, Any]] = []
         half = np.array(PART[:2]) / 2 + SLOT_CLEARANCE
         chamfer, height = self.chamfer, SLOT_HEIGHT
         outer = half + chamfer + SLOT_RIM
         for axis in (0, 1):
             for side in (-1.0, 1.0):
-                # Each wall as (distance from the middle: from, to; top), along the other axis over the whole fixture.
+                # The distance from the middle at which a box begins, and the height of its top.
                 for begin, top in ((half[axis], height - chamfer), (half[axis] + chamfer, height)):
                     boxes.append(_wall(axis, side, begin, outer[axis], outer[1 - axis], top))
                 if chamfer > 0:
@@ -85,7 +86,7 @@ def _wall(axis: int, side: float, begin: float, end: float, reach: float, top: f
 
 
 def _chamfer(axis: int, side: float, begin: float, reach: float, chamfer: float, height: float) -> dict[str, Any]:
-    """Return a box under the slope, which rises outwards by 45 degrees to the top of the wall."""
+    """Return a box whose upper face is the chamfer, a slope of 45 degrees that rises outwards to the wall's top."""
     half_thickness = chamfer / 2
     outward = begin + chamfer / 2 + half_thickness * math.sqrt(0.5)
     position, extents = np.zeros(3), np.full(3, half_thickness)
@@ -120,7 +121,7 @@ def load_robot(client: BulletClient, *, flags: int = 0) -> int:
 
 
 def add_part(client: BulletClient) -> int:
-    """Add the part, with a visual shape; return its body's id. The base position is that of its middle."""
+    """Add the part, with a visual shape; return its body's id. Its base position is the middle of the part."""
     half = [size / 2 for size in PART]
     body = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
     picture = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=PART_COLOR)

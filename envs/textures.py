@@ -1,9 +1,10 @@
 """
-The wall textures of the ball-catching problem: procedural ones and image files.
+The wall textures of the ball-catching problem: procedural textures and image files.
 
-Dimension key: S texels a side of a procedural texture, H and W rows and columns of any. A texture is an array
-``(H, W, 3)`` uint8 as in an image file. One copy covers 8 m x 8 m of the wall. PyBullet's plane turns it: on the wall
-its columns run upwards and its rows to the right. So procedural textures are drawn upright and turned back at the end.
+Dimension key: S texels per side of a procedural texture; H rows and W columns of any texture. A texture is an array
+``(H, W, 3)`` uint8 as in an image file. One copy covers 8 m x 8 m of the wall. PyBullet's plane rotates the texture: on
+the wall its columns run upwards and its rows to the right. So procedural textures are drawn upright and rotated at the
+end.
 """
 
 import colorsys
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-SIZE = 128  # S: 6.25 cm a texel on the wall, about a fifth of a pixel of the camera at the far end
+SIZE = 128  # S: a texel covers 6.25 cm of the wall, about a fifth of a camera pixel at the far end
 
 Pattern = Callable[[np.random.Generator], np.ndarray]  # draws a tileable picture (S, S), values in [0, 1]
 
@@ -25,7 +26,7 @@ ROWS, COLUMNS = np.meshgrid(*[(np.arange(SIZE) + 0.5) / SIZE] * 2, indexing="ij"
 
 
 def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
-    """Draw tileable smooth noise with about ``waves`` blobs per side, spread over [0, 1]."""
+    """Draw tileable smooth noise with about ``waves`` blobs per side and values spread evenly over [0, 1]."""
     frequency = np.fft.fftfreq(SIZE, 1 / SIZE)
     envelope = np.exp(-((frequency[:, None] ** 2 + frequency**2) / (2 * waves**2)))
     field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((SIZE, SIZE))) * envelope).real
@@ -33,7 +34,7 @@ def _noise(rng: np.random.Generator, waves: float) -> np.ndarray:
 
 
 def bricks(rng: np.random.Generator) -> np.ndarray:
-    """Draw a running bond: 8 courses of 4 bricks (1 m x 2 m each), every brick of its own shade, light mortar."""
+    """Draw a brick wall: 8 rows of 4 bricks (1 m x 2 m each), each with its own shade, and light mortar."""
     courses, per_course, mortar = 8, 4, 2 * 8 / SIZE  # the joint as a fraction of a course
     course = (ROWS * courses).astype(int)
     along = COLUMNS * per_course + 0.5 * (course % 2)
@@ -58,7 +59,7 @@ def stripes(rng: np.random.Generator) -> np.ndarray:
 
 
 def dots(rng: np.random.Generator) -> np.ndarray:
-    """Draw round dots, with every other row shifted by half a distance."""
+    """Draw round dots; every second row is shifted by half the distance between two dots."""
     per_side = 2 * int(rng.integers(2, 4))
     rows, columns = ROWS * per_side, COLUMNS * per_side
     columns = columns + 0.5 * (rows.astype(int) % 2)
@@ -96,7 +97,7 @@ Colour = tuple[float, float, float]  # hue, saturation, value, each in [0, 1]
 
 
 def _paint(pattern: Pattern, seed: int, dark: Colour, light: Colour) -> np.ndarray:
-    """Blend two colours by a pattern, add a little grain, and turn the picture upright for the wall."""
+    """Blend two colours by a pattern, add a little grain, and rotate the picture for the wall."""
     rng = np.random.default_rng(seed)
     ends = np.array([colorsys.hsv_to_rgb(*dark), colorsys.hsv_to_rgb(*light)])
     amount = pattern(rng)[..., None]  # (S, S, 1)
@@ -105,7 +106,7 @@ def _paint(pattern: Pattern, seed: int, dark: Colour, light: Colour) -> np.ndarr
     return np.ascontiguousarray(np.rot90(upright, -1))
 
 
-# name: pattern, seed, colours of the pattern's 0 and 1
+# name: pattern, seed, and the colours for the pattern's values 0 and 1
 _BUILT_IN: dict[str, tuple[Pattern, int, Colour, Colour]] = {
     "brick": (bricks, 0, (0.02, 0.80, 0.50), (0.05, 0.18, 0.80)),
     "blue_tiles": (tiles, 1, (0.61, 0.85, 0.45), (0.57, 0.35, 0.95)),
@@ -139,7 +140,7 @@ def floor_texture() -> np.ndarray:
 
 def random_texture(seed: int) -> np.ndarray:
     """Draw a texture ``(S, S, 3)`` of random pattern and hue; the same seed gives the same texture."""
-    rng = np.random.default_rng([seed, 8])  # not the streams of the built-in ones
+    rng = np.random.default_rng([seed, 8])  # a different random stream from the built-in textures
     pattern = PATTERNS[rng.integers(len(PATTERNS))]
     hue, shift = rng.random(), 0.1 * rng.standard_normal()
     dark = (hue, rng.uniform(0.3, 0.95), rng.uniform(0.2, 0.55))
@@ -152,7 +153,7 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
     Load a texture from a name, a path or an array.
 
     :param texture: A built-in name (``"brick"`` or one of ``TEST_TEXTURES``), ``"random-<seed>"`` for
-        :func:`random_texture`, ``"<percent>%-<name>"`` for one of these over the brick with this opacity
+        :func:`random_texture`, ``"<percent>%-<name>"`` for one of these textures over the brick with this opacity
         (``"40%-violet_dots"``), the path of an image file, or an array ``(H, W, 3)`` uint8.
     :return: ``(H, W, 3)`` uint8
     :raises FileNotFoundError: if there is no such file.
@@ -187,10 +188,10 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
         )
     try:
         with Image.open(path) as image:
-            if image.mode.startswith("I"):  # 16 bits of grey: Pillow would cut all above 255
+            if image.mode.startswith("I"):  # 16-bit grey: Pillow would clip values above 255
                 return np.rint(np.asarray(image)[..., None].repeat(3, axis=2) / 257).astype(np.uint8)
             return np.array(image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:  # what Pillow raises for a broken file differs by format
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow's exception for a broken file depends on the format
         raise ValueError(
             f"texture={name!r} cannot be read as an image ({error}): use an intact PNG, JPEG or other file that Pillow "
             "opens"

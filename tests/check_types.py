@@ -1,8 +1,8 @@
 """
 Check the types of the package: ``make type``.
 
-``envs/`` and ``hyperparams/`` lie beside ``sb3_tdpg/`` but belong to it. mypy's command line derives a module's name
-from its folder alone, so this script names their modules itself.
+``envs/`` and ``hyperparams/`` are folders beside ``sb3_tdpg/``, but their modules belong to this package. mypy's
+command line derives a module's name only from its folder, so this script sets the names of their modules.
 """
 
 import sys
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> int:
-    """Run mypy; return the exit code."""
+    """Run mypy and return the exit code."""
     files = [path for name in ("sb3_tdpg", "envs", "hyperparams") for path in sorted((ROOT / name).rglob("*.py"))]
     _, options = process_options(["--config-file", str(ROOT / "setup.cfg"), "--fast-module-lookup", "-m", "sb3_tdpg"])
     sources = []

@@ -1,4 +1,4 @@
-"""Samples whose information is known, and the registry of estimators sorted by kind."""
+"""Make samples whose information is known, and sort the registered estimators by kind."""
 
 import math
 
@@ -15,12 +15,12 @@ CRITIC_FREE = sorted(set(ESTIMATORS) - set(CRITICS))
 UPPER = sorted(name for name, cls in CLASSES.items() if cls.bound == "upper")
 LOWER = sorted(name for name, cls in CLASSES.items() if cls.bound == "lower")
 
-# One time step for each: gains a of ``trv = a * state + noise`` in each of two dimensions.
+# The gains a in ``trv = a * state + noise`` for each time step and each of two dimensions.
 GAINS = ((0.0, 0.0), (0.8, 0.0), (1.0, 1.0))
 
 
 def gaussian_batch(n, gains, noise_std=1.0, generator=None):
-    """Samples whose information is ``sum log(1 + (a / noise_std)^2) / 2`` nats: one time step per row of gains."""
+    """Sample a channel with ``sum log(1 + (a / noise_std)^2) / 2`` nats; there is one time step per row of gains."""
     gains = th.as_tensor(gains)[:, None, :]  # (T, 1, Z)
     states = th.randn(gains.shape[0], n, gains.shape[2], generator=generator)
     means = gains * states
@@ -31,9 +31,9 @@ def gaussian_batch(n, gains, noise_std=1.0, generator=None):
 
 def gaussian_channels(nats, dim, n, n_channels, rng):
     """
-    Channels x~ = A x + noise, one a time step, each with an information of ``nats`` and a random A.
+    Sample random channels x~ = A x + noise, a different one for each time step; each channel carries ``nats`` nats.
 
-    How the information is shared among the directions is uniform on the simplex.
+    The shares of the information in the directions are uniform on the simplex.
     """
     nats_of_each = nats * rng.dirichlet(np.ones(dim), n_channels)
     left, right = (np.linalg.qr(rng.standard_normal((n_channels, dim, dim)))[0] for _ in range(2))
@@ -45,12 +45,12 @@ def gaussian_channels(nats, dim, n, n_channels, rng):
 
 
 def batch_of(means, stds):
-    """Samples of an encoder that sees what it tells: the states are the means."""
+    """Sample an encoder whose means are the states."""
     return InformationBatch(means, means + stds * th.randn_like(means), means, stds)
 
 
 def modes_batch(n=4000, distance=10.0):
-    """TRVs with four modes, which tell nothing but which: ln 4 nats."""
+    """Sample TRVs around four distant modes; they carry only the number of the mode, which is ln 4 nats."""
     modes = distance * th.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     means = modes[th.randint(4, (n,))][None]
     return batch_of(means, th.ones_like(means))
@@ -75,12 +75,12 @@ def half_dead():
     alive = th.ones(4, 60, dtype=th.bool)
     alive[1:, 50:] = False
     alive[2:, ::2] = False
-    alive[3:, 3:] = False  # too few are left at the last step
+    alive[3:, 3:] = False  # too few episodes are left at the last step
     return alive
 
 
 def fresh_estimates(estimator, n_batches=20, n=1000):
-    """Estimates on samples that the critic has not seen: mean and standard error for each time step."""
+    """Return mean and standard error, for each time step, of estimates on samples that the critic has not seen."""
     with th.no_grad():
         values = np.stack([estimator(gaussian_batch(n, GAINS)).numpy() for _ in range(n_batches)])
     return values.mean(0), values.std(0, ddof=1) / math.sqrt(n_batches)
@@ -91,7 +91,7 @@ def generator(seed=0):
 
 
 def channel(states, means, stds, rng):
-    """Wrap arrays ``(T, N, ...)`` of a channel as a batch."""
+    """Return a batch with the arrays ``(T, N, ...)`` of a channel."""
     trvs = means + stds * rng.standard_normal(means.shape)
     return InformationBatch(*map(th.as_tensor, (states, trvs, means, np.broadcast_to(stds, means.shape).copy())))
 

@@ -1,11 +1,11 @@
 """
-Mutation testing: ``make mutants`` changes the code in small ways and counts the changes that the tests notice.
+Mutation testing: ``make mutants`` makes small changes to the code and counts the changes that the tests detect.
 
-It covers what computes the results: the losses, the update, the estimators of the information, the certificates and the
-environments. ``mutmut`` changes one operator, number or argument at a time, and runs the tests that reach the changed
-function until one fails. Statements that word an error or a warning, and what draws pictures for people or writes a
-page, are not changed. By default a random sample of the changes is tried; ``--all`` tries every one, for a day. A run
-that is stopped goes on where it was.
+The code that computes the results is changed: the losses, the update, the estimators of the information, the
+certificates and the environments. ``mutmut`` changes one operator, number or argument at a time. It then runs the tests
+that reach the changed function until one fails. Errors, warnings, and code that draws pictures or writes a page are not
+changed. By default a random sample of the changes is tried; ``--all`` tries all of them, which takes a day. A run that
+was stopped continues where it stopped.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CODE = [
     "evaluation/interval_bounds.py", "certificates/certificate.py", "certificates/declared.py",
     "certificates/shifts.py", "envs/*.py",
 ]  # fmt: skip
-# What people look at; and the table of scenarios, which is read with the module, before a change is switched on.
+# Code for pictures, and the table of scenarios, which is made at import, before mutmut activates a change.
 LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|show_window|_figure__")
 TESTS = [
     "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
@@ -63,7 +63,7 @@ use_git_change_detection = false
 
 
 def stage() -> None:
-    """Lay the tree out as in a wheel, ``envs`` inside the package: mutmut derives a module's name from its path."""
+    """Copy the files as in a wheel, with ``envs`` in the package, because mutmut derives module names from paths."""
     TREE.mkdir(parents=True, exist_ok=True)
     ignore = shutil.ignore_patterns("__pycache__")
     inside = {name: f"sb3_tdpg/{name}" for name in ("envs", "hyperparams")}
@@ -79,7 +79,7 @@ def stage() -> None:
 
 
 def mutmut(*arguments: str, check: bool = True) -> str:
-    """Run it in the tree; return what it prints, without its complaints if they are not checked."""
+    """Run mutmut in the copied tree and return its output; without ``check``, ignore its errors."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ""}
     command = [sys.executable, "-m", "mutmut", *arguments]
     done = subprocess.run(
@@ -96,12 +96,12 @@ def mutmut(*arguments: str, check: bool = True) -> str:
 
 
 def results() -> dict[str, str]:
-    """Return the state of each mutant: killed, survived, timeout, no tests, not checked, ..."""
+    """Return the state of each mutant, such as killed, survived, timeout, no tests or not checked."""
     return dict(re.findall(r"^\s*(\S+): (.+)$", mutmut("results", "--all", "true"), re.MULTILINE))
 
 
 def main() -> int:
-    """Print the share of the changes that the tests notice, and those that they do not; 1 if the goal is missed."""
+    """Print the undetected changes and the share of detected changes; return 1 if the goal is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--all", action="store_true", help="try all changes")
     parser.add_argument("--sample", type=int, default=400, help="number of changes to try")
@@ -109,7 +109,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only mutants whose name contains this text")
     given = parser.parse_args()
     stage()
-    # No mutant has that name: this makes the mutants and finds out which tests reach them.
+    # No mutant has this name, so this call only makes the mutants and determines which tests reach them.
     mutmut("run", "--max-children", "1", "nothing.*", check=False)
     names = sorted(name for name in results() if given.only in name and not LEFT_OUT.search(name))
     chosen = names if given.all else random.Random(given.seed).sample(names, min(given.sample, len(names)))

@@ -1,4 +1,4 @@
-"""Grasps whose outcome is known, for the tests of the grasping problem."""
+"""Make grasps whose outcome is known, for the tests of the grasping problem."""
 
 import os
 import subprocess
@@ -21,19 +21,19 @@ def random_states(n, seed=0, half_width=0.05):
 
 
 def action_for(poses):
-    """The action of a grasp at (x, y, z, yaw)."""
+    """Return the action of a grasp at (x, y, z, yaw)."""
     return ((np.asarray(poses) - NOMINAL_GRASP) / 0.1).astype(np.float32)
 
 
 def oracle_actions(states):
-    """At the rim, on the side where the gripper's fingers come to stand inside and outside."""
+    """Return grasps of the rim at a side where one finger is inside the mug and the other finger outside."""
     poses = np.tile(NOMINAL_GRASP, (len(states), 1))
     poses[:, :2] = states[:, :2] + [0.045, 0.01]
     return action_for(poses)
 
 
 def mixed_actions(states, seed=0):
-    """Around the oracle's, so that about half of them lift the mug."""
+    """Return grasps around the oracle's grasps, of which about half lift the mug."""
     noise = np.random.default_rng(seed).normal(size=(len(states), 4))
     return (oracle_actions(states) + noise * [0.3, 0.3, 0.2, 3.0]).astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Environments to be perturbed, and rollouts of them."""
+"""Environments for the tests of perturbations, and functions that roll them out."""
 
 import functools
 from collections import namedtuple
@@ -21,13 +21,13 @@ HORIZON = 8
 
 
 class PictureEnv(gym.Env):
-    """A camera that looks at another part of a picture at every step; the episodes of a name last 8, 9, ... steps."""
+    """A camera that looks at another part of a picture at every step; an episode has ``8 + name`` steps."""
 
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 
     def __init__(self, name=0, layout="HWC", side=24):
         self.lengths = 8 + name
-        self.horizon = 8  # of the shortest
+        self.horizon = 8  # horizon of the shortest episodes
         self.layout, self.side = layout, side
         shape = dict(HWC=(side, side, 3), CHW=(3, side, side), HW=(side, side))[layout]
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
@@ -60,7 +60,7 @@ DICT = spaces.Dict(
 
 
 class ClockEnv(gym.Env):
-    """An episode whose observation is the time of the step, from 10 on, in every part; it remembers its actions."""
+    """An environment whose observation is 10 plus the time step, in every component; it records its actions."""
 
     action_space = spaces.Box(-1, 1, (2,), np.float32)
     horizon = 12
@@ -107,7 +107,7 @@ PROBLEMS = {
 
 
 def applying():
-    """Name every problem with every perturbation that applies to it."""
+    """Yield every problem with every perturbation that applies to it."""
     for problem, make in PROBLEMS.items():
         env = make(1)
         horizon = env.get_attr("horizon")[0] if env.has_attr("horizon") else None
@@ -122,7 +122,7 @@ Run = namedtuple("Run", "observations starts states rewards dones terminal")
 
 
 def run(env, n_steps=None, seed=0):
-    """Roll out with fixed actions; everything as arrays ``(T + 1, N, ...)``, the start of an episode at its place."""
+    """Roll out fixed actions; return arrays ``(T + 1, N, ...)``, in which resets replace terminal observations."""
     if n_steps is None:  # two episodes and the beginning of a third
         n_steps = 2 if getattr(env.unwrapped, "env", None) is not None and env.unwrapped.env.horizon == 1 else 20
     env.seed(seed)
@@ -142,7 +142,7 @@ def run(env, n_steps=None, seed=0):
         rewards.append(reward)
         all_dones.append(dones)
         terminal.extend((i, info["terminal_observation"]) for i, info in enumerate(infos) if dones[i])
-    np.testing.assert_array_equal(observations[0], kept)  # what was handed out is not overwritten
+    np.testing.assert_array_equal(observations[0], kept)  # a returned observation is not overwritten
     return Run(np.stack(observations), np.stack(starts), states, np.array(rewards), np.array(all_dones), terminal)
 
 
@@ -155,12 +155,12 @@ def perturbed(env, name, severity=3, seed=5, **kwargs):
 
 
 def differs(first, second):
-    """Whether observations ``(T, N, *obs)`` differ: ``(T, N)``."""
+    """Return whether observations ``(T, N, *obs)`` differ: ``(T, N)``."""
     return (first != second).reshape(*first.shape[:2], -1).any(axis=2)
 
 
 def episodes(starts):
-    """Steps of the policy in each complete episode of each environment: (environment, slice)."""
+    """Yield the steps of each complete episode of each environment: (environment, slice)."""
     for i in range(starts.shape[1]):
         begins = np.flatnonzero(starts[:, i])
         for begin, end in pairwise(begins):

@@ -1,4 +1,4 @@
-"""A real PostgreSQL for the tests: its own data in a temporary folder, on a free port of this machine."""
+"""Run a real PostgreSQL server for the tests, with its data in a temporary folder and on a free port."""
 
 import os
 import pwd
@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-PASSWORD = "p{e}rc%nt"  # characters that a URL, Optuna and Alembic treat in ways of their own
+PASSWORD = "p{e}rc%nt"  # URLs, Optuna and Alembic give some of these characters a special meaning
 
 
 def find_programs():
-    """Return the folder of initdb and pg_ctl; Debian does not put them on the PATH."""
+    """Return the folder of initdb and pg_ctl, which is not on Debian's PATH."""
     found = shutil.which("pg_ctl")
     folders = [Path(found).resolve().parent] if found else []
     folders += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
@@ -29,13 +29,13 @@ class Postgres:
         if self.programs is None:
             pytest.skip("PostgreSQL is not installed: apt install postgresql")
         self.user = None
-        if os.geteuid() == 0:  # as root it refuses to run
+        if os.geteuid() == 0:  # PostgreSQL does not run as root
             try:
                 pwd.getpwnam("postgres")
             except KeyError:
                 pytest.skip("PostgreSQL does not run as root, and there is no user postgres: apt install postgresql")
             self.user = "postgres"
-        # Not in pytest's folder, which nobody but its owner may enter.
+        # pytest's folder is not used, because only its owner has access.
         self.folder = folder = Path(tempfile.mkdtemp(prefix="sb3_tdpg-postgres-"))
         if self.user:
             shutil.chown(folder, self.user, self.user)
@@ -92,7 +92,7 @@ class Postgres:
 
 @pytest.fixture(scope="session")
 def postgres():
-    """Start a server for all tests of this process."""
+    """Provide a server for all tests of this process."""
     server = Postgres()
     server.start()
     yield server

@@ -1,4 +1,4 @@
-"""Start programs of the package in processes of their own, as a user does."""
+"""Start programs of the package in new processes, as a user does."""
 
 import os
 import signal
@@ -10,17 +10,17 @@ ENVIRONMENT = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(p for p in 
 
 
 def start(arguments, folder):
-    """Start a command of the package in a folder; it hears Ctrl-C."""
+    """Start a command of the package in a folder; Ctrl-C interrupts it."""
     return subprocess.Popen(
         [sys.executable, "-m", "sb3_tdpg", *arguments],
         cwd=folder, env={**os.environ, **ENVIRONMENT}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        # A shell that runs the tests in the background has it ignored.
+        # If a shell runs the tests in the background, processes ignore Ctrl-C by default.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
 
 
 def run(command, folder, **environment):
-    """Run Python to its end in a folder."""
+    """Run a Python command in a folder, and wait until it has ended."""
     done = subprocess.run(
         [sys.executable, *command],
         cwd=folder, env={**os.environ, **ENVIRONMENT, **environment}, capture_output=True, text=True, timeout=120,
@@ -29,7 +29,7 @@ def run(command, folder, **environment):
 
 
 def wait_for(folder, pattern, process):
-    """Wait until a process has written a file."""
+    """Wait until a process has written a file that matches a pattern."""
     deadline = time.monotonic() + 120
     while not list(folder.glob(pattern)):
         assert process.poll() is None, process.communicate()[0]

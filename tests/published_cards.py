@@ -1,4 +1,4 @@
-"""Helpers that read a model card."""
+"""Functions that read a model card."""
 
 import re
 

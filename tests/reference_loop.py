@@ -1,9 +1,9 @@
 """
-One policy epoch of TDPG on the lava problem as the plainest loop: one sample, one time step, one critic at a time.
+Run one policy epoch of TDPG on the lava problem as a simple loop over samples, time steps and critics.
 
-Written from the paper's equations and not from the package, with a module of its own for each time step. The batched
-code must give the same numbers (``test_reference_loop.py``) in a fraction of the time (``benchmarks/run.py``). All that
-is random comes from outside. Only :meth:`LoopTDPG.copy_of` and :func:`draw_randomness` know of the package.
+This code follows the paper's equations, not the package, and has a separate module for each time step. The batched code
+must give the same numbers (``test_reference_loop.py``) in a fraction of the time (``benchmarks/run.py``). All random
+numbers are arguments. Only :meth:`LoopTDPG.copy_of` and :func:`draw_randomness` use the package.
 
 Dimension key: T horizon, N episodes, S gradient steps, B minibatch, X state, Z task-relevant variables (TRVs), U
 action.
@@ -26,26 +26,26 @@ GOAL, WALL, LAVA = 3.0, 0.0, 5.0  # m
 
 
 class Minibatch(NamedTuple):
-    """Which episodes the samples of the joint distribution and of the product of its marginals come from."""
+    """The episodes from which the samples of the joint distribution and of the product of its marginals come."""
 
     joint: list[int]
     marginal: list[tuple[int, int]]  # x_t of one episode with x~_t of another
 
 
 class Randomness(NamedTuple):
-    """Everything random of an epoch; arrays are indexed by episode first."""
+    """All random numbers of an epoch; the first index of an array is the episode."""
 
     initial_distance: np.ndarray  # (N,)
     sensor_noise: np.ndarray  # (N, T, X), standard normal
     trv_noise: th.Tensor  # (N, T, Z), eps_t, standard normal
     action_noise: th.Tensor  # (N, T, U), standard normal
     minibatches: list[list[Minibatch]]  # T lists of S, to fit the critics
-    pairings: list[Minibatch]  # T, for the estimate that the policy descends
+    pairings: list[Minibatch]  # T, for the estimate in the policy's loss
 
 
 @dataclass
 class Episode:
-    """What happened in an episode, one entry for each time step."""
+    """The record of an episode, with one entry for each time step."""
 
     states: list[th.Tensor] = field(default_factory=list)  # (X,)
     observations: list[th.Tensor] = field(default_factory=list)  # (X,)
@@ -55,13 +55,13 @@ class Episode:
 
 
 def bounded_exp(x: th.Tensor, log_maximum: float) -> th.Tensor:
-    """``exp(x)`` that levels off at ``exp(log_maximum)``."""
+    """Return an ``exp(x)`` that saturates at ``exp(log_maximum)``."""
     return 1 / (th.exp(-x) + math.exp(-log_maximum))
 
 
 @dataclass
 class LoopTDPG:
-    """Modules and optimisers of the loop."""
+    """The modules and the optimisers of the loop."""
 
     encoders: list[nn.Sequential]  # T
     action_heads: list[nn.Sequential]  # T
@@ -85,7 +85,7 @@ class LoopTDPG:
 
     @classmethod
     def copy_of(cls, model: TDPG) -> LoopTDPG:
-        """Copy networks and settings of a model of the lava problem whose policy has not been updated yet."""
+        """Copy networks and settings of a model for the lava problem whose policy has not been updated yet."""
         env = model.env.unwrapped.env
         return cls(
             encoders=unbatch(model.policy.encoder.mlp),
@@ -101,7 +101,7 @@ class LoopTDPG:
         )
 
     def epoch(self, randomness: Randomness) -> None:
-        """Make one policy epoch."""
+        """Run one policy epoch."""
         episodes = self.rollouts(randomness)
         if self.mi_coef > 0:
             self.fit_critics(episodes, randomness.minibatches)
@@ -111,7 +111,7 @@ class LoopTDPG:
 
     @th.no_grad()
     def rollouts(self, randomness: Randomness) -> list[Episode]:
-        """Roll out every episode on its own."""
+        """Roll out each episode separately."""
         return [
             self.rollout(
                 float(randomness.initial_distance[n]),
@@ -155,19 +155,19 @@ class LoopTDPG:
         return episode
 
     def encode(self, t: int, prev_trv: th.Tensor, observation: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Mean and variance of q(x~_t | x~_{t-1}, y_t)."""
+        """Return mean and variance of q(x~_t | x~_{t-1}, y_t)."""
         mean, log_variance = self.encoders[t](th.cat([prev_trv, observation])).chunk(2)
         return th.tanh(mean), bounded_exp(log_variance, 4) + self.encoder_var_floor
 
     def act(self, t: int, trv: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Mean and variance of pi(u_t | x~_t)."""
+        """Return mean and variance of pi(u_t | x~_t)."""
         mean, log_variance = self.action_heads[t](trv).chunk(2)
         return mean, bounded_exp(log_variance, 8) + self.action_var_floor
 
     # -- mutual information ---------------------------------------------------------------------------------------
 
     def fit_critics(self, episodes: list[Episode], minibatches: list[list[Minibatch]]) -> None:
-        """Fit one critic after the other."""
+        """Fit the critics one after the other."""
         for t in range(self.horizon):
             states = [episode.states[t] for episode in episodes]
             trvs = [episode.trvs[t] for episode in episodes]
@@ -180,7 +180,7 @@ class LoopTDPG:
     def donsker_varadhan(
         self, t: int, states: list[th.Tensor], trvs: list[th.Tensor], minibatch: Minibatch
     ) -> th.Tensor:
-        """The estimate of I[x_t; x~_t] in nats, the critic called for one sample at a time."""
+        """Estimate I[x_t; x~_t] in nats; the critic is called for one sample at a time."""
         joint = 0.0
         for i in minibatch.joint:
             joint = joint + self.critics[t](th.cat([states[i], trvs[i]]))[0]
@@ -195,7 +195,7 @@ class LoopTDPG:
         """
         Estimate I[x_t; x~_t] for every t.
 
-        :param trvs: of each episode at each time step
+        :param trvs: TRVs of each episode at each time step.
         """
         return [
             self.donsker_varadhan(t, [e.states[t] for e in episodes], [e[t] for e in trvs], pairings[t])
@@ -212,9 +212,9 @@ class LoopTDPG:
         advantages: list[list[float]],
     ) -> None:
         """
-        Make one step of the policy.
+        Make one optimiser step on the policy.
 
-        :param advantages: weight of each log-probability, for each episode and time step
+        :param advantages: Weight of each log-probability, for each episode and time step.
         """
         loss = 0.0
         for n, episode in enumerate(episodes):
@@ -227,7 +227,7 @@ class LoopTDPG:
         if self.mi_coef > 0:
             trvs = [self.rebuild_trvs(episode, trv_noise[n]) for n, episode in enumerate(episodes)]
             for information in self.information(episodes, trvs, pairings):
-                # A critic's estimate may be negative, the mutual information may not.
+                # A critic's estimate can be negative, but mutual information cannot.
                 if information > 0:
                     loss = loss + self.mi_coef * information
         self.optimizer.zero_grad()
@@ -235,7 +235,7 @@ class LoopTDPG:
         self.optimizer.step()
 
     def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> list[th.Tensor]:
-        """Compute the TRVs of an episode again, now as functions of the encoder's parameters."""
+        """Compute the TRVs of an episode again, as functions of the encoder's parameters."""
         trvs = []
         trv = th.zeros(self.trv_dim)
         for t in range(self.horizon):
@@ -258,7 +258,7 @@ def move(distance: float, velocity: float, control: float) -> tuple[float, float
 
 
 def log_density(x: th.Tensor, mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
-    """Log-density of a diagonal Gaussian, one component at a time."""
+    """Return the log-density of a diagonal Gaussian; the components are summed in a loop."""
     result = 0.0
     for i in range(len(x)):
         result = result - 0.5 * ((x[i] - mean[i]) ** 2 / variance[i] + th.log(2 * math.pi * variance[i]))
@@ -266,13 +266,13 @@ def log_density(x: th.Tensor, mean: th.Tensor, variance: th.Tensor) -> th.Tensor
 
 
 def mean_baseline(episodes: list[Episode]) -> list[list[float]]:
-    """Weight every step with the cost of the whole episode less the mean over episodes."""
+    """Return weights for all steps: the cost of the whole episode minus the mean over episodes."""
     mean = sum(sum(episode.costs) for episode in episodes) / len(episodes)
     return [[sum(episode.costs) - mean] * len(episode.costs) for episode in episodes]
 
 
 def to_float32(x: float) -> float:
-    """Round as Stable-Baselines3 does with observations and rewards."""
+    """Round a number to float32, as Stable-Baselines3 rounds observations and rewards."""
     return float(np.float32(x))
 
 
@@ -292,7 +292,7 @@ def unbatch(mlp: BatchedMLP) -> list[nn.Sequential]:
 
 
 def draw_randomness(model: TDPG, rng: np.random.Generator) -> Randomness:
-    """Draw what an epoch of a model needs, minibatches as :class:`~sb3_tdpg.information.mine.Mine` has them."""
+    """Draw the random numbers for an epoch; minibatches have the form of :class:`~sb3_tdpg.information.mine.Mine`."""
     n, horizon, trv_dim = model.n_episodes, model.horizon, model.policy.trv_dim
     size = min(model.estimator.batch_size, n // 2)
 

@@ -1,9 +1,9 @@
 """
-Check what a release uploads: ``make release-check``.
+Check the files that a release uploads: ``make release-check``.
 
-Build the sdist from the files that git tracks, and the wheel from the sdist, into dist/. Check how PyPI will show them.
-Install each, with the dependencies that it declares, into a fresh environment and train, save and load a model there.
-``BORROW=1 make release-check`` takes the dependencies of this environment instead of installing them twice.
+Build the sdist from the files that git tracks, and the wheel from the sdist, in dist/. Check how PyPI will show them.
+Install each of the two in a new environment with its declared dependencies, and train, save and load a model there.
+``BORROW=1 make release-check`` uses the dependencies of this environment instead of installing them twice.
 """
 
 import argparse
@@ -43,7 +43,7 @@ print(f"sb3_tdpg {sb3_tdpg.__version__} trains, saves and loads on Python {sys.v
 
 
 def run(*command: object, cwd: Path = ROOT) -> str:
-    """Run a command without this checkout on its path; stop with all that it printed if it fails."""
+    """Run a command without this checkout on its path; if it fails, exit with its output."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     arguments = [str(argument) for argument in command]
     done = subprocess.run(
@@ -55,13 +55,13 @@ def run(*command: object, cwd: Path = ROOT) -> str:
 
 
 def tracked() -> list[str]:
-    """Return the files of the release; a file that somebody forgot to add is missing here as it will be there."""
+    """Return the files that git tracks; a file that was not added will also be missing in the release."""
     names = run("git", "ls-files", "-z").split("\0")
     return [name for name in names if (ROOT / name).is_file()]
 
 
 def build(scratch: Path) -> list[Path]:
-    """Build in a copy: setuptools builds in place, and files of an old build would end up in the new one."""
+    """Build in a copy, because setuptools builds in place and would include files of an old build."""
     files = tracked()
     for name in files:
         (scratch / name).parent.mkdir(parents=True, exist_ok=True)
@@ -78,7 +78,7 @@ def build(scratch: Path) -> list[Path]:
 
 
 def check_tag(version: str) -> None:
-    """Compare the version with TAG, which the workflow of a release sets."""
+    """Compare the version with TAG, which the release workflow sets."""
     tag = os.environ.get("TAG")
     if tag and tag != f"v{version}":
         sys.exit(
@@ -88,7 +88,7 @@ def check_tag(version: str) -> None:
 
 
 def smoke_test(archive: Path, folder: Path, borrow: bool) -> str:
-    """Install the archive into a fresh environment, and use it from an empty folder."""
+    """Install the archive in a new environment, and use it from an empty folder."""
     venv.create(folder / "venv", with_pip=True, symlinks=os.name != "nt")
     programs = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = programs / ("python.exe" if os.name == "nt" else "python")
@@ -96,7 +96,8 @@ def smoke_test(archive: Path, folder: Path, borrow: bool) -> str:
     empty = folder / "empty"
     empty.mkdir()
     if borrow:
-        # The folders of a .pth file come last, and .pth files in them are not read: no editable install of ours.
+        # Folders in a .pth file come last on the path, and the .pth files in them are not read. So the editable install
+        # of this checkout is not found.
         packages = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=empty).strip()
         ours = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
         Path(packages, "borrowed.pth").write_text("\n".join(ours))
@@ -108,7 +109,7 @@ def smoke_test(archive: Path, folder: Path, borrow: bool) -> str:
 
 
 def main() -> None:
-    """Build, check and try; stop at the first thing that is wrong."""
+    """Build the archives, check and test them; exit at the first error."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--borrow", action="store_true", help="take the dependencies of this environment")
     borrow = parser.parse_args().borrow

@@ -21,12 +21,12 @@ TINY_CRITIC = dict(hidden_sizes=(8,), batch_size=5, gradient_steps=2, warmup_gra
 
 
 def words(value):
-    """Name the case of a test without the characters that a tool which runs single tests cannot pass on."""
+    """Return a name for a test case without characters that tools which run single tests cannot handle."""
     return re.sub(r"\W+", " ", str(getattr(value, "__name__", value))).strip()
 
 
 def tiny_tdpg(env="Lava-v0", **kwargs):
-    """Build a TDPG model that trains an epoch in milliseconds."""
+    """Make a TDPG model that trains an epoch in milliseconds."""
     estimator = kwargs.get("mi_estimator", "logdet")
     defaults = dict(
         n_episodes=20,
@@ -40,19 +40,19 @@ def tiny_tdpg(env="Lava-v0", **kwargs):
 
 
 def train_epochs(model, n_epochs, **kwargs):
-    """Train for a number of epochs of episodes that all last for the whole horizon."""
+    """Train for a number of epochs; all episodes must last for the whole horizon."""
     return model.learn(n_epochs * model.n_episodes * model.horizon, **kwargs)
 
 
 def parameters(module):
-    """Copy of all parameters and buffers of a module."""
+    """Return a copy of all parameters and buffers of a module."""
     return {name: value.detach().clone() for name, value in module.state_dict().items() if hasattr(value, "detach")}
 
 
 def assert_same_parameters(first, second):
     assert first.keys() == second.keys()
     for name, value in first.items():
-        # NaN marks a moving average that has not begun.
+        # NaN means that a moving average has no value yet.
         np.testing.assert_array_equal(value.numpy(), second[name].numpy(), err_msg=name)
 
 
@@ -61,7 +61,7 @@ def same_parameters(first, second):
 
 
 class ToyEnv(gym.Env):
-    """A number between -1 and 1, shown in any observation space; the cost is its square plus the first action's."""
+    """A number between -1 and 1 in any observation space; the cost is its square plus that of the first action."""
 
     def __init__(
         self,
@@ -119,9 +119,9 @@ class ToyEnv(gym.Env):
 
 class CountdownEnv(gym.Env):
     """
-    Episodes of given lengths, one after the other; the cost of a step is ``100 * episode + t``.
+    Run episodes of the given lengths, one after the other; the cost of a step is ``100 * episode + t``.
 
-    The observation is ``(name, episode, t)``, and so is the true state, negated.
+    The observation is ``(name, episode, t)``, and the true state is its negative.
     """
 
     horizon = 4
@@ -154,7 +154,7 @@ class CountdownEnv(gym.Env):
 
 
 class LinearProblem(POMDPEnv):
-    """Two controls of ``x' = x + u`` with a quadratic cost and a noisy sensor: everything is differentiable."""
+    """The system ``x' = x + u`` for two controls, with a quadratic cost and a noisy sensor; all is differentiable."""
 
     sensor_noise_std = 0.3
 
@@ -229,14 +229,14 @@ def lava_env(n=20):
 
 
 def rollouts(model):
-    """Roll out an epoch without an update; the batch that the update would get."""
+    """Roll out an epoch without an update; return the batch that the update would get."""
     model.train = lambda: None
     train_epochs(model, 1)
     return model.rollout_buffer.episode_batch()
 
 
 def complete_runs_here(tasks, *, n_eval_episodes, jobs=None):
-    """As runs.complete_runs, in this process: workers would not see what a test has patched."""
+    """Complete runs in this process instead of workers, which would not have the patches of a test."""
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
     while waiting:
         task = next(task for task in waiting if task[0].start not in unfinished)
@@ -246,13 +246,13 @@ def complete_runs_here(tasks, *, n_eval_episodes, jobs=None):
 
 
 def give_settings(monkeypatch, more, cls=Run):
-    """Replace settings of all runs: a dict, or a function of the run that returns one."""
+    """Replace settings of all runs with a dict, or with a function that returns a dict for a run."""
     settings = cls.settings.fget
     monkeypatch.setattr(cls, "settings", property(lambda run: settings(run) | (more(run) if callable(more) else more)))
 
 
 def error_line(capsys, *command):
-    """Run a command of the package that must fail with exit code 2 and one line about it; return that line."""
+    """Run a command of the package that must fail with exit code 2 and an error in one line; return this line."""
     assert main([str(argument) for argument in command]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ")

@@ -1,9 +1,9 @@
 """
-Endurance: ``make soak``, a quarter of an hour. It fails on a leak, a difference or a lost trial.
+Endurance test: ``make soak``, a quarter of an hour. It fails if it finds a leak, a difference or a lost trial.
 
 Memory and open files of this process must not grow after the first tenth of each job. Trainings that are killed and
-resumed must end with the parameters of an uninterrupted one. A study must lose no trial though its workers are killed
-and its PostgreSQL is restarted.
+resumed must end with the same parameters as an uninterrupted training. A study must not lose a trial when its workers
+are killed and its PostgreSQL server is restarted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-# Before NumPy and PyTorch start their threads.
+# This must come before NumPy and PyTorch start their threads.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
 
 import gymnasium as gym
@@ -33,15 +33,15 @@ from study_workers import Workers, open_quick
 from sb3_tdpg import TDPG, make_episodes_env
 from sb3_tdpg.common.markdown import markdown_table
 
-MEMORY_LIMIT = 8.0  # MB of growth; the allocator's noise is below 1
+MEMORY_LIMIT = 8.0  # MB of growth; the allocator's noise is below 1 MB
 TRAIN = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1", "--verbose", "0"]
 TRAIN += ["-params", "n_episodes:20", "-n", "100000"]
-N_TRAININGS, N_KILLS = 5, 5  # kills of each training
+N_TRAININGS, N_KILLS = 5, 5  # each training is killed N_KILLS times
 N_TRIALS, N_WORKERS, N_WORKER_KILLS, N_RESTARTS = 40, 3, 5, 2
 
 
 def lava() -> Iterator[None]:
-    """1e5 resets."""
+    """Reset the lava problem 1e5 times."""
     env = make_episodes_env("Lava-v0", n_episodes=500)
     for _ in range(200):
         env.reset()
@@ -50,12 +50,12 @@ def lava() -> Iterator[None]:
 
 
 def grasp() -> Iterator[None]:
-    """2,000 grasps."""
+    """Simulate 2,000 grasps."""
     yield from _episodes("PandaGrasp-v0", 2000)
 
 
 def ball() -> Iterator[None]:
-    """300 episodes of ball catching with PyBullet."""
+    """Run 300 episodes of ball catching with PyBullet."""
     yield from _episodes("BallCatch-v0", 300, renderer="pybullet")
 
 
@@ -73,7 +73,7 @@ def _episodes(env_id: str, n_episodes: int, **env_kwargs: Any) -> Iterator[None]
 
 
 def epochs() -> Iterator[None]:
-    """200 policy epochs with MINE."""
+    """Train 200 policy epochs with MINE."""
     model = TDPG("TRVPolicy", "Lava-v0", seed=0, device="cpu")
     for _ in range(200):
         model.learn(model.n_episodes * model.horizon, reset_num_timesteps=False)
@@ -84,7 +84,7 @@ LOOPS: dict[str, Callable[[], Iterator[None]]] = dict(lava=lava, grasp=grasp, ba
 
 
 def no_leak(loop: Callable[[], Iterator[None]]) -> tuple[str, bool]:
-    """Compare memory and open files after a tenth of a loop with those at its end."""
+    """Compare memory and open files after the first tenth of a loop with the values at its end."""
     sizes = [_resources() for _ in loop()]
     (memory, files), (last_memory, last_files) = sizes[len(sizes) // 10], sizes[-1]
     growth = last_memory - memory
@@ -92,14 +92,14 @@ def no_leak(loop: Callable[[], Iterator[None]]) -> tuple[str, bool]:
 
 
 def _resources() -> tuple[float, int]:
-    """Resident memory in MB, and the number of open files."""
+    """Return the resident memory in MB, and the number of open files."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6, len(os.listdir("/proc/self/fd"))
 
 
 def resumed() -> tuple[str, bool]:
-    """Kill trainings at random moments, resume them, and compare their parameters with uninterrupted ones."""
+    """Kill trainings at random times, resume them, and compare their parameters with uninterrupted trainings."""
     rng, n_equal, n_kills = random.Random(0), 0, 0
     for seed in range(N_TRAININGS):
         with tempfile.TemporaryDirectory() as folder:
@@ -123,7 +123,7 @@ def _start(arguments: list[str], folder: Path) -> subprocess.Popen[bytes]:
 
 
 def _killed(arguments: list[str], folder: Path, checkpoint: Path, rng: random.Random) -> bool:
-    """Kill a training shortly after it has written a new checkpoint; return whether it still ran."""
+    """Kill a training shortly after it has written a new checkpoint; return whether it was still running."""
     before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0
     process = _start(arguments, folder)
     while process.poll() is None and not (checkpoint.exists() and checkpoint.stat().st_mtime_ns > before):
@@ -184,7 +184,7 @@ JOBS: dict[str, Callable[[], tuple[str, bool]]] = {
 
 
 def main() -> int:
-    """Run the jobs; return 1 if one failed."""
+    """Run the jobs; return 1 if a job failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("jobs", nargs="*", default=list(JOBS), help=f"default: {' '.join(JOBS)}")
     rows = []

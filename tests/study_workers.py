@@ -1,4 +1,4 @@
-"""Real worker processes of a study, for the tests: they may be killed."""
+"""Run real worker processes of a study, which tests can kill."""
 
 import multiprocessing as mp
 import os
@@ -21,8 +21,8 @@ def open_quick(url, **kwargs):
 
 
 def run_worker(url, n_trials, log, seconds):
-    """Work at the study "s"; write the beginning and the end of each trial, and what is reported, to a log."""
-    # A shell that runs the tests in the background has it ignored.
+    """Run trials of the study "s"; write the start and the end of each trial, and all reports, to a log."""
+    # If a shell runs the tests in the background, processes ignore Ctrl-C by default.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def objective(trial):
@@ -37,7 +37,7 @@ def run_worker(url, n_trials, log, seconds):
         with open(log, "a") as file:
             file.write(text + "\n")
 
-    # The same seed in all workers: they must not try the same points for it.
+    # All workers have the same seed, but they must not try the same points.
     study = open_quick(url, sampler=optuna.samplers.TPESampler(seed=0))
     if n_trials is None:
         enqueue_once(study, JOBS)
@@ -45,20 +45,20 @@ def run_worker(url, n_trials, log, seconds):
 
 
 class Workers:
-    """Worker processes, and the log that they write."""
+    """Worker processes, and the log to which they write."""
 
     def __init__(self, folder, url, n_trials):
         self.url, self.n_trials, self.log = url, n_trials, folder / "log"
         self.processes = []
-        # Forked by a process that has imported what they need, they start in milliseconds. What that is to import it
-        # finds through the environment alone.
+        # Workers start in milliseconds if a process that has already imported their modules forks them. That process
+        # finds the modules only through the environment.
         self.context = mp.get_context("forkserver")
         self.context.set_forkserver_preload([__name__])
         with patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)):
             ensure_running()
 
     def start(self, *seconds):
-        """Start a worker for each duration of a trial."""
+        """Start one worker for each given duration of a trial."""
         new = [self.context.Process(target=run_worker, args=(self.url, self.n_trials, self.log, s)) for s in seconds]
         for process in new:
             process.start()
@@ -66,7 +66,7 @@ class Workers:
         return new
 
     def lines(self, kind, process=None):
-        """Return what was written, as tuples of words: the parameters of trials that begin or end."""
+        """Return the log's lines of one kind as tuples of words, such as the parameters of trials that begin or end."""
         lines = [line.split() for line in self.log.read_text().splitlines()] if self.log.exists() else []
         return [tuple(at) for word, pid, *at in lines if word == kind and (process is None or int(pid) == process.pid)]
 
@@ -76,11 +76,11 @@ class Workers:
 
     @property
     def n_dropped(self):
-        """Number of results in vain: on a busy machine a living worker, too, may be silent for the grace period."""
+        """Number of dropped results. On a busy machine even a living worker can be silent for the grace period."""
         return self.said.count("its result is dropped")
 
     def wait_for(self, kind, process):
-        deadline = time.monotonic() + 120  # a machine may be busy
+        deadline = time.monotonic() + 120  # the machine can be busy
         while not self.lines(kind, process):
             assert time.monotonic() < deadline, f"no {kind} in the log: {[p.exitcode for p in self.processes]}"
             time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Baselines lower the variance and leave the gradient as it is."""
+"""Baselines lower the variance of the gradient but do not change its expectation."""
 
 import pytest
 import torch as th
@@ -48,7 +48,7 @@ def test_the_value_baseline_explains_what_the_state_tells_of_the_cost(rollouts):
 
 @pytest.fixture
 def long_rollouts():
-    """Six episodes of a state that wanders, half of which end early; a cost that the state tells exactly."""
+    """Return six episodes of a random walk, of which half end early; the state determines the cost exactly."""
     states = 0.95 ** th.arange(200.0)[:, None, None] * th.randn(6, 1) + 0.3 * th.randn(200, 6, 1)
     alive = th.ones(200, 6)
     alive[120:, ::2] = 0.0
@@ -61,7 +61,7 @@ def test_a_long_horizon_with_few_episodes_has_enough_for_one_regression_that_all
     advantages = regression_advantages(costs, states, alive, 0.5, 0.0)[living]
     targets = cost_to_go(costs, 0.5)[living]
     assert advantages.var() < 0.3 * targets.var()
-    # Step by step three episodes would have to tell what the other three cost.
+    # With a separate fit for each step, three episodes would have to predict the costs of three other episodes.
     per_step = [
         regression_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(0, 198)
     ]
@@ -71,7 +71,7 @@ def test_a_long_horizon_with_few_episodes_has_enough_for_one_regression_that_all
 def test_the_end_of_a_long_horizon_is_told_from_its_middle():
     costs, alive = th.ones(200, 6), th.ones(200, 6)
     advantages = regression_advantages(costs, th.randn(200, 6, 1), alive, 0.9)
-    assert advantages.abs().max() < 1.0  # the cost to come falls from 10 to 1 over the last steps
+    assert advantages.abs().max() < 1.0  # the future cost falls from 10 to 1 over the last steps
 
 
 @pytest.mark.parametrize(("fixture", "more"), [("rollouts", 1e4), ("long_rollouts", 50.0)])
@@ -82,11 +82,11 @@ def test_an_episodes_own_cost_never_enters_its_own_baseline(fixture, more, reque
     changed[:100, 2] += more
     new_baseline = cost_to_go(changed) - regression_advantages(changed, states, alive)
     th.testing.assert_close(new_baseline[:, 2], baseline[:, 2], rtol=0, atol=0.02)
-    assert (new_baseline[:, 3] - baseline[:, 3]).abs().max() > 1  # but it does enter those of the other half
+    assert (new_baseline[:, 3] - baseline[:, 3]).abs().max() > 1  # but it changes the baselines of the other half
 
 
 def test_with_lambda_zero_the_advantage_is_the_residual_of_one_step():
-    # The state foretells the last cost exactly: the first step must not be blamed for it.
+    # The state predicts the last cost exactly, so this cost must not change the advantage of the first step.
     states = th.randn(2, N, 1)
     states[1] = states[0]
     costs = th.stack([th.zeros(N), 50 * states[1, :, 0]])
@@ -116,7 +116,7 @@ def test_dead_episodes_do_not_enter_the_regression(rollouts):
     living = alive > 0
     first, second = (regression_advantages(costs, x, alive, 1.0)[living] for x in (garbage, zeros))
     assert th.isfinite(first).all()
-    # Only the places of the bumps may depend on dead states: the quality of the fit must not.
+    # Dead states may change the positions of the basis functions, but not the quality of the fit.
     assert first.var().item() == pytest.approx(second.var().item(), rel=0.1)
 
 
@@ -139,7 +139,7 @@ def test_the_value_of_a_state_far_from_all_others_is_not_extrapolated():
     n = 400
     states = th.linspace(-1, 1, n)[None, :, None].clone()
     costs = 10 * states[..., 0]
-    states[0, 0] = 5.0  # predicted from the other fold, whose states are within [-1, 1]: a line through them gives 40
+    states[0, 0] = 5.0  # the other fold predicts it with states within [-1, 1]; extrapolated linearly, it would be 40
     baseline = costs - regression_advantages(costs, states, th.ones(1, n), 1.0, 1.0)
     assert baseline[0, 0] == pytest.approx(10.0)
     assert baseline.abs().max() <= 10.0
@@ -147,8 +147,8 @@ def test_the_value_of_a_state_far_from_all_others_is_not_extrapolated():
 
 def test_the_ridge_regression_is_that_of_its_penalty_and_weights():
     features, targets = th.tensor([[[2.0], [4.0], [3.5]]]), th.tensor([[1.0, 5.0, 100.0]])
-    weight = th.tensor([[1.0, 1.0, 0.0]])  # the third is predicted only
-    # Deviations from the means, 3 and 3, are -1, 1 and -2, 2: a slope of 4 / (2 + 0.5).
+    weight = th.tensor([[1.0, 1.0, 0.0]])  # the third sample is only predicted
+    # The deviations from the means 3 and 3 are (-1, 1) and (-2, 2), which gives a slope of 4 / (2 + 0.5).
     expected = [3 - 1.6, 3 + 1.6, 3 + 0.5 * 1.6]
     assert _ridge(features, targets, weight)[0].tolist() == pytest.approx(expected)
 
@@ -159,5 +159,5 @@ def test_the_value_network_is_told_the_discounted_time_that_is_left(gamma):
     value.network.forward = lambda inputs: inputs[..., -1:]
     left = cost_to_go(th.ones(20, 3), gamma)
     th.testing.assert_close(value(th.randn(20, 3, 2), gamma), left / left[0])
-    # Episodes that have all ended early are as far from the horizon as the others.
+    # If all episodes have ended early, the time left is still counted up to the horizon.
     th.testing.assert_close(value(th.randn(5, 3, 2), gamma), (left / left[0])[:5])

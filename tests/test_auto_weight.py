@@ -1,4 +1,4 @@
-"""The weight that follows a cost limit, a number or a share of the improvement: ``beta="auto"``."""
+"""With ``beta="auto"`` the weight follows a cost limit, which is a number or a share of the improvement."""
 
 import math
 
@@ -12,7 +12,7 @@ from sb3_tdpg.auto_weight import LEVEL_EPOCHS, WINDOW, AutoWeight, share_of
 
 @pytest.mark.parametrize(("limit", "above", "met", "below"), [(10.0, 12.0, 9.0, 5.0), (-400.0, -100.0, -450.0, -490.0)])
 def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above(limit, above, met, below):
-    """Costs are negative returns, and many environments pay rewards."""
+    """Costs are negative returns, so they are negative in environments with positive rewards."""
     weight = AutoWeight(cost_limit=limit)
     for _ in range(5):
         weight.update(cost=above, information=4.0)
@@ -35,7 +35,7 @@ def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_on
         assert start * 4.0 == pytest.approx(limit - best)
         weight.update(cost=best, information=4.0)
         assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
-        weight.update(cost=(best + limit) / 2, information=4.0)  # the aim
+        weight.update(cost=(best + limit) / 2, information=4.0)  # the target cost
         assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
         weight.update(cost=above, information=4.0)
         assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5)))
@@ -52,7 +52,7 @@ def test_a_constant_in_every_cost_does_not_change_the_weight_of_a_share():
             weight.update(cost + constant, information=4.0, progress_remaining=1 - epoch / 100)
         values.append(weight.value)
     assert values == pytest.approx([values[0]] * 3, rel=1e-6)
-    assert values[0] > 4.5 / 4  # it has grown since its start
+    assert values[0] > 4.5 / 4  # the weight has grown since its start
 
 
 @pytest.mark.parametrize(("cost", "is_penalised"), [(5.0, True), (0.0, False)])
@@ -111,16 +111,16 @@ def test_a_policy_gradient_model_may_go_on_with_a_cost_limit(tmp_path):
         return TDPG.load(tmp_path / "pg", env=lava_env(), **kwargs, device="cpu")
 
     assert train_epochs(load(beta="auto", cost_limit=1e4), 1).mi_coef > 0
-    loaded = load(cost_limit=8.0)  # which asks for the weight, too
+    loaded = load(cost_limit=8.0)  # a limit implies beta="auto"
     assert (loaded.beta, loaded.cost_limit) == ("auto", 8.0)
-    loaded = load(beta="auto")  # the improvement counts from the first epoch of all
+    loaded = load(beta="auto")  # the improvement is measured from the very first epoch
     assert (loaded.cost_limit, loaded.auto_weight.first_cost) == ("95%", model.first_cost)
     with pytest.raises(ValueError, match=r"cost_limit=8.0.*beta=0.5"):
         load(beta=0.5, cost_limit=8.0)
 
 
 def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised():
-    """The selection compares epochs by it."""
+    """The selection compares epochs by their information."""
     trained = []
     for arguments in (dict(beta="auto", cost_limit=1e-3), dict(beta=math.inf)):
         model = tiny_tdpg(**arguments)
@@ -132,7 +132,7 @@ def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised()
 
 
 def test_the_weight_falls_at_most_by_twice_the_rate():
-    """One bad epoch does not undo many good ones."""
+    """One bad epoch must not cancel the effect of many good epochs."""
     weight = AutoWeight(cost_limit=10.0)
     weight.update(10.0, 1.0)
     before = weight.value
@@ -146,7 +146,7 @@ def test_the_weight_falls_at_most_by_twice_the_rate():
 
 
 def costs_that_level_off(first, best, n_falling=20, n_level=20):
-    """Fall linearly, then stay."""
+    """Return costs that fall linearly and then stay constant."""
     return [*np.linspace(first, best, n_falling), *[best] * n_level]
 
 
@@ -165,7 +165,8 @@ def test_with_a_share_the_weight_starts_once_the_cost_has_levelled_off():
         weight.update(cost, information=4.0)
         values.append(weight.value)
     started = int(np.flatnonzero(values)[0])
-    # Not while it falls; and when a window of five epochs differs by less than the slack from one ten epochs before.
+    # The weight starts after the cost has fallen: when the mean over five epochs differs from the mean ten epochs
+    # earlier by less than the slack.
     assert 20 < started < 20 + WINDOW + LEVEL_EPOCHS
     assert weight.information_before == 4.0
     assert values[started] == pytest.approx(0.1 * 100.0 / 4.0)  # the penalty equals the slack
@@ -233,7 +234,7 @@ def test_the_share_goes_on_where_it_was_after_a_save(tmp_path):
     model.save(tmp_path / "model")
     loaded = TDPG.load(tmp_path / "model", env=env, device="cpu")
     assert vars(loaded.auto_weight) == vars(model.auto_weight)
-    # Another share begins anew, but the improvement counts from the first epoch of all.
+    # With another share the weight starts again, but the improvement is measured from the very first epoch.
     other = TDPG.load(tmp_path / "model", env=env, cost_limit="70%", device="cpu")
     assert (other.mi_coef, other.auto_weight.first_cost) == (0.0, model.first_cost)
 

@@ -1,4 +1,4 @@
-"""Bad input is refused before any training, with an error that says what to do."""
+"""Bad input raises an error before any training, and the error says what to do."""
 
 import io
 import math
@@ -34,7 +34,7 @@ class NamedTwice(LavaEnv):
     state_names = ("d", "d")
 
 
-# Name of the case: what is done, and what the message must say (regular expressions, in any order).
+# For each case: the arguments, and the regular expressions that the message must match, in any order.
 ARGUMENTS = {
     **{f"policy {name}": (dict(policy=name), f"policy='{name}'", r"\['TRVPolicy'\]", "takes vectors, images and dicts")
        for name in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy", "MlpLstmPolicy")},
@@ -199,7 +199,7 @@ def test_a_bad_argument_is_refused_with_the_mend(case):
     ("n_episods", ": did you mean 'n_episodes'"),
     ("xyz", "$"),
     ("n_step", ": use epoch_steps"),
-    ("n_steps", ": use epoch_steps"),  # this one and those below are PPO's
+    ("n_steps", ": use epoch_steps"),  # from here on, the arguments are PPO's
     ("ent_coef", ".*action_log_var_init"),
     ("use_sde", ".*encoder_log_var_init"),
 ])  # fmt: skip
@@ -218,7 +218,7 @@ def half(path):
 
 
 def rewritten(change):
-    """Return a function that saves a model in which ``change(name, content)`` replaces each part; ``None`` drops it."""
+    """Return a function that saves a model with parts replaced by ``change(name, content)``; ``None`` drops a part."""
 
     def write(path):
         tiny_tdpg().save(path)
@@ -331,7 +331,7 @@ def test_a_callback_or_a_policy_of_its_own_refuses_a_bad_argument(make, kwargs, 
 
 
 class Payload:
-    """Runs code when it is unpickled."""
+    """An object that runs code when it is unpickled."""
 
     def __init__(self, marker):
         self.marker = marker

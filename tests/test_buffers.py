@@ -1,4 +1,4 @@
-"""The buffer keeps whole episodes, time step by episode."""
+"""The buffer stores whole episodes; its axes are time step and episode."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def rows(n, value):
 
 
 def fill(buffer, value_of_step=lambda t: 1.0):
-    """Store an epoch of N episodes of T steps."""
+    """Store an epoch of N episodes with T steps each."""
     for t in range(T):
         buffer.add_step(np.full(N, t), np.arange(N), **rows(N, value_of_step(t)))
     buffer.full = True
@@ -97,7 +97,7 @@ def test_where_no_episode_runs_the_encoder_has_a_density(buffer):
     buffer.full = True
     stds = buffer.episode_batch().stds
     assert (stds[0] == 7).all()
-    assert (stds[1:] == 1).all()  # its logarithm is finite
+    assert (stds[1:] == 1).all()  # so that the logarithm is finite
 
 
 # -- which column of the buffer an environment fills -----------------------------------------------------------------
@@ -108,7 +108,7 @@ def test_each_environment_runs_its_share_of_a_number_of_episodes():
     assert episodes.column.tolist() == [0, 1]
     episodes.advance(np.array([True, False]))
     assert episodes.column.tolist() == [2, 1]
-    episodes.advance(np.array([True, False]))  # its second and last one
+    episodes.advance(np.array([True, False]))  # the second and last episode of environment 0 ends
     assert episodes.column.tolist() == [-1, 1]
     assert episodes.running.tolist() == [1]
     episodes.advance(np.array([True, True]))
@@ -118,10 +118,10 @@ def test_each_environment_runs_its_share_of_a_number_of_episodes():
 
 def test_with_a_number_of_steps_an_episode_begins_as_long_as_fewer_are_stored():
     episodes = RunningEpisodes(2, n_episodes=None, n_steps=6, horizon=9)
-    episodes.advance(np.array([False, True]))  # two steps
+    episodes.advance(np.array([False, True]))  # one step of each of the two environments
     assert episodes.column.tolist() == [0, 2]
     episodes.advance(np.array([False, False]))
-    episodes.advance(np.array([True, False]))  # the sixth step ends the epoch when the episodes are over
+    episodes.advance(np.array([True, False]))  # after the sixth step the epoch ends with the running episodes
     assert episodes.column.tolist() == [-1, 2]
     episodes.advance(np.array([True, True]))
     assert episodes.running.size == 0

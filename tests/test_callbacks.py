@@ -1,4 +1,4 @@
-"""Selection, interruption and divergence."""
+"""Callbacks select policies, stop on an interrupt and detect divergence."""
 
 import json
 import math
@@ -33,7 +33,7 @@ from sb3_tdpg.envs.lava import LavaEnv
 
 
 class Scripted(AtEveryEpoch):
-    """Overwrite what each epoch measured; must come before the selection in the list of callbacks."""
+    """Overwrite the measurements of each epoch; it must come before the selection in the list of callbacks."""
 
     def __init__(self, measured):
         self.policies = {}
@@ -51,9 +51,9 @@ MEASURED = [(50.0, 0.1), (30.0, 3.0), (35.0, 0.4), (25.0, 0.9), (38.0, 0.2), (20
 
 
 @pytest.mark.parametrize(("limits", "chosen"), [
-    (dict(cost_limit=40.0), 4),  # the paper's rule: the lowest information under a cost
+    (dict(cost_limit=40.0), 4),  # the paper's rule: the lowest information under a cost limit
     (dict(cost_limit=32.0), 3),
-    (dict(mi_limit=1.0), 3),  # the lowest cost under an information
+    (dict(mi_limit=1.0), 3),  # the lowest cost under a limit on the information
     (dict(mi_limit=0.3), 4),
     (dict(mi_limit=5.0), 5),
     (dict(cost_limit=45.0, mi_limit=0.5), 2),
@@ -65,7 +65,7 @@ def test_the_epoch_that_the_rule_asks_for_is_kept_and_restored(limits, chosen):
     best = selection.restore(model)
     assert best.epoch == chosen
     assert (best.cost, best.information) == pytest.approx(MEASURED[chosen], rel=1e-5)
-    # The policy is the one that made these rollouts, not the one after their update.
+    # The selected policy is the one that made these rollouts, before their update.
     assert_same_parameters(parameters(model.policy), script.policies[chosen])
 
 
@@ -107,10 +107,10 @@ def test_the_first_epoch_with_a_penalty_has_critics_that_were_fitted_to_it():
 def test_a_negative_or_broken_estimate_does_not_win():
     measured = [(30.0, -50.0), (30.0, math.nan), (20.0, 0.0), (math.nan, 0.0)]
     script, selection = Scripted(measured), SelectionCallback(cost_limit=40.0)
-    model = tiny_tdpg(baseline="mean", beta=math.inf)  # no update is made from the scripted costs
+    model = tiny_tdpg(baseline="mean", beta=math.inf)  # train() is replaced, so the scripted costs cause no update
     model.train = lambda: setattr(model, "epoch", model.epoch + 1)
     train_epochs(model, 4, callback=[script, selection])
-    # -50 counts as 0, and the lower cost decides.
+    # An information of -50 counts as 0, so the lower cost decides.
     assert selection.best.epoch == 2
 
 
@@ -151,7 +151,7 @@ def test_a_selection_goes_on_with_a_resumed_training_and_starts_anew_with_a_new_
     path = tmp_path / "best"
     train_epochs(model, 3, callback=[Scripted(MEASURED), SelectionCallback(cost_limit=40.0, save_path=path)])
     resumed = SelectionCallback(cost_limit=40.0, save_path=path)
-    # Epochs 3 and 4 are worse than epoch 2 of before.
+    # Epochs 3 and 4 are worse than epoch 2 of the first training.
     worse = [None] * 3 + [(39.0, 5.0)] * 2
     train_epochs(model, 2, callback=[Scripted(worse), resumed], reset_num_timesteps=False)
     assert resumed.best.epoch == 2
@@ -171,7 +171,7 @@ def test_a_selection_of_another_training_or_under_looser_limits_is_not_taken_ove
     model = train_epochs(tiny_tdpg(), 1)
     train_epochs(model, 1, callback=tighter, reset_num_timesteps=False)
     assert tighter.best is None
-    train_epochs(tiny_tdpg(), 1, callback=SelectionCallback(cost_limit=1.0, save_path=path))  # selects nothing
+    train_epochs(tiny_tdpg(), 1, callback=SelectionCallback(cost_limit=1.0, save_path=path))  # selects no policy
     assert not path.with_suffix(".json").exists()
 
 
@@ -320,12 +320,12 @@ def test_after_an_interrupted_training_with_a_progress_bar_the_next_one_shows_it
     (39, "infonce", 0.1, True),
     (4, "logdet", 0.1, False),
     (4, "vib", 0.1, False),
-    (4, "mine", np.inf, False),  # without a penalty no number is too few
+    (4, "mine", np.inf, False),  # without a penalty any number of episodes is enough
 ])  # fmt: skip
 def test_too_few_episodes_for_the_critics_are_reported_with_the_number_needed(
     n_episodes, mi_estimator, beta, warns, recwarn
 ):
-    # Two TRVs and two components of the state.
+    # There are two TRVs and two components of the state.
     train_epochs(tiny_tdpg(n_episodes=n_episodes, mi_estimator=mi_estimator, beta=beta), 1)
     messages = [str(w.message) for w in recwarn if "are too few for" in str(w.message)]
     assert len(messages) == warns

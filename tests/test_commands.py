@@ -1,4 +1,4 @@
-"""``sweep``, ``push`` and ``pull`` from the command line; what they do is tested with the functions that they call."""
+"""``sweep``, ``push`` and ``pull`` work from the command line; other tests cover the functions that they call."""
 
 import json
 import re

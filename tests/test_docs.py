@@ -1,5 +1,5 @@
 """
-The Python of the README, the documentation and its notebooks runs; everything that the map of the paper names exists.
+The Python code of the README, the documentation and its notebooks runs, and all names in the map of the paper exist.
 """
 
 import importlib
@@ -24,15 +24,15 @@ from sb3_tdpg.robustness import PERTURBATIONS
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
 
-# A block after <!-- no-run --> is run elsewhere, with Ray or a stand-in for the Hub (distributed/test_ray_vec_env.py,
-# hub/test_transfer.py); what stands in an indented or quoted block is not one.
+# A block after <!-- no-run --> is run by another test, with Ray or with a fake Hub (distributed/test_ray_vec_env.py,
+# hub/test_transfer.py). An indented or quoted block does not count.
 BLOCK = re.compile(r"^(?P<skip><!-- no-run -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 POLICIES = sorted((ROOT / "docs" / "policies").glob("*.zip"))
 PAPER_MAP = ROOT / "docs" / "paper_map.md"
 
-# Everything that has a number in the paper's PDF, but for plain sections.
+# Everything that has a number in the paper's PDF, except sections.
 PAPER_NUMBERS = {
     *(f"Equation {i}" for i in range(1, 17)),
     "Theorem II.1",
@@ -44,7 +44,7 @@ PAPER_NUMBERS = {
 
 MAX_EPOCHS = 2
 
-# The other pages take up to minutes and are marked slow.
+# All other pages can take minutes and are marked slow.
 QUICK_PAGES = {
     "README.md",
     "docs/guide/quickstart.md",
@@ -56,7 +56,7 @@ QUICK_PAGES = {
 
 
 def python_blocks(page):
-    """Line number and code of each block of a page that is to be run."""
+    """Yield line number and code of each block of a page that this test runs."""
     text = page.read_text(encoding="utf-8")
     for match in BLOCK.finditer(text):
         if match["skip"] is None:
@@ -69,7 +69,7 @@ def name_of(page):
 
 @pytest.fixture
 def brief_training(monkeypatch):
-    """Make every call of ``learn`` take a few epochs with a few critic steps, whatever the page asks for."""
+    """Limit every call of ``learn`` to a few epochs with a few critic steps."""
     learn, learn_ppo, init = TDPG.learn, PPO.learn, CriticEstimator.__init__
 
     def brief_learn(self, total_timesteps=1_000_000, *args, **kwargs):
@@ -88,7 +88,7 @@ def brief_training(monkeypatch):
 
 @pytest.fixture
 def registries(registry):
-    """Forget the environments, the perturbations and the estimators that a page registers."""
+    """Remove the environments, the perturbations and the estimators that a page registers."""
     before = [(table, dict(table)) for table in (PERTURBATIONS, ESTIMATORS)]
     yield
     for table, entries in before:
@@ -97,23 +97,23 @@ def registries(registry):
 
 
 def run_in_order(blocks, source):
-    """Run blocks of code, given with their first line, as one program that must not warn; return what they define."""
+    """Run blocks of code, with their line numbers, as one program without warnings; return its namespace."""
     namespace = {"__name__": "__main__"}
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # what a page shows must not warn
-        # Not of the page's making: tqdm.rich, which SB3's progress bar uses, calls itself experimental.
-        # A training that was cut short may not have met its cost limit.
+        warnings.simplefilter("error")  # the code of a page must not give a warning
+        # Two warnings are not caused by the page: tqdm.rich, which SB3's progress bar uses, is experimental; and a
+        # shortened training may miss its cost limit.
         warnings.filterwarnings("ignore", message="no epoch met cost_limit|the training was too short")
         warnings.filterwarnings("ignore", message="rich is experimental")
         warnings.filterwarnings("ignore", module=r"torch\.")
         for line, code in blocks:
-            # Blank lines in front, so that a traceback shows the line of the page.
+            # Blank lines come first, so that a traceback shows the line number in the page.
             exec(compile("\n" * (line - 1) + code, str(source), "exec"), namespace)
     return namespace
 
 
 def parameters_of(pages):
-    """Mark the pages that take minutes as slow."""
+    """Return the pages as parameters; pages that take minutes are marked slow."""
     return [pytest.param(p, marks=() if name_of(p) in QUICK_PAGES else pytest.mark.slow, id=name_of(p)) for p in pages]
 
 
@@ -150,7 +150,7 @@ def test_a_published_policy_loads_and_costs_what_its_page_says(policy):
 
 
 def code_cells(notebook):
-    """Code of each cell, in order; a notebook is JSON, and its code plain Python."""
+    """Return the code of each cell, in order; a notebook is JSON that contains plain Python."""
     for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
         if cell["cell_type"] == "code":
             yield 1, "".join(cell["source"])
@@ -158,7 +158,7 @@ def code_cells(notebook):
 
 @pytest.fixture
 def no_window(monkeypatch):
-    """Draw figures into memory."""
+    """Draw figures in memory instead of in a window."""
     backend = matplotlib.get_backend()
     matplotlib.use("Agg")
     yield
@@ -209,7 +209,7 @@ def test_a_notebook_is_kept_without_outputs(notebook):
 
 
 def numbers_of_the_paper(text):
-    """Find the numbers that a text cites: "Equations 12 and 13" are Equation 12 and Equation 13."""
+    """Return the numbers that a text cites; "Equations 12 and 13" gives Equation 12 and Equation 13."""
     number = r"(?:[IVX]+\.\d|\d+|[IVX]+)\b"
     kinds = "Equation|Theorem|Algorithm|Footnote|Table|Figure"
     found = set()

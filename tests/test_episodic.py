@@ -1,4 +1,4 @@
-"""Rollouts of whole episodes: where an epoch ends, and what follows an error."""
+"""Rollouts have whole episodes: these tests check the end of an epoch and the state after an error."""
 
 import copy
 import math
@@ -16,9 +16,9 @@ from sb3_tdpg import TDPG, MINECallback, TrainingDivergedError
 def test_the_last_epoch_takes_the_steps_that_are_left():
     model = TDPG("TRVPolicy", "CartPole-v1", epoch_steps=400, batch_size=100, n_envs=1, seed=0, device="cpu").learn(600)
     assert model.epoch == 2
-    assert 600 <= model.num_timesteps < 700  # less than an episode more
+    assert 600 <= model.num_timesteps < 700  # at most one more episode
     before = model.num_timesteps
-    model.learn(1, reset_num_timesteps=False)  # a tenth of an epoch is the least
+    model.learn(1, reset_num_timesteps=False)  # the minimum is a tenth of an epoch
     assert 40 <= model.num_timesteps - before < 140
 
 
@@ -50,13 +50,14 @@ def test_the_log_counts_the_stored_episodes_only():
         def write(self, key_values, key_excluded, step=0):
             rows.append(dict(key_values))
 
-    env = VecMonitor(DummyVecEnv([lambda: CountdownEnv(0, [4]), lambda: CountdownEnv(1, [1])]))  # which goes on
+    # Environment 1 continues after its episode of one step, but its further episodes are not stored.
+    env = VecMonitor(DummyVecEnv([lambda: CountdownEnv(0, [4]), lambda: CountdownEnv(1, [1])]))
     model, rows = tiny_tdpg(env, n_episodes=2), []
     model.set_logger(Logger(None, [Rows()]))
     model.learn(2, callback=AtEveryStep(lambda each: each.model.dump_logs() is None), log_interval=None)
     assert [info["l"] for info in model.ep_info_buffer] == [1, 4]
     assert len(rows) == 4
-    assert not any("rollout/ep_cost_mean" in row for row in rows)  # of episodes that are not over
+    assert not any("rollout/ep_cost_mean" in row for row in rows)  # the mean would include unfinished episodes
 
 
 def test_a_list_of_callbacks_of_the_user_s_own_keeps_its_hooks():
@@ -92,4 +93,4 @@ def test_after_an_error_the_next_training_begins_with_new_episodes():
         model.learn(12, callback=AtEveryEpoch(poison))
     before = np.array(env.get_attr("n_resets"))
     model.learn(12, reset_num_timesteps=False)
-    assert (env.get_attr("n_resets") - before == 2).all()  # at its start, and after its episode
+    assert (env.get_attr("n_resets") - before == 2).all()  # one reset at the start and one after the episode

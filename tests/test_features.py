@@ -1,4 +1,4 @@
-"""What stands before the encoder: the kind of an observation, the scale of depth images, the layers for images."""
+"""Preprocessing before the encoder: the kind of an observation, the scale of depth images, the layers for images."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_pixels_are_pooled_to_their_means(shape):
 
 
 def test_a_texture_finer_than_the_layers_step_is_seen_as_its_mean():
-    """Stripes of one pixel that move by a pixel: without pooling, the features of a random layer move with them."""
+    """One-pixel stripes move by a pixel; without pooling, the features of a random layer would change."""
     space = spaces.Box(0, 255, (3, 24, 24), np.uint8)
     stripes = np.zeros((2, 3, 24, 24), np.uint8)
     stripes[0, :, :, ::2] = stripes[1, :, :, 1::2] = 255
@@ -65,7 +65,7 @@ def test_a_keypoint_moves_in_proportion_to_what_moves_in_the_image(axis):
     cnn = TRVCnn(space, layers=((8, 6, 2), (5, 4, 2)), keypoints=True)
     first = th.full((1, 1, 64, 48), 0.8)
     first[:, :, 18:30, 16:26] = 0.1
-    images = th.cat([first.roll(shift, axis) for shift in (-4, 0, 4, 8)])  # the layers' step is 4 pixels
+    images = th.cat([first.roll(shift, axis) for shift in (-4, 0, 4, 8)])  # the layers' total stride is 4 pixels
     x_and_y = cnn(images).view(4, 5, 2)
     moved = th.diff(x_and_y, dim=0)  # (3, channels, 2)
     along, across = moved[..., 3 - axis], moved[..., axis - 2]
@@ -87,7 +87,7 @@ def test_keypoints_need_a_map_and_small_depth_images_have_the_papers_layers():
 
 
 def test_the_convolutions_can_stand_in_sb3s_own_policies():
-    """SB3 initialises weights orthogonally, which needs them contiguous."""
+    """SB3 initialises weights orthogonally, which needs contiguous weights."""
     env = ToyEnv(spaces.Box(0, 255, (3, 20, 16), np.uint8))
     PPO("CnnPolicy", env, policy_kwargs=dict(features_extractor_class=TRVCnn), n_steps=8, batch_size=8).learn(8)
 
@@ -96,7 +96,7 @@ def test_the_convolutions_can_stand_in_sb3s_own_policies():
     (0.2, 0.7, (-1.0, 0.0, 1.0)),
     (0.0, 2.0, (-1.0, 0.0, 1.0)),
     (-1.0, 1.0, (-1.0, 0.0, 1.0)),
-    (0.5, 0.5, (0.5, 0.5, 0.5)),  # nothing to be brought anywhere
+    (0.5, 0.5, (0.5, 0.5, 0.5)),  # equal bounds: the values do not change
     (0.0, np.inf, (0.0, 1.0, 2.0)),
 ])  # fmt: skip
 def test_images_of_floats_are_brought_from_their_bounds_to_plus_and_minus_one(low, high, expected):

@@ -1,5 +1,5 @@
 """
-Both gradient paths of ``train`` against finite differences of losses written here by hand, and against the truth.
+Both gradient paths of ``train`` agree with finite differences of hand-written losses and with simulated gradients.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs, U action.
 """
@@ -22,7 +22,7 @@ T, N, Z = 3, 6, 2
 
 
 def make_model(**kwargs):
-    """A model in double precision with an epoch of random rollouts, in which two episodes end early."""
+    """Return a model in double precision with an epoch of random rollouts, in which two episodes end early."""
     estimator = kwargs.pop("mi_estimator", "logdet")
     model = TDPG(
         "TRVPolicy",
@@ -60,24 +60,24 @@ def make_model(**kwargs):
     batch = buffer.episode_batch()
     batch = type(batch)(*(each_part(lambda v: v.double(), x) for x in batch))
     buffer.episode_batch = lambda **_: batch
-    # Features are single precision by SB3's preprocessing: exact for these observations.
+    # SB3's preprocessing makes features single precision, which is exact for these observations.
     model.policy.double()
     model.estimator.double()
     return model, batch
 
 
 def train_gradient(model):
-    """Gradient that ``train`` steps along, by parameter."""
+    """Return the gradient of each parameter that ``train`` uses in its step."""
     th.manual_seed(1)
     before = parameters(model.policy)
     model.train()
-    # A step of 1e-9 moves nothing that finite differences would see, but is made: undo it.
+    # The step of 1e-9 is too small for finite differences to detect, but undo it anyway.
     model.policy.load_state_dict(before)
     return {name: p.grad.clone() for name, p in model.policy.named_parameters()}
 
 
 def finite_differences(model, loss, step=1e-5):
-    """Central differences of a loss in every single parameter of the policy."""
+    """Return the central differences of a loss with respect to every parameter of the policy."""
     gradients = {}
     with th.no_grad():
         for name, parameter in model.policy.named_parameters():
@@ -113,7 +113,7 @@ def mlp(network, x, t):
 
 
 def gaussian(outputs, floor, log_maximum):
-    """Mean, and variance: the exponential, which levels off at a maximum, and the floor."""
+    """Return the mean and the variance, which is an exponential that saturates at a maximum, plus a floor."""
     mean, log_var = outputs.chunk(2, dim=-1)
     return mean, 1 / ((-log_var).exp() + math.exp(-log_maximum)) + floor
 
@@ -137,7 +137,7 @@ def advantages(batch):
 
 
 def score_objective(model, batch):
-    """sum_t A (log q + log pi) at the stored samples, averaged over episodes."""
+    """Return sum_t A (log q + log pi) at the stored samples, averaged over episodes."""
     total = 0.0
     for t in range(T):
         prev = batch.trvs[t - 1] if t > 0 else th.zeros(N, Z).double()
@@ -148,7 +148,7 @@ def score_objective(model, batch):
 
 
 def unrolled(model, batch):
-    """TRVs, means and variances along the recurrence with the noise held fixed."""
+    """Return TRVs, means and variances along the recurrence with fixed noise."""
     trv, out = th.zeros(N, Z).double(), []
     for t in range(T):
         mean, var = encode(model.policy, batch, t, trv)
@@ -158,7 +158,7 @@ def unrolled(model, batch):
 
 
 def pathwise_objective(model, batch):
-    """sum_t A log pi(u_t | x~_t(noise)), averaged over episodes."""
+    """Return sum_t A log pi(u_t | x~_t(noise)), averaged over episodes."""
     total = 0.0
     for t, (trv, _, _) in enumerate(unrolled(model, batch)):
         total = total + (batch.alive[t] * advantages(batch) * log_pi(model.policy, batch, t, trv)).sum()
@@ -216,7 +216,7 @@ def test_the_information_moves_the_encoder_and_nothing_in_the_action_head(encode
 
 
 def test_the_score_of_the_action_does_not_flow_through_the_trvs():
-    # With log q left out of the loss nothing must be left of the encoder's gradient.
+    # If log q is left out of the loss, the encoder's gradient must be zero.
     model, _ = make_model(beta=math.inf, encoder_gradient="score")
     original = model.policy.trv_log_prob
     model.policy.trv_log_prob = lambda *args: original(*args).detach()
@@ -265,9 +265,9 @@ def test_the_norm_of_the_gradient_is_clipped_as_asked():
 
 def simulated_costs(policy, noises):
     """
-    Cost of each episode of LinearProblem as a function of the parameters, in double precision.
+    Return the cost of each episode of LinearProblem as a function of the parameters, in double precision.
 
-    :param noises: x_0, and for each step: of the sensor, of the TRVs, of the action
+    :param noises: x_0, and for each step the noise of the sensor, of the TRVs and of the action.
     """
     x, *steps = noises
     trv = th.zeros(len(x), policy.trv_dim).double()
@@ -284,7 +284,7 @@ def simulated_costs(policy, noises):
 
 
 def gradients_of_epochs(n_epochs, n, **kwargs):
-    """Gradients of epochs of n episodes of LinearProblem, ``(n_epochs, parameters)``, and the model, which stays."""
+    """Return gradients of epochs with n episodes of LinearProblem, ``(n_epochs, parameters)``, and the fixed model."""
     gradients = []
 
     def remember(model):
@@ -324,7 +324,7 @@ def test_the_expected_gradient_is_that_of_the_true_expected_cost(encoder_gradien
             error = th.sqrt(along.var() / n_epochs + truth_error**2)
             assert abs(along.mean() - truth) < 4.5 * error, (i, along.mean(), truth, error)
             if i == 0:
-                assert truth > 20 * error  # the test could tell a gradient that is 20 % off
+                assert truth > 20 * error  # the test can detect an error of 20 % in the gradient
 
 
 def test_the_pathwise_gradient_varies_less_than_the_score_gradient():
@@ -338,7 +338,7 @@ def test_the_pathwise_gradient_varies_less_than_the_score_gradient():
 
 
 def test_the_actions_density_is_taken_at_the_unclipped_action():
-    # A gradient taken at clipped actions would be biased wherever the bounds bind.
+    # A gradient at clipped actions would be biased if actions are outside the bounds.
     env = LavaEnv(horizon=2)
     env.action_space = spaces.Box(-0.05, 0.05, (1,), np.float32)
     model = TDPG("TRVPolicy", BatchedVecEnv(env, 50), n_episodes=50, beta=math.inf, seed=0, device="cpu").learn(100)

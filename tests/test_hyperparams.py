@@ -1,4 +1,4 @@
-"""The YAML blocks: every key is an argument, every number a number, and every block trains."""
+"""In the YAML blocks every key is an argument, no number is read as text, and every block trains."""
 
 import inspect
 from importlib import resources
@@ -42,9 +42,9 @@ def test_every_block_trains_for_an_epoch(block):
     if settings.get("mi_estimator") == "mine":
         cheap["mi_kwargs"] = {**settings.get("mi_kwargs", {}), "gradient_steps": 2, "warmup_gradient_steps": 2}
     if "batch_size" in settings:
-        cheap["batch_size"] = 20 * 25  # the epoch
+        cheap["batch_size"] = 20 * 25  # the whole epoch
     training = make_training(env_id_of(block), settings, n_episodes=20, seed=0, **cheap)
-    training.model.learn(1, training.callbacks)  # an epoch is the least
+    training.model.learn(1, training.callbacks)  # the minimum is one epoch
     assert training.model.epoch == 1
 
 

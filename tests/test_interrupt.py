@@ -1,4 +1,4 @@
-"""Ctrl-C in a terminal ends a command in one line, with the cursor visible, also while it imports."""
+"""Ctrl-C in a terminal ends a command with one line and a visible cursor, even during imports."""
 
 import os
 import re
@@ -17,17 +17,17 @@ HIDE, SHOW = b"\x1b[?25l", b"\x1b[?25h"
 
 
 def interrupted(arguments, marker):
-    """Run Python in a terminal, press Ctrl-C when it has printed the marker; return exit code and output."""
+    """Run Python in a terminal, and press Ctrl-C after it has printed the marker; return exit code and output."""
     pid, terminal = pty.fork()
     if pid == 0:
-        # A shell starts a job in the background with Ctrl-C ignored, and children inherit that.
+        # A background job of a shell ignores Ctrl-C, and its child processes inherit this setting.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.execv(sys.executable, [sys.executable, *arguments])
     output, pressed = b"", False
     while True:
         try:
             read = os.read(terminal, 65536)
-        except OSError:  # Linux's end of a terminal
+        except OSError:  # on Linux this means that the terminal has been closed
             read = b""
         if not read:
             break

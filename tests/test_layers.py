@@ -1,4 +1,4 @@
-"""The package's layers: imports run down, never up, and there is no circle, between files or folders."""
+"""Modules import only from their own layer or lower layers, without cycles between files or folders."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -8,7 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "sb3_tdpg"
 
-# From the bottom to the top; a folder imports those before it and itself. A file that no row names is the algorithm.
+# The layers from bottom to top. A folder imports from earlier layers and from itself. Files that are not listed belong
+# to the layer "algorithm".
 LAYERS = [
     ["common"],
     ["information"],
@@ -20,7 +21,7 @@ LAYERS = [
     ["cli", "__init__", "__main__"],
 ]
 LEVELS = {name: level for level, names in enumerate(LAYERS) for name in names}
-# What the algorithm does not import before a model needs it.
+# The algorithm imports these modules only when a model needs them.
 ON_DEMAND = {("episodic", "deployment.export"), ("episodic", "robustness.nuisance")}
 
 
@@ -32,7 +33,7 @@ MODULES = {module_of(path): path for path in PACKAGE.rglob("*.py")}
 
 
 def imports(path):
-    """Name the modules of this package that a file imports, but for those that are for type checkers only."""
+    """Yield the modules of this package that a file imports, except imports only for type checkers."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for_types = {
         inner
@@ -75,7 +76,7 @@ def test_folders_make_no_circle():
     for module, others in GRAPH.items():
         targets = {layer_of(other) for other in others}
         folders.setdefault(layer_of(module), set()).update(targets - {layer_of(module)})
-    list(TopologicalSorter(folders).static_order())  # raises a CycleError, which names the circle
+    list(TopologicalSorter(folders).static_order())  # raises a CycleError, which names the cycle
 
 
 def test_files_make_no_circle():

@@ -1,4 +1,4 @@
-"""Ordinary environments: epochs of steps, segments, a value network, pooled information, dicts, and their defaults."""
+"""Environments with long horizons: epochs of steps, segments, value network, pooled information, dicts, defaults."""
 
 import math
 from unittest.mock import Mock
@@ -19,7 +19,7 @@ from sb3_tdpg.information.logdet import LogDet
 
 
 def tiny(env="CartPole-v1", **kwargs):
-    """Build a model with the defaults of ordinary environments and few, small updates."""
+    """Make a model with the defaults for long horizons, and with few and small updates."""
     small = dict(epoch_steps=400, batch_size=100, n_epochs=2, seed=0, device="cpu")
     if "n_episodes" in kwargs:
         del small["epoch_steps"]
@@ -31,7 +31,7 @@ def tiny(env="CartPole-v1", **kwargs):
 
 def test_the_line_of_a_new_user_learns_cartpole():
     model = TDPG("TRVPolicy", "CartPole-v1", seed=0, device="cpu").learn(24_000)
-    assert model.rollout_buffer.episode_costs.mean() < -150  # from -20
+    assert model.rollout_buffer.episode_costs.mean() < -150  # the untrained policy costs -20
 
 
 def test_a_cost_limit_takes_information_out_and_keeps_the_return():
@@ -53,9 +53,9 @@ def test_an_epoch_of_steps_has_whole_episodes_and_stops_as_soon_as_there_are_eno
     batch = model.rollout_buffer.episode_batch(whole_horizon=False)
     lengths = batch.alive.sum(0)
     assert 300 <= lengths.sum() == model.rollout_buffer.alive.sum()
-    # Without the last episode of each environment there were too few.
+    # Without the last episode of each environment there are fewer than 300 steps.
     assert lengths.sum() - lengths.sort().values[-3:].sum() < 300
-    assert len(lengths) > 3  # the buffer has made room
+    assert len(lengths) > 3  # the buffer has grown
     assert len(batch.alive) == lengths.max()
     assert (batch.alive[0] == 1).all()
     assert not batch.prev_trvs[0].any()
@@ -92,7 +92,7 @@ def test_segments_leave_out_what_comes_after_the_end():
     assert parts.alive.shape[1] == sum(math.ceil(n / 5) for n in batch.alive.sum(0).tolist())
     assert (parts.alive[0] == 1).all()
     first = parts.prev_trvs[0]
-    assert (first == 0).all(dim=1).sum() == batch.alive.shape[1]  # one for each episode
+    assert (first == 0).all(dim=1).sum() == batch.alive.shape[1]  # one segment of each episode starts with zeros
     living = parts.alive.bool()
     assert sorted(parts.costs[living].tolist()) == sorted(batch.costs[batch.alive.bool()].tolist())
 
@@ -107,7 +107,7 @@ def test_minibatches_count_steps(monkeypatch):
 
 
 def test_the_first_ratio_of_an_epoch_is_one():
-    """Statistics of the observations must not change between the rollouts and their gradients."""
+    """The statistics of the observations must not change between the rollouts and their gradients."""
     model = tiny(n_epochs=1, batch_size=400, normalize_advantage=False).learn(800)
     assert model.logger.name_to_value["train/approx_kl"] == pytest.approx(0.0, abs=1e-4)
     assert model.epoch >= 2
@@ -198,7 +198,7 @@ def test_the_observation_and_its_change_are_in_the_first_trvs_from_the_start():
     policy.changes.share.copy_(th.tensor([1.0, 0.5, 0.0]))
     policy.changes.norm.var.copy_(th.tensor([0.04, 0.04, 0.04]))
     with th.no_grad():
-        for parameter in policy.encoder.parameters():  # all that is left is what skips the encoder
+        for parameter in policy.encoder.parameters():  # only the connections that skip the encoder are left
             parameter.zero_()
     shown, before = th.tensor([[0.3, -0.9, 0.2]]), th.zeros(1, policy.trv_dim)
     before[0, :3] = th.tensor([0.2, -0.8, 0.5])
@@ -208,7 +208,7 @@ def test_the_observation_and_its_change_are_in_the_first_trvs_from_the_start():
     np.testing.assert_allclose(mean[0, 3:6], [0.1 / 0.2, 0.5 * -0.1 / 0.2, 0.0], rtol=1e-4, atol=1e-6)
     assert not mean[0, 6:].any()
     first, _ = policy.encoder_density(shown, th.zeros_like(before), np.zeros(1, int))
-    assert not first[0, 3:].detach().any()  # nothing has changed yet
+    assert not first[0, 3:].detach().any()  # there are no changes at the first step
 
 
 def test_what_skips_the_encoder_needs_as_many_trvs():
@@ -226,7 +226,7 @@ def test_what_skips_the_encoder_needs_as_many_trvs():
 
 @pytest.mark.parametrize("shows_velocity", [True, False])
 def test_changes_count_where_they_say_what_the_observation_does_not(shows_velocity):
-    """A mass on a spring, pushed at random: its last displacement tells the next one unless its velocity is seen."""
+    """A mass on a spring is pushed at random; its last displacement predicts the next unless it shows its velocity."""
     generator = np.random.default_rng(0)
     state, seen = generator.normal(size=(40, 2)), []
     for _ in range(50):
@@ -265,7 +265,7 @@ def test_the_value_network_sees_changes_where_observations_stand_in_for_the_stat
     assert with_state.value_function.changes is None
     partial.learn(1000)
     for changes in (partial.value_function.changes, partial.policy.changes):
-        assert (changes.share > 0.3).all()  # below 0.05 where velocities are shown
+        assert (changes.share > 0.3).all()  # if velocities are shown, the share is below 0.05
 
 
 def test_the_noise_of_the_actions_is_a_share_of_their_range():
@@ -289,8 +289,8 @@ def test_the_variance_of_the_actions_is_one_parameter_unless_asked_for():
     before = stds[None][0].item()
     model = tiny("Pendulum-v1").learn(800)
     after = model.policy.action_density(th.zeros(1, model.policy.trv_dim), np.zeros(1, int)).distribution.stddev
-    assert after.item() != pytest.approx(before, rel=1e-4)  # it is learnt
-    assert not hasattr(tiny("CartPole-v1").policy, "action_log_var")  # nothing to learn with discrete actions
+    assert after.item() != pytest.approx(before, rel=1e-4)  # the standard deviation is learnt
+    assert not hasattr(tiny("CartPole-v1").policy, "action_log_var")  # discrete actions have no variance
 
 
 def test_a_saved_model_predicts_and_continues_the_same(tmp_path):
@@ -315,7 +315,7 @@ def test_a_camera_beside_joints_is_learnt_from(horizon, tmp_path):
     env = ToyEnv(observation_space=CAMERA_AND_JOINTS, horizon=horizon)
     model = TDPG("TRVPolicy", env, n_episodes=4, beta=10.0, seed=0).learn(2 * 4 * horizon)
     assert model.epoch == 2
-    assert model.state_dim == 1  # what the environment says, and not the joints
+    assert model.state_dim == 1  # the state from the environment, not the joints
     model.save(tmp_path / "model")
     observation, _ = env.reset(seed=0)
     models = (model, TDPG.load(tmp_path / "model"))
@@ -350,4 +350,4 @@ def test_actions_in_double_precision_are_learnt_and_stay_in_their_bounds():
     model = tiny(toy_vec_env(action_space=space, horizon=50), epoch_steps=100).learn(200)
     action, _ = model.predict(model.observation_space.sample())
     assert space.contains(action.astype(np.float64))
-    assert model.policy.action_range.dtype == th.float32  # everything is computed in single precision
+    assert model.policy.action_range.dtype == th.float32  # all computations use single precision

@@ -1,4 +1,4 @@
-"""The loss functions, by hand."""
+"""The loss functions agree with values that are computed by hand."""
 
 import math
 
@@ -17,7 +17,7 @@ from sb3_tdpg.losses import (
 
 @pytest.mark.parametrize(("alive", "total"), [
     ([[1.0, 1.0], [1.0, 1.0]], 10 + 40 + 90 + 160),
-    ([[1.0, 1.0], [0.0, 1.0]], 10 + 40 + 160),  # a dead step counts nothing, its episode counts
+    ([[1.0, 1.0], [0.0, 1.0]], 10 + 40 + 160),  # a dead step does not count, but its episode does
 ])  # fmt: skip
 def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes(alive, total):
     log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]])
@@ -80,7 +80,7 @@ def test_the_clipped_loss_begins_with_the_policy_gradient():
 
 
 @pytest.mark.parametrize(("ratio", "advantage", "moves"), [
-    (1.5, 1.0, True),  # too likely and too expensive: makes it less likely
+    (1.5, 1.0, True),  # too likely and too expensive: the update makes it less likely
     (0.5, 1.0, False),  # too expensive, and already much less likely
     (1.5, -1.0, False),  # cheap, and already much more likely
     (0.5, -1.0, True),  # cheap, and too unlikely
@@ -109,4 +109,4 @@ def test_the_distance_of_two_policies_is_that_of_the_new_one_from_the_old():
     log_ratio, alive = th.tensor([[1.0, -0.5, 0.0]]), th.tensor([[1.0, 1.0, 0.0]])
     kl, clipped = policy_distance(log_ratio - 3.0, th.full((1, 3), -3.0), alive, 0.5)
     assert kl.item() == pytest.approx(((math.e - 2) + (math.exp(-0.5) - 0.5)) / 2)
-    assert clipped.item() == 0.5  # e - 1 is beyond, 1 - e^-0.5 is not
+    assert clipped.item() == 0.5  # e - 1 is outside the range, 1 - e^-0.5 is inside

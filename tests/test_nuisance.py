@@ -1,4 +1,4 @@
-"""The nuisance of a training: what TDPG puts around its environment, and what the policy then sees and stores."""
+"""The nuisance of a training: the wrappers that TDPG adds, and what the policy then observes and stores."""
 
 import math
 import subprocess
@@ -41,7 +41,7 @@ def ball_env(n=20):
 
 
 def wrappers(model):
-    """The classes around the environment, the outermost first."""
+    """Return the classes of the environment's wrappers, from the outermost to the innermost."""
     env, found = model.env, []
     while hasattr(env, "venv"):
         found.append(type(env))
@@ -68,7 +68,7 @@ def test_with_the_default_for_images_the_policy_sees_changed_ones_each_with_its_
     model = tiny_tdpg(ball_env(), policy_kwargs={})
     first, second = (model.env._perturber(np.full((20, 3, 64, 64), 120, np.uint8)) for _ in range(2))
     assert (np.abs(first.astype(int) - 120).mean(axis=(1, 2, 3)) > 3).mean() > 0.8
-    assert (np.abs(first.astype(int) - second).mean(axis=(1, 2, 3)) > 5).mean() > 0.8  # more than the noise
+    assert (np.abs(first.astype(int) - second).mean(axis=(1, 2, 3)) > 5).mean() > 0.8  # larger than the noise
 
 
 def test_by_default_depth_images_are_noisy_or_lack_pixels_in_three_episodes_of_four():
@@ -77,7 +77,7 @@ def test_by_default_depth_images_are_noisy_or_lack_pixels_in_three_episodes_of_f
     seen = np.concatenate([model.env._perturber(plain) for _ in range(2)])
     offset = seen - 0.45
     noisy, lacking = (offset > 0).any(axis=(1, 2, 3)), (seen == DEPTH.low.min()).mean(axis=(1, 2, 3))
-    assert 0 < (noisy & (abs(offset).mean(axis=(1, 2, 3)) < 0.05)).mean() < 0.6  # 5 % of .5 m
+    assert 0 < (noisy & (abs(offset).mean(axis=(1, 2, 3)) < 0.05)).mean() < 0.6  # 5 % of 0.5 m
     assert 0.2 < (~noisy & (lacking > 0)).mean() < 0.8
     assert lacking.max() < 0.15
     assert 0 < (offset == 0).all(axis=(1, 2, 3)).mean() < 0.6
@@ -89,7 +89,7 @@ def test_the_policy_acts_on_what_it_is_shown_and_the_states_stay_true():
     batch, policy = rollouts(model), model.policy
     offset = batch.observations - batch.states
     assert offset.abs().min() > 1.0
-    th.testing.assert_close(offset, offset[:1].expand_as(offset), rtol=1e-3, atol=1e-5)  # one for an episode
+    th.testing.assert_close(offset, offset[:1].expand_as(offset), rtol=1e-3, atol=1e-5)  # one offset per episode
     trv = th.zeros(20, policy.trv_dim)
     for t in range(model.horizon):
         with th.no_grad():
@@ -117,10 +117,10 @@ NESTED = {
 def test_where_the_observation_stands_in_for_the_state_it_is_the_unperturbed_one(wrap, nuisance):
     env = wrap(make_vec_env("CartPole-v1", 4, seed=0))
     batch = rollouts(tiny_tdpg(env, n_episodes=8, nuisance=nuisance))
-    assert batch.states[0].abs().max() <= 0.05 < batch.observations[0].abs().max()  # where a cart starts
+    assert batch.states[0].abs().max() <= 0.05 < batch.observations[0].abs().max()  # a cart starts within 0.05
     now, following = batch.states[:-1], batch.states[1:]
     runs = batch.alive[1:] > 0
-    moved = now[..., 0] + 0.02 * now[..., 1]  # as the cart does
+    moved = now[..., 0] + 0.02 * now[..., 1]  # the dynamics of the cart
     th.testing.assert_close(following[..., 0][runs], moved[runs], rtol=1e-4, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The package as a user gets it: built, installed alone in a fresh environment, used from another folder."""
+"""The package works for a user: built, installed alone in a new environment, and used from another folder."""
 
 import os
 import re
@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCES = ("sb3_tdpg", "envs", "hyperparams", "setup.cfg", "pyproject.toml", "LICENSE")
 
 IMPORT_ALL = "import sb3_tdpg, sb3_tdpg.envs, sb3_tdpg.hyperparams; "
-# What lies beside the package in a checkout is not part of it.
+# Files and folders beside the package in a checkout are not part of it.
 NOTHING_ELSE = (
     "import importlib.util; "
     "found = [n for n in ('tests', 'docs', 'sb3_tdpg') if importlib.util.find_spec(f'sb3_tdpg.{n}')]; "
@@ -25,7 +25,7 @@ MAKE_LAVA = "import gymnasium, sb3_tdpg; [gymnasium.make(id).reset() for id in (
 
 
 def run(*command: object, cwd: Path, pythonpath: Path | None = None, path: Path | None = None) -> str:
-    """Run a command with no trace of this checkout in its environment; fail with all that it printed."""
+    """Run a command without this checkout in its environment; if it fails, show its output."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     if path is not None:
         environment["PATH"] = f"{path}{os.pathsep}{environment['PATH']}"
@@ -38,12 +38,12 @@ def run(*command: object, cwd: Path, pythonpath: Path | None = None, path: Path 
 
 
 def pip(*arguments: object, cwd: Path) -> None:
-    """Call pip without the network: setuptools comes with the `tests` extra."""
+    """Call pip without the network; the extra `tests` has installed setuptools."""
     run(sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments, cwd=cwd)
 
 
 def copy_sources(folder: Path) -> Path:
-    """Copy what a build needs: setuptools builds in place, and an old build/ would end up in the wheel."""
+    """Copy the files for a build, because setuptools builds in place and would include an old build/."""
     folder.mkdir()
     for name in SOURCES:
         source = REPOSITORY / name
@@ -55,10 +55,10 @@ def copy_sources(folder: Path) -> Path:
 
 
 def make_environment(folder: Path) -> Path:
-    """Make a virtual environment that borrows our dependencies, and return its interpreter.
+    """Create a virtual environment that uses our dependencies, and return its interpreter.
 
-    A folder named in a .pth file goes behind the environment's own packages, and the .pth files inside it are
-    not read: so the dependencies are there without a second install, but an editable install of ours is not.
+    A folder in a .pth file comes after the environment's own packages, and the .pth files inside it are not read. So
+    the dependencies are available without a second installation, but the editable install of this checkout is not.
     """
     venv.create(folder, symlinks=os.name != "nt")
     python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
@@ -78,7 +78,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment into which the wheel was installed."""
+    """Return the interpreter of an environment in which the wheel is installed."""
     folder = tmp_path_factory.mktemp("installed")
     python = make_environment(folder / "venv")
     pip("--python", python, "install", "--no-deps", wheel, cwd=folder)

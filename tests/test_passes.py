@@ -1,4 +1,4 @@
-"""Passes over an epoch's rollouts, and the defaults of arguments left out."""
+"""Updates make several passes over an epoch's rollouts, and missing arguments get their defaults."""
 
 import math
 from itertools import permutations
@@ -13,7 +13,7 @@ from small_problems import parameters, tiny_tdpg, toy_vec_env, train_epochs
 from sb3_tdpg import TDPG
 
 IMAGE = spaces.Box(0, 255, (3, 20, 16), np.uint8)
-PASSES = dict(n_epochs=3, batch_size=40, clip_range=0.2)  # 8 of 20 episodes
+PASSES = dict(n_epochs=3, batch_size=40, clip_range=0.2)  # a minibatch has 8 of 20 episodes
 
 
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
@@ -61,19 +61,19 @@ def test_one_pass_without_clipping_and_one_with_it_are_the_same_step(beta):
 
 @pytest.mark.parametrize("beta", [math.inf, 1 / 75])
 def test_normalising_the_advantages_scales_the_gradient_of_the_whole_objective(beta):
-    """The penalty is divided by what the advantages are divided by: beta keeps its meaning."""
+    """The penalty is divided by the same number as the advantages, so that beta keeps its meaning."""
     gradients = []
     for normalize in (False, True):
         model = train_epochs(tiny_tdpg(beta=beta, normalize_advantage=normalize), 1)
         gradients.append(th.cat([p.grad.flatten() for p in model.policy.parameters()]))
     cosine = th.nn.functional.cosine_similarity(*gradients, dim=0)
-    # Not 1: subtracting the mean of the advantages changes the noise of the gradient.
+    # The cosine is not 1, because subtracting the mean of the advantages changes the noise of the gradient.
     assert cosine.item() > 0.98
     assert gradients[0].norm() > 2 * gradients[1].norm()
 
 
 def test_passes_stop_where_the_clipping_says():
-    """Many passes over the same rollouts leave the policy near the one that made them; without clipping they do not."""
+    """With clipping, the policy stays near the one that made the rollouts, even after many passes over them."""
     distances = []
     for clip_range in (0.05, 1e9):
         model = tiny_tdpg(beta=math.inf, n_epochs=60, clip_range=clip_range, learning_rate=1e-2)
@@ -98,7 +98,7 @@ def test_the_clip_range_may_follow_the_progress():
     assert asked == sorted(asked, reverse=True)
 
 
-# In single precision the sums differ in the last digit.
+# In single precision the sums of the permutations differ in the last digit.
 SAME_SUM = [(0.0, *costs) for costs in permutations([1 / 3, 7 / 3, 11 / 3])]
 
 
@@ -124,10 +124,10 @@ def test_an_epoch_logs_what_it_did():
     assert logged["train/objective"] == pytest.approx(cost + 75 * model.information.sum(), rel=1e-5)
     assert logged["train/n_updates"] == 2
     assert logged["train/trv_std"] == pytest.approx(model.rollout_buffer.stds.mean(), rel=1e-5)
-    # What was minimised is the sum of both parts, of which the penalty is divided as the advantages are.
+    # The minimised loss is the sum of both parts; the penalty is divided in the same way as the advantages.
     assert logged["train/loss"] > logged["train/policy_loss"]
     assert {f"train/{name}" for name in ("mi_loss", "mi_coef", "grad_norm")} <= set(logged)
-    # How far the policy is from that of the rollouts.
+    # The distance of the policy from the policy of the rollouts.
     assert 0 < logged["train/approx_kl"] < 1
     assert 0 <= logged["train/clip_fraction"] < 1
     assert "tensorboard" in model.logger.name_to_excluded["train/n_updates"]

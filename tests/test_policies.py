@@ -1,4 +1,4 @@
-"""The policy step by step, as whole episodes, and with all sorts of spaces."""
+"""The policy acts step by step, encodes whole episodes, and supports many spaces."""
 
 import math
 from types import SimpleNamespace
@@ -34,7 +34,7 @@ def make_policy(observation_space=VECTOR, action_space=ACTION_SPACES["box"], **k
 
 
 def step_through(policy, observations, deterministic):
-    """Call predict T times; return actions, TRVs and the samples that were drawn, each ``(T, N, ...)``."""
+    """Call predict T times; return actions and TRVs, ``(T, N, ...)``, and the results of ``policy.step``."""
     recorded, original = [], policy.step
 
     def record(*args):
@@ -92,7 +92,7 @@ def test_segments_side_by_side_give_the_trvs_of_whole_episodes(n_steps):
     for name in RebuiltTRVs._fields:
         joined = getattr(rebuilt, name).unflatten(1, (-1, 4)).transpose(0, 1).flatten(0, 1)[:5]
         th.testing.assert_close(joined, getattr(whole, name), rtol=1e-4, atol=1e-5)
-    # The gradient reaches the beginning of its segment.
+    # The gradient reaches the start of the segment.
     (gradient,) = th.autograd.grad(rebuilt.trvs[-1].sum(), features)
     assert (gradient.abs().sum(dim=(1, 2)) > 0).all()
 
@@ -102,7 +102,7 @@ def test_deterministic_predictions_repeat_and_stochastic_ones_do_not():
     policy.train()
     observation = np.ones((N, 3), np.float32)
     first, state = policy.predict(observation, deterministic=True)
-    policy.predict(np.zeros((2, 3), np.float32))  # an evaluation in between, as EvalCallback does
+    policy.predict(np.zeros((2, 3), np.float32))  # an evaluation in between, like that of EvalCallback
     second, _ = policy.predict(observation, deterministic=True)
     np.testing.assert_array_equal(first, second)
     assert isinstance(state, tuple)
@@ -120,7 +120,7 @@ def test_the_memory_matters_and_is_cleared_where_an_episode_starts():
     _, memory = policy.predict(5 * observation, deterministic=True)
     kept, start = [x.copy() for x in memory], np.array([True, False] * 3)
     mixed, mixed_state = policy.predict(observation, memory, start, deterministic=True)
-    for x, expected in zip(memory, kept, strict=True):  # what is passed in is not changed
+    for x, expected in zip(memory, kept, strict=True):  # predict does not change its arguments
         np.testing.assert_array_equal(x, expected)
     np.testing.assert_array_equal(mixed[start], fresh[start])
     np.testing.assert_array_equal(mixed_state[0][start], fresh_state[0][start])
@@ -269,7 +269,7 @@ def test_the_paper_s_convolutions_stand_before_the_encoder_of_small_images_and_o
 
 @pytest.mark.parametrize(("kwargs", "channels", "n_features"), [
     (None, 16, 32),
-    (dict(layers=((6, 6, 2), (6, 4, 2)), keypoints=False), 6, 5400),  # the paper's
+    (dict(layers=((6, 6, 2), (6, 4, 2)), keypoints=False), 6, 5400),  # the paper's network
 ])  # fmt: skip
 def test_depth_images_have_the_papers_network_of_grasping_but_for_keypoints(kwargs, channels, n_features):
     space = spaces.Box(0.2, 0.7, (1, 128, 128), np.float32)
@@ -313,7 +313,7 @@ MORE_ACTION_SPACES = {
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
 @pytest.mark.parametrize("space", MORE_ACTION_SPACES.values(), ids=MORE_ACTION_SPACES)
 def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encoder_gradient, tmp_path):
-    # ToyEnv itself asserts that each action is in the space.
+    # ToyEnv asserts that each action is in the space.
     model = tiny_tdpg(toy_vec_env(action_space=space), encoder_gradient=encoder_gradient, beta=0.1)
     before = parameters(model.policy)
     train_epochs(model, 2)
@@ -349,7 +349,7 @@ def test_the_log_probability_of_an_action_is_that_of_its_distribution(name):
         expected = th.distributions.Bernoulli(logits=outputs).log_prob(actions).sum(-1)
     else:
         mean, log_var = outputs.chunk(2, dim=-1)
-        variance = 1 / ((-log_var).exp() + np.exp(-8)) + 1e-5  # exp(log_var), which levels off
+        variance = 1 / ((-log_var).exp() + np.exp(-8)) + 1e-5  # exp(log_var) that saturates
         expected = th.distributions.Normal(mean, variance.sqrt()).log_prob(actions).sum(-1)
     th.testing.assert_close(log_probs, expected, rtol=1e-4, atol=1e-4)
 
@@ -365,7 +365,7 @@ def test_images_train_in_either_layout(space, tmp_path):
     np.testing.assert_array_equal(shown, (127 * (state + 1)).astype(np.uint8))
     env = ToyEnv(observation_space=space)
     observation, _ = env.reset(seed=0)
-    for batch in (observation, np.stack([observation] * 3)):  # as the user's environment gives them
+    for batch in (observation, np.stack([observation] * 3)):  # in the format of the user's environment
         assert model.predict(batch)[0].shape == (*batch.shape[:-3], 1)
     model.save(tmp_path / "model")
     loaded = TDPG.load(tmp_path / "model", env=toy_vec_env(observation_space=space), device="cpu", nuisance="auto")

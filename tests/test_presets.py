@@ -1,4 +1,4 @@
-"""The defaults of each kind of problem, and what one argument says of another."""
+"""Each kind of problem has its defaults, and some arguments determine others."""
 
 import math
 
@@ -80,7 +80,7 @@ def test_learning_without_a_number_of_steps_takes_the_default(monkeypatch):
 
 
 def test_the_one_line_training_in_miniature():
-    """Two epochs on PyBullet's images, from the line that the documentation shows; two rows of the table."""
+    """Train two epochs on PyBullet's images with the line from the documentation, and check two rows of the table."""
     model = TDPG("TRVPolicy", "BallCatch-v0", n_episodes=8, device="cpu").learn(2 * 8 * 25)
     assert model.epoch == 2
     records = evaluate_scenarios(model, BALL_CATCH[:2], 4)
@@ -88,7 +88,7 @@ def test_the_one_line_training_in_miniature():
 
 
 def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping_network():
-    """Two epochs of real grasps, from the line that the documentation shows."""
+    """Train two epochs of simulated grasps with the line from the documentation."""
     model = TDPG("TRVPolicy", "PandaGrasp-v0", n_episodes=16, device="cpu").learn(2 * 16)
     assert model.epoch == 2
     assert (model.beta, model.cost_limit, model.mi_estimator) == ("auto", "95%", "logdet")
@@ -104,13 +104,13 @@ def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping
 @pytest.mark.parametrize(("given", "others"), [
     ({}, {}),
     (dict(cost_limit=3.0), dict(beta="auto")),
-    (dict(cost_limit="90%", beta=0.5), {}),  # which is refused
+    (dict(cost_limit="90%", beta=0.5), {}),  # this is not allowed
     (dict(beta=0.5), dict(cost_limit=None)),
     (dict(beta="auto", cost_limit=None), {}),
     (dict(cost_limit=3.0, beta=None), dict(beta="auto")),
     (dict(n_episodes=20, epoch_steps=None), dict(epoch_steps=None)),
     (dict(epoch_steps=100), dict(n_episodes=None)),
-    (dict(epoch_steps=100, n_episodes=20), {}),  # as is this
+    (dict(epoch_steps=100, n_episodes=20), {}),  # this is not allowed either
 ], ids=words)  # fmt: skip
 def test_a_limit_means_auto_and_episodes_exclude_steps(given, others):
     assert implied(given) == others

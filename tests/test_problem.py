@@ -1,4 +1,4 @@
-"""What environments return is checked before it reaches a network, and what is wrong is named."""
+"""The results of environments are checked before they reach a network, and errors name the problem."""
 
 import re
 
@@ -13,7 +13,7 @@ from sb3_tdpg.envs.lava import LavaEnv
 
 
 class BrokenEnv(ToyEnv):
-    """Returns something else at the second step of its third episode, or at its first reset."""
+    """Return a wrong result at the second step of the third episode, or at the first reset."""
 
     def __init__(self, broken, at_reset=False):
         super().__init__(gives_state=False)
@@ -90,7 +90,7 @@ def test_an_observation_of_a_wrong_shape_is_named_with_its_environment(at_reset)
 
 
 class WrongShapeEnv(ToyEnv):
-    """Says two numbers, and returns three."""
+    """Declare an observation of two numbers, and return three."""
 
     def _observe(self):
         return np.zeros(3, np.float32)

@@ -1,4 +1,4 @@
-"""``make records`` packs the records of single episodes that the checksums name, and refuses others."""
+"""``make records`` packs the records of single episodes that have a checksum, and no other files."""
 
 import importlib.util
 import tarfile
@@ -14,7 +14,7 @@ SPEC.loader.exec_module(make_records)
 
 @pytest.fixture
 def results(tmp_path):
-    """A folder with two records, a summary that is none, and checksums."""
+    """Return a folder with two records, a summary (which is not a record), and checksums."""
     folder = tmp_path / "results"
     (folder / "lava").mkdir(parents=True)
     for name in ("episodes_text.csv.gz", "shifts.csv.xz", "seeds.csv"):

@@ -1,7 +1,8 @@
 """
-One policy epoch of TDPG against the plain loop of ``reference_loop.py``, fed with the same randomness.
+One policy epoch of TDPG equals the simple loop in ``reference_loop.py`` for the same random numbers.
 
-In float64, so that nothing is left of rounding and 1e-5 is generous. Dimension key as there.
+The computation is in float64, so that rounding errors are far below the tolerance of 1e-5. The dimension key is that of
+``reference_loop.py``.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ N_EPISODES = 12
 
 
 class Case(NamedTuple):
-    """One way to configure the epoch."""
+    """One configuration of the epoch."""
 
     beta: float = 1 / 75
     baseline: str = "mean"
@@ -52,7 +53,7 @@ class Recorded(NamedTuple):
 
 @pytest.fixture(autouse=True)
 def float64(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Make everything between the environment and the optimiser float64."""
+    """Use float64 for all computations between the environment and the optimiser."""
     reset = EpisodeBuffer.reset
 
     def reset_in_float64(buffer: EpisodeBuffer) -> None:
@@ -84,13 +85,13 @@ def make_model(case: Case) -> TDPG:
             gradient_steps=case.gradient_steps,
             warmup_gradient_steps=0,
             learning_rate=3e-2,
-            refit_below=-math.inf,  # a fit from scratch has no counterpart in the loop
+            refit_below=-math.inf,  # the loop does not support a fit from scratch
         ),
     )
 
 
 def run_both(case: Case) -> Recorded:
-    """Make one epoch with the batched code, learn its randomness, and make the same epoch with the loop."""
+    """Run one epoch with the batched code, recover its random numbers, and run the same epoch with the loop."""
     model = make_model(case)
     loop = LoopTDPG.copy_of(model)
     critic_inputs: list[th.Tensor] = []
@@ -107,7 +108,7 @@ def run_both(case: Case) -> Recorded:
     has_penalty = model.mi_coef > 0
     fits = [minibatches_of(inputs, batch) for inputs in critic_inputs[: case.gradient_steps]]
     logged = minibatches_of(critic_inputs[n_estimates - 1], batch) if has_penalty else []
-    # The last call is that of the update, with rebuilt TRVs.
+    # The last call comes from the update, with rebuilt TRVs.
     pairings = minibatches_of(critic_inputs[-1], batch) if has_penalty else []
     randomness = replay_randomness(model)._replace(
         minibatches=[list(of_t) for of_t in zip(*fits, strict=True)], pairings=pairings
@@ -126,7 +127,7 @@ def run_both(case: Case) -> Recorded:
 
 
 def replay_randomness(model: TDPG) -> Randomness:
-    """Draw again, from equal generators, what the rollouts of the first epoch drew."""
+    """Draw the random numbers of the first epoch's rollouts again, from generators with the same state."""
     n, horizon = model.n_episodes, model.horizon
     env_rng, _ = seeding.np_random(SEED)
     initial_distance = env_rng.uniform(0.0, 5.0, n)
@@ -140,9 +141,9 @@ def replay_randomness(model: TDPG) -> Randomness:
 
 def minibatches_of(inputs: th.Tensor, batch: EpisodeBatch) -> list[Minibatch]:
     """
-    Find out from the critics' inputs, however they were drawn, from which episodes they come: one for each time step.
+    Return one minibatch for each time step: the episodes from which the critics' inputs come.
 
-    :param inputs: joint samples, then as many marginal ones, ``(T, 2 B, X + Z)``
+    :param inputs: B joint samples, then B marginal samples, ``(T, 2 B, X + Z)``.
     """
     minibatches = []
     for t, rows in enumerate(inputs):
@@ -156,7 +157,7 @@ def minibatches_of(inputs: th.Tensor, batch: EpisodeBatch) -> list[Minibatch]:
 
 
 def find_rows(rows: th.Tensor, table: th.Tensor) -> list[int]:
-    """Return the index in ``table`` of each of ``rows``."""
+    """Return the index in ``table`` of each row in ``rows``."""
     distance, index = (rows[:, None] - table[None]).abs().amax(dim=-1).min(dim=1)
     assert distance.max() < 1e-9, "the critic was shown a sample that is in no episode"
     return index.tolist()
@@ -169,7 +170,7 @@ def batched_advantages(batch: EpisodeBatch, baseline: str) -> list[list[float]]:
 def assert_same_networks(
     batched: list[th.nn.Sequential], loop: list[th.nn.Sequential], *, before: list[th.nn.Sequential]
 ) -> None:
-    """Compare the parameters; they must have moved, too."""
+    """Compare the parameters, and check that they have changed."""
     for ours, reference, initial in zip(batched, loop, before, strict=True):
         moved = 0.0
         for p, q, p0 in zip(ours.parameters(), reference.parameters(), initial.parameters(), strict=True):
@@ -179,7 +180,7 @@ def assert_same_networks(
 
 
 def gradients_of(mlp: BatchedMLP) -> list[th.Tensor]:
-    """Gradients in the layout of ``nn.Linear``: for each layer ``(T, O, I)`` and ``(T, O)``."""
+    """Return the gradients in the layout of ``nn.Linear``: ``(T, O, I)`` and ``(T, O)`` for each layer."""
     return [g for layer in mlp.layers for g in (layer.weight.grad.mT, layer.bias.grad.squeeze(1))]
 
 
@@ -191,7 +192,7 @@ def test_batched_rollouts_equal_the_loop() -> None:
         th.testing.assert_close(getattr(batch, name), reference, rtol=0, atol=TOLERANCE)
     costs = th.tensor([episode.costs for episode in episodes]).T
     th.testing.assert_close(batch.costs, costs, rtol=0, atol=TOLERANCE)
-    # The rollouts come by wall and lava, or the comparison says little of the dynamics.
+    # Some rollouts reach the wall and the lava, so that the comparison covers these parts of the dynamics.
     assert (batch.states[..., 0] == 0.0).any() and (batch.states[..., 0] == 5.0).any()
 
 
@@ -208,7 +209,7 @@ def test_batched_critics_equal_the_loop_after_the_fit() -> None:
     Case(beta=math.inf, baseline="regression"),
     Case(baseline="mean"),
     Case(baseline="regression"),
-    Case(gradient_steps=1),  # the critics know nothing, and some estimates are below zero
+    Case(gradient_steps=1),  # the critics are almost untrained, and some estimates are below zero
 ], ids=str)  # fmt: skip
 def test_batched_update_of_the_policy_equals_the_loop(case: Case) -> None:
     recorded = run_both(case)
@@ -219,7 +220,7 @@ def test_batched_update_of_the_policy_equals_the_loop(case: Case) -> None:
         (policy.action_head, initial.action_head, loop.action_heads),
     ):
         assert_same_networks(unbatch(network.mlp), reference, before=unbatch(initial_network.mlp))
-        # Adam's first step forgets the gradient's scale: compare the gradients, too.
+        # Adam's first step does not depend on the gradient's scale, so the gradients are compared, too.
         per_step = [[p.grad for p in module.parameters()] for module in reference]
         for ours, theirs in zip(gradients_of(network.mlp), zip(*per_step, strict=True), strict=True):
             expected = th.stack(theirs)

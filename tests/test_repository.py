@@ -1,4 +1,4 @@
-"""What GitHub, Read the Docs and a newcomer read: it is valid, and names nothing that does not exist."""
+"""The files for GitHub, Read the Docs and newcomers are valid, and everything that they name exists."""
 
 import configparser
 import re
@@ -14,7 +14,7 @@ WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 PAGES = sorted((ROOT / ".github").glob("*.md"))
 TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
-# A target, or a variable with its value; nothing that a shell would run besides make.
+# A call of make with targets and variables, but without other shell commands.
 MAKE = re.compile(r"""(?:[A-Z_]+=\S+ )?make(?: [a-z-]+| [A-Z]+=(?:[\w,./]+|"\$READTHEDOCS_OUTPUT/html"))+""")
 
 

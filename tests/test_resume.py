@@ -1,4 +1,4 @@
-"""A training that is killed and resumed ends with the very numbers of one that was not."""
+"""A training that is killed and resumed ends with exactly the numbers of an uninterrupted training."""
 
 import os
 import signal
@@ -18,7 +18,8 @@ from sb3_tdpg import TDPG, SelectionCallback, TrainingCheckpointCallback
 SLOW = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[1]
 SAVE_FREQ = 2
-# Seven epochs of 20 episodes on Lava, about as many on CartPole, of 8 episodes of varying length.
+# Environment steps of about seven epochs. An epoch has 20 episodes on Lava, and 8 episodes of varying length on
+# CartPole.
 TOTAL = {"lava": 700, "lava_in_dummy_vec_env": 700, "cartpole": 3000}
 
 ENVIRONMENTS = {
@@ -56,7 +57,7 @@ def train(model, total_timesteps, path, callbacks=(), **kwargs):
 
 def resume(env, path, callbacks=()):
     model = TDPG.load(path, env=ENVIRONMENTS[env](), device="cpu")
-    # Nothing of what the process has drawn in the meantime may matter.
+    # Random numbers that the process has drawn in the meantime must have no effect.
     th.manual_seed(99)
     np.random.seed(99)  # noqa: NPY002
     return train(model, model.remaining_timesteps, path, callbacks, reset_num_timesteps=False)
@@ -81,7 +82,7 @@ def assert_same_training(first, second):
 
 
 class Stop(Exception):
-    """Ends a training at once, as a kill would."""
+    """Ends a training immediately, like a kill."""
 
 
 def stop_in_epoch(epoch):
@@ -99,7 +100,7 @@ def stop_in_epoch(epoch):
 ])  # fmt: skip
 def test_a_training_that_stopped_anywhere_goes_on_bit_for_bit(env, settings, tmp_path):
     total, stop = TOTAL[env], stop_in_epoch(3)
-    if SETTINGS[settings].get("seed", 0) is None:  # two models differ then: both go on from the same file
+    if SETTINGS[settings].get("seed", 0) is None:  # two new models would differ, so both continue from the same file
         start = tmp_path / "start.zip"
         with pytest.raises(Stop):
             train(make_model(env, settings), total, start, [stop_in_epoch(1)])

@@ -1,4 +1,4 @@
-"""TDPG does what users of Stable-Baselines3 expect of any of its algorithms."""
+"""TDPG behaves as users of Stable-Baselines3 expect from an algorithm."""
 
 import io
 import math
@@ -32,7 +32,7 @@ from sb3_tdpg.envs.lava import LavaEnv
 
 
 def stochastic_predictions(model, observation):
-    """Actions of one whole episode with the noise that follows from a seed."""
+    """Return the actions of one whole episode; a seed determines the noise."""
     th.manual_seed(1)
     actions, state = [], None
     for _ in range(model.horizon):
@@ -127,7 +127,7 @@ def test_another_environment_of_the_same_shape_can_be_set():
 
 def test_evaluate_policy_clears_the_memory_between_episodes():
     model = tiny_tdpg()
-    # More than one episode for each environment: an episode_start that is not heeded would overrun the horizon.
+    # Each environment runs more than one episode: without episode_start, the policy would go beyond the horizon.
     rewards, lengths = evaluate_policy(
         model, lava_env(4), n_eval_episodes=12, deterministic=False, return_episode_rewards=True, warn=False
     )
@@ -136,7 +136,7 @@ def test_evaluate_policy_clears_the_memory_between_episodes():
 
 
 def test_evaluation_in_mid_rollout_does_not_disturb_the_training(tmp_path):
-    # Deterministic in policy and environment: nothing is drawn.
+    # Policy and environment are deterministic, so that the evaluation draws no random numbers.
     evaluation = EvalCallback(lava_env(4), n_eval_episodes=8, eval_freq=3, verbose=0, best_model_save_path=tmp_path)
     plain, evaluated = (train_epochs(tiny_tdpg(), 3, callback=callback) for callback in (None, evaluation))
     assert_same_parameters(parameters(plain.policy), parameters(evaluated.policy))
@@ -151,7 +151,7 @@ def test_a_callback_can_stop_the_training_in_mid_rollout_and_the_model_learns_on
     assert model.epoch == 1
     train_epochs(model, 2, reset_num_timesteps=False)
     assert model.epoch == 3
-    assert (model.rollout_buffer.states[0, :, 1] == 0).all()  # from the start of an episode
+    assert (model.rollout_buffer.states[0, :, 1] == 0).all()  # the rollouts begin at the start of an episode
 
 
 def test_callbacks_are_given_as_one_or_a_list_or_a_function():
@@ -222,7 +222,7 @@ def test_the_log_has_what_the_paper_plots_and_the_single_steps_go_to_tensorboard
     np.testing.assert_allclose(scalars["rollout/ep_cost_mean"], costs, rtol=1e-5)
     np.testing.assert_allclose(scalars["mi/total"], np.sum(information, axis=1), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(scalars["mi/t03"], np.array(information)[:, 3], rtol=1e-4, atol=1e-6)
-    # What train() records is written with the next epoch.
+    # The values that train() records are written with the next epoch.
     objective = costs[0] + 75 * information[0].sum()
     assert scalars["train/objective"][0] == pytest.approx(objective, rel=1e-4)
 
@@ -318,7 +318,7 @@ def test_an_environment_that_leaves_out_its_state_is_refused_with_the_mend():
 
 
 def test_the_recipe_for_hyperparameters_in_tensorboard_works_with_the_defaults(tmp_path):
-    """As in SB3's documentation."""
+    """The recipe is from SB3's documentation."""
     pytest.importorskip("tensorboard")
     model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
     logger = configure(str(tmp_path), ["tensorboard"])

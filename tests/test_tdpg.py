@@ -1,4 +1,4 @@
-"""The algorithm as a user of Stable-Baselines3 would use it."""
+"""TDPG learns, and it can be used like an algorithm of Stable-Baselines3."""
 
 import math
 
@@ -45,13 +45,13 @@ def test_the_penalty_takes_the_information_out_of_the_trvs():
     information = []
     train_epochs(model, 150, callback=AtEveryEpoch(lambda m: information.append(m.information.sum())))
     assert information[0] > 0.1
-    assert np.median(information[-50:]) < 0.2 * information[0]  # a single epoch may jump
+    assert np.median(information[-50:]) < 0.2 * information[0]  # the median, because a single epoch can be an outlier
 
 
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
 def test_a_memory_is_learnt_where_it_is_needed(encoder_gradient):
     class Recall(POMDPEnv):
-        """Say at t = 1 the number that was shown at t = 0 only."""
+        """The policy must repeat at t = 1 the number that only the observation at t = 0 shows."""
 
         def __init__(self):
             super().__init__(horizon=2)
@@ -83,7 +83,7 @@ def test_a_memory_is_learnt_where_it_is_needed(encoder_gradient):
         policy_kwargs=dict(net_arch=dict(encoder=[16], action_head=[16]), squash_trv_mean=False),
     )
     train_epochs(model, 200)
-    # Without a memory the best is to say 0, at a cost of 1 plus the action's variance.
+    # Without a memory the best action is 0, which costs 1 plus the action's variance.
     assert model.rollout_buffer.episode_costs.mean() < 0.6
 
 
@@ -106,7 +106,7 @@ def test_what_is_stored_is_what_the_environment_and_the_policy_produced():
     buffer = model.rollout_buffer
     np.testing.assert_array_equal(buffer.observations, buffer.states)
     np.testing.assert_allclose(buffer.trvs, buffer.means + buffer.stds * buffer.noise, rtol=1e-5, atol=1e-6)
-    # The states follow from the actions, clipped as the environment saw them.
+    # The states follow from the actions, which the environment clips.
     env = model.env.env
     for t in range(4):
         state, action = buffer.states[t].astype(float), np.clip(buffer.actions[t], -0.5, 0.5)
@@ -124,12 +124,12 @@ def assert_trvs_are_those_of(model, policy):
 
 @pytest.mark.parametrize("baseline", ["value", "regression", "mean"])
 def test_every_environment_runs_its_quota_of_episodes_however_short_they_are(baseline):
-    # Environment 0 has short episodes; were the first N to finish taken, it would fill the epoch.
+    # Environment 0 has short episodes. If the first N finished episodes counted, environment 0 would fill the epoch.
     lengths = [[1, 1, 1], [4, 3, 4], [2, 4, 1]]
     env = DummyVecEnv([lambda i=i: CountdownEnv(i, lengths[i]) for i in range(3)])
     model = tiny_tdpg(env, n_episodes=9, baseline=baseline, beta=math.inf).learn(1)
     buffer = model.rollout_buffer
-    first = int(buffer.states[0, 0, 1])  # episodes that the resets before learning used up
+    first = int(buffer.states[0, 0, 1])  # number of episodes that were skipped by the resets before learning
     for episode in range(9):
         name, number = episode % 3, episode // 3
         length = lengths[name][(abs(first) + number) % 3]
@@ -140,20 +140,20 @@ def test_every_environment_runs_its_quota_of_episodes_however_short_they_are(bas
             assert (-buffer.states[t, episode]).tolist() == expected
             assert buffer.costs[t, episode] == 100 * expected[1] + t
         assert (buffer.costs[length:, episode] == 0).all()
-    # Every epoch starts with whole episodes: one of them may have been cut short and must not be seen.
+    # Every epoch starts with new episodes: an episode that the last epoch has cut off must not appear.
     model.learn(model.num_timesteps + 1, reset_num_timesteps=False)
     assert (buffer.observations[0, :, 2] == 0).all()
 
 
 class LosesEpisodes(VecEnvWrapper):
-    """Marks the second episode of environment 1 as lost, as ``RayVecEnv`` does after a restart."""
+    """Mark the second episode of environment 1 as lost, as ``RayVecEnv`` does after a restart."""
 
     def reset(self):
         return self.venv.reset()
 
     def step_wait(self):
         observations, rewards, dones, infos = self.venv.step_wait()
-        if dones[1] and self.venv.envs[1].episode % 4 == 1:  # auto-reset: this is the index of the next episode
+        if dones[1] and self.venv.envs[1].episode % 4 == 1:  # after the auto-reset, the index of the next episode
             infos[1]["episode_lost"] = True
         return observations, rewards, dones, infos
 
@@ -191,7 +191,7 @@ def test_more_episodes_than_environments_are_run_one_after_the_other():
     old_policy = parameters(model.policy)
     train_epochs(model, 1, reset_num_timesteps=False)
     assert model.rollout_buffer.alive.all()
-    assert_trvs_are_those_of(model, old_policy)  # of every episode they start from zero, not only of the first ones
+    assert_trvs_are_those_of(model, old_policy)  # the TRVs start from zero in every episode
     assert len(np.unique(model.rollout_buffer.states[0, :, 0])) == 20
     assert (model.rollout_buffer.states[0, :, 1] == 0).all()
 
@@ -256,7 +256,7 @@ def test_beta_may_follow_the_progress():
     model = tiny_tdpg(beta=lambda progress: 1 / (75 * (1.0001 - progress)))
     coefficients = []
     train_epochs(model, 4, callback=AtEveryEpoch(lambda m: coefficients.append(m.mi_coef)))
-    np.testing.assert_allclose(coefficients, 75 * (np.arange(1, 5) / 4 + 0.0001), rtol=1e-6)  # as in train()
+    np.testing.assert_allclose(coefficients, 75 * (np.arange(1, 5) / 4 + 0.0001), rtol=1e-6)  # the schedule in train()
 
 
 def test_a_schedule_may_begin_with_policy_gradient():
@@ -275,7 +275,7 @@ def test_schedules_are_never_asked_beyond_the_end_of_the_training(schedule):
         return 0.01 + progress
 
     model = tiny_tdpg(**{schedule: value})
-    model.learn(150)  # an epoch and a half: the second goes 50 steps beyond
+    model.learn(150)  # one and a half epochs, so the second epoch goes 50 steps further
     assert model.num_timesteps == 200
     assert min(asked) >= 0.0
     assert max(asked) <= 1.0

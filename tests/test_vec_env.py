@@ -1,4 +1,4 @@
-"""The batched VecEnv is the same environment as the one that gymnasium.make gives."""
+"""The batched VecEnv and the environment from gymnasium.make are the same."""
 
 import warnings
 
@@ -75,7 +75,7 @@ def test_a_finished_episode_is_reset_at_once_and_its_last_observation_is_kept():
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(observations, second.astype(np.float32))
     for info, x_0 in zip(infos, first, strict=True):
-        np.testing.assert_array_equal(info["state"], x_0)  # a robot at rest that is not pushed stays
+        np.testing.assert_array_equal(info["state"], x_0)  # a robot at rest does not move without a control
         np.testing.assert_array_equal(info["terminal_observation"], x_0.astype(np.float32))
         assert info["TimeLimit.truncated"] is False
 
@@ -139,12 +139,12 @@ def test_the_model_sees_the_true_states_through_sb3s_wrappers(is_normalized, wra
     assert isinstance(model.get_vec_normalize_env(), VecNormalize) == is_normalized
     train_epochs(model, 2)
     states = model.rollout_buffer.states
-    assert (states[0, :, 1] == 0).all()  # x_0, not what is left of the last episode
+    assert (states[0, :, 1] == 0).all()  # x_0, not the last state of the previous episode
     assert states[0, :, 0].min() >= 0
     assert len(np.unique(states[0, :, 0])) == 20
     observations = model.rollout_buffer.observations
     assert np.allclose(observations, states, rtol=1e-6) != is_normalized
-    assert (abs(observations[..., 0].mean()) < 1) == is_normalized  # d itself is 2.5 on average
+    assert (abs(observations[..., 0].mean()) < 1) == is_normalized  # the mean of d is 2.5
 
 
 def test_attributes_and_methods_of_the_environment_can_be_reached():
@@ -183,7 +183,7 @@ def test_any_other_environment_becomes_a_dummy_vec_env(env_id):
 def test_an_environment_without_pictures_is_not_asked_for_any(registry):
     gym.register("Blind-v0", ToyEnv)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # Gymnasium's, once for each environment
+        warnings.simplefilter("error")  # Gymnasium would warn once for each environment
         env = make_episodes_env("Blind-v0", 2, env_kwargs=dict(horizon=7), seed=1)
     assert env.get_attr("horizon") == [7, 7]
     assert make_episodes_env("Pendulum-v1", 2).render_mode == "rgb_array"
@@ -220,7 +220,7 @@ def test_a_window_shows_the_first_episode():
 
 
 def test_pictures_of_a_batch_have_no_gripper():
-    """Each episode has its own; that of the first stood in every picture."""
+    """Each episode has its own gripper, so that a picture of the batch must not show the first episode's gripper."""
     env = BatchedVecEnv(SqueezeInsertEnv(render_mode="rgb_array"), 2)
     env.reset()
     env.step(np.array([[0.0], [1.5]]))

@@ -1,1 +1,1 @@
-"""From a policy to the robot: one step in a file that needs neither this package nor PyTorch."""
+"""Export one step of a policy to a file that a robot can run without this package and without PyTorch."""

@@ -37,14 +37,14 @@ OPSET = 18
 
 class ExportedStep(nn.Module):
     """
-    One step of a policy as a pure function of tensors; the noise is an input.
+    Compute one step of a policy as a pure function of tensors; the noise is an input.
 
     ``forward(*observation, memory, [time_step], trv_noise, action_noise)`` returns ``(action, memory)``. An observation
-    is as the environment's, in bytes or in its own units; a ``Dict`` has one input for each key, in the order of the
-    space. With zeros for both noises the step is that of ``predict(deterministic=True)``.
+    has the format of the environment: bytes, or numbers that are not standardised. A ``Dict`` has one input for each
+    key, in the order of the space. If both noises are zero, the result is that of ``predict(deterministic=True)``.
 
     :param policy: The policy, on the CPU.
-    :param normalization: Statistics of the observations that the training standardised.
+    :param normalization: The statistics with which the training standardised the observations.
     """
 
     def __init__(self, policy: TRVPolicy, normalization: VecNormalize | None = None) -> None:
@@ -74,20 +74,20 @@ class ExportedStep(nn.Module):
 
     @property
     def input_names(self) -> list[str]:
-        """Names of the inputs, in their order."""
+        """The names of the inputs, in the order of the inputs."""
         observations = [f"observation.{key}" for key in self.keys] or ["observation"]
         return [*observations, "memory", *["time_step"] * self.policy.time_varying, "trv_noise", "action_noise"]
 
     @property
     def n_action_noises(self) -> int:
-        """Length of the action noise of one robot."""
+        """The number of components of the action noise for one robot."""
         distribution = self.policy.action_dist
         if isinstance(distribution, DiagGaussianDistribution):
             return distribution.action_dim
         return self.policy._n_action_parameters()
 
     def example(self, n: int = 2) -> tuple[th.Tensor, ...]:
-        """Return inputs of N robots: sampled observations, zeros for the rest."""
+        """Return inputs for N robots: sampled observations, and zeros for all other inputs."""
         space = self.policy.observation_space
         parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
         observations = [th.as_tensor(np.stack([part.sample() for _ in range(n)])) for part in parts]
@@ -101,7 +101,7 @@ class ExportedStep(nn.Module):
         )
 
     def forward(self, *inputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """See the class."""
+        """Compute the action and the new memory; the inputs are those of :attr:`input_names`."""
         policy = self.policy
         n_parts = len(self.keys) or 1
         parts, (memory, *time_step, trv_noise, action_noise) = inputs[:n_parts], inputs[n_parts:]
@@ -115,14 +115,14 @@ class ExportedStep(nn.Module):
         return self._action(_at_time_steps(policy.action_head, trv, t), action_noise), trv
 
     def _prepared(self, observation: th.Tensor, key: str) -> th.Tensor:
-        """Standardise, and turn bytes into floats: pooling of bytes uses integers, which ONNX lacks."""
+        """Standardise an observation; convert bytes to floats, because ONNX cannot pool bytes."""
         if key in self.scales:
             mean, std = self.scales[key]
             return ((observation.double() - mean) / std).clamp(-self.clip, self.clip).float()
         return observation.float() if observation.dtype == th.uint8 else observation
 
     def _action(self, parameters: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        """Return the action for the head's outputs: as the distribution's ``mode`` where the noise is 0."""
+        """Return the action for the outputs of the action head. Without noise it is the mode of the distribution."""
         space = self.policy.action_space
         if isinstance(space, spaces.Box):
             mean, log_std = self.policy.action_gaussian(parameters)
@@ -137,14 +137,14 @@ class ExportedStep(nn.Module):
 
 
 def _at_time_steps(network: TimeMLP, x: th.Tensor, t: th.Tensor | None) -> th.Tensor:
-    """Evaluate a network at the time step of each robot: ``(N, I)`` and ``(N,) -> (N, O)``; None: shared weights."""
+    """Evaluate a network at each robot's time step: ``(N, I)`` and ``(N,) -> (N, O)``; None means shared weights."""
     if t is None:
         return network.at(x, 0)
     return network.mlp.through(x, lambda layer, x: (x[:, None, :] @ layer.weight[t] + layer.bias[t])[:, 0])
 
 
 def metadata_of(step: ExportedStep) -> dict[str, Any]:
-    """Return what the user of an exported file must know of it."""
+    """Return the metadata of an exported file, which its user needs."""
     policy, space = step.policy, step.policy.action_space
     noise = "gumbel"
     if isinstance(space, (spaces.Box, spaces.MultiBinary)):
@@ -184,10 +184,10 @@ def export_policy(
     Write one step of a policy to a file.
 
     :param policy: The policy.
-    :param path: The file; an existing one is replaced when the new one is complete.
-    :param format: ``"onnx"`` (needs the extra ``export``) or ``"torchscript"``; default: by the suffix, ``.onnx`` or
-        ``.pt``.
-    :param normalization: Statistics of the observations that the training standardised with ``VecNormalize``.
+    :param path: The file. If it exists, it is replaced when the new file is complete.
+    :param format: ``"onnx"`` (needs the extra ``export``) or ``"torchscript"``. By default the suffix of ``path``,
+        ``.onnx`` or ``.pt``, determines the format.
+    :param normalization: The statistics with which ``VecNormalize`` standardised the observations in training.
     :return: the file
     :raises ValueError: if the format is unknown.
     :raises ImportError: if the packages for ONNX are missing.
@@ -208,7 +208,7 @@ def export_policy(
         step = ExportedStep(policy, normalization).eval()
         metadata = json.dumps(metadata_of(step))
         with th.no_grad(), warnings.catch_warnings(), replaced_atomically(path) as partial:
-            # Of torch's own: parts that it will replace, and sizes of images, which are fixed.
+            # Hide torch's warnings about its own parts that it will replace, and about image sizes, which are fixed.
             warnings.filterwarnings("ignore", category=FutureWarning)
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             warnings.filterwarnings("ignore", category=th.jit.TracerWarning)
@@ -226,11 +226,11 @@ def export_model(
     model: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, format: str | None = None
 ) -> Path:
     """
-    Write one step of a saved model of TDPG, with the ``vecnormalize.pkl`` beside it, if there is one.
+    Write one step of a saved TDPG model to a file; use the ``vecnormalize.pkl`` in the model's folder, if there is one.
 
-    :param model: File written by ``model.save``; loading it unpickles it, which can run any code.
-    :param out: The file; default: beside the model, with its name.
-    :param format: See :func:`export_policy`; default: by the suffix of ``out``, or ONNX.
+    :param model: File written by ``model.save``. It is unpickled, which can run any code.
+    :param out: The file to write. By default it has the folder and the name of the model.
+    :param format: See :func:`export_policy`. By default the suffix of ``out`` determines the format, or it is ONNX.
     :return: the file
     :raises ValueError: if there is no such model.
     """
@@ -249,27 +249,27 @@ def export_model(
 
 def export_trained(model: Any, path: str | os.PathLike[str], format: str | None, normalization: Any) -> Path:
     """
-    Write one step of the policy of a TDPG, see :func:`export_policy`.
+    Write one step of the policy of a TDPG model to a file; see :func:`export_policy`.
 
-    :raises ValueError: if observations were normalised in its training, and there are no statistics.
+    :raises ValueError: if the training normalised the observations, but the statistics are missing.
     """
     check_statistics(model, normalization)
     return export_policy(model.policy, path, format=format, normalization=normalization)
 
 
 def _is_not_of_torchvision(record: logging.LogRecord) -> bool:
-    """Drop a warning of torch for each operator of a package that no policy needs."""
+    """Return whether a log record is not one of torch's warnings about torchvision, which no policy needs."""
     return not record.getMessage().startswith("torchvision is not installed")
 
 
 def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
     try:
-        from onnxscript import opset18 as op  # torch.onnx needs it, too
+        from onnxscript import opset18 as op  # torch.onnx also needs onnxscript
     except ImportError as e:
         raise ImportError("ONNX needs more packages: pip install 'sb3_tdpg[export]'") from e
 
     def sigmoid(x: Any) -> Any:
-        # ONNX Runtime's Sigmoid is wrong by a tenth and more where it is small, as in the variance of narrow TRVs.
+        # Small values of ONNX Runtime's Sigmoid, as for TRVs with a small variance, are wrong by 10 % and more.
         return op.Reciprocal(op.Add(op.Exp(op.Neg(x)), op.Constant(value_float=1.0)))
 
     names = step.input_names

@@ -1,4 +1,4 @@
-"""Environments on many cores or machines."""
+"""Run environments on many cores or machines."""
 
 from sb3_tdpg.distributed.ray_vec_env import DeadActorError, RayVecEnv
 

@@ -1,7 +1,7 @@
 """
-Environments on the machines of a Ray cluster, or on the cores of this machine.
+Run environments on the machines of a Ray cluster, or on the cores of this machine.
 
-Dimension key: N environments in the order of ``env_fns``; each actor has a contiguous share B of them.
+Dimension key: N environments in the order of ``env_fns``; each actor has B successive environments.
 """
 
 import itertools
@@ -26,15 +26,15 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from sb3_tdpg.common.threads import set_threads, usable_cores
 from sb3_tdpg.envs.checks import count as check_count
 
-CLOSE_TIMEOUT = 10.0  # s, after which an actor is killed although its environments are not closed
+CLOSE_TIMEOUT = 10.0  # s; after this time an actor is killed even if its environments are not closed
 
 
 class DeadActorError(RuntimeError):
-    """An actor died or did not answer, and Ray does not restart it: its running episodes are lost."""
+    """An actor died or did not answer, and Ray does not restart it. The actor's running episodes are lost."""
 
 
 class EnvActor:
-    """Hold B environments in a ``DummyVecEnv``; its methods return the observations (or None) and the rest."""
+    """Run B environments in a ``DummyVecEnv``. Each method returns the observations (or None) and all other results."""
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
         set_threads(1)
@@ -44,11 +44,11 @@ class EnvActor:
 
     @cached_property
     def _env(self) -> DummyVecEnv:
-        # Made by the first call, because Ray does not pass on exceptions of an actor's constructor.
+        # The first call makes the environments, because Ray does not forward exceptions of an actor's constructor.
         return DummyVecEnv(self._env_fns)
 
     def call(self, message: bytes) -> tuple[bytes, bytes]:
-        """Call another method. All is pickled here: Ray takes 0.1 ms longer for an array, and makes it read-only."""
+        """Call another method; pickle here, because Ray takes 0.1 ms longer for an array and makes it read-only."""
         name, *arguments = cloudpickle.loads(message)
         observations, rest = getattr(self, name)(*arguments)
         return pickle.dumps(observations, pickle.HIGHEST_PROTOCOL), cloudpickle.dumps((self._life, rest))
@@ -70,7 +70,7 @@ class EnvActor:
         return self._env.reset(), self._env.reset_infos
 
     def step(self, actions: np.ndarray) -> tuple[Any, Sequence[Any]]:
-        """Step the environments, or start new episodes if a restart has lost the running ones."""
+        """Step the environments, or start new episodes if the running episodes were lost in a restart."""
         if self._has_begun:
             observations, *rest = self._env.step(actions)
             return observations, (*rest, self._env.reset_infos)
@@ -91,30 +91,33 @@ class EnvActor:
 
 class RayVecEnv(VecEnv):
     """
-    An SB3 ``VecEnv`` whose environments are in Ray actors, a ``DummyVecEnv`` in each.
+    Run an SB3 ``VecEnv`` in Ray actors, with one ``DummyVecEnv`` per actor.
 
-    It gives the results of ``SubprocVecEnv`` for the same seeds, on the cores of several machines::
+    For the same seeds the results are those of ``SubprocVecEnv``, but the cores can belong to several machines::
 
         make_vec_env("PandaGrasp-v0", n_envs=32, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=8))
 
     If Ray is not initialised (``ray.init``), this class joins the cluster of the environment variable ``RAY_ADDRESS``,
     or starts Ray on this machine until the last ``RayVecEnv`` is closed. Every machine of a cluster needs this package.
 
-    Exceptions of an environment are raised as they are. If an actor dies (killed, crashed, machine lost), the next call
-    raises :class:`DeadActorError`. With ``max_restarts`` Ray restarts the actor instead, which makes its environments
-    anew: attributes that were set and the running episodes are lost. The next step warns and ends these episodes as a
-    time limit does, with reward 0 and ``info["episode_lost"]=True``.
+    An exception of an environment is raised unchanged. If an actor dies (killed, crashed, machine lost), the next call
+    raises :class:`DeadActorError`. With ``max_restarts`` Ray restarts the actor instead, and the actor makes new
+    environments. The attributes that were set and the running episodes are lost. The next step gives a warning and ends
+    these episodes like a time limit, with reward 0 and ``info["episode_lost"]=True``.
 
-    :param env_fns: Each makes an environment.
+    :param env_fns: Functions that make one environment each.
     :param n_actors: Number of actors; default: one for each CPU of the cluster, but not more than environments.
     :param max_restarts: How often Ray may restart each actor.
-    :param actor_options: Ray's options of an actor, like ``dict(num_gpus=0.1)``; default: one CPU (none on own Ray).
+    :param actor_options: Ray's options for an actor, such as ``dict(num_gpus=0.1)``; default: one CPU (no CPU if this
+        class has started Ray).
     :param start_timeout: Seconds to wait until all actors have made their environments.
-    :param step_timeout: Seconds before an actor that does not answer is killed, longer than a restart; None: no limit.
+    :param step_timeout: Seconds after which an actor that does not answer is killed; a restart must take less time.
+        ``None`` means no limit.
     :raises TimeoutError: if the actors do not start in time, for instance because the cluster has too few CPUs.
     """
 
-    # All objects share the connection to Ray: how many use it, whether this class made it, and whether Ray runs here.
+    # All objects share the connection to Ray. These are the number of its users, whether this class made the
+    # connection, and whether Ray runs only on this machine.
     _n_users, _is_ours, _is_local = 0, False, False
 
     def __init__(
@@ -150,7 +153,8 @@ class RayVecEnv(VecEnv):
             n_actors = n_actors or min(len(env_fns), max(1, int(self._ray.cluster_resources().get("CPU", 1))))
             bounds = [len(env_fns) * i // n_actors for i in range(n_actors + 1)]
             self._shares = list(itertools.starmap(slice, itertools.pairwise(bounds)))
-            # On Ray of our own a second RayVecEnv would wait for free CPUs for ever. Task events cost 0.1 ms a step.
+            # Actors need no CPU if this class has started Ray: otherwise a second RayVecEnv would wait for free CPUs
+            # for ever. Task events cost 0.1 ms per step.
             self._actor_options = {"num_cpus": 0 if self._is_local else 1, "enable_task_events": False, **options}
             actor_class = self._ray.remote(EnvActor).options(
                 max_restarts=max_restarts, max_task_retries=-1 if max_restarts else 0, **self._actor_options
@@ -172,7 +176,7 @@ class RayVecEnv(VecEnv):
         if not ray.is_initialized():
             is_local = not os.environ.get("RAY_ADDRESS")
             RayVecEnv._n_users, RayVecEnv._is_ours, RayVecEnv._is_local = 0, True, is_local
-            # By default Ray lets every other program go first (nice 15).
+            # By default Ray's processes have a low priority (nice 15).
             config = {} if "RAY_worker_niceness" in os.environ else {"worker_niceness": 0}
             n_cpus = max(1, math.ceil(n_actors * num_cpus))
             local = dict(address="local", num_cpus=n_cpus, include_dashboard=False, _system_config=config)
@@ -193,11 +197,11 @@ class RayVecEnv(VecEnv):
 
     def _send(self, actor: int, method: str, *arguments: Any) -> list[Any]:
         """Call a method of an actor; return Ray's references to the observations and to the rest."""
-        # Ray needs 1 ms longer for an object of more than 100 kB: the terminal image must not travel with the next.
+        # Ray needs 1 ms longer for an object of more than 100 kB, so terminal images are not sent with the next images.
         return self._actors[actor].call.options(num_returns=2).remote(cloudpickle.dumps((method, *arguments)))
 
     def _receive_all(self, replies: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-        """Wait for the replies of all actors; return a tuple of the observations and one of the rest."""
+        """Wait for the replies of all actors; return a tuple of the observations and a tuple of the other results."""
         return tuple(zip(*itertools.starmap(self._receive, enumerate(replies)), strict=True))
 
     def _receive(self, actor: int, reply: list[Any]) -> tuple[Any, Any]:
@@ -208,7 +212,7 @@ class RayVecEnv(VecEnv):
                 observations, rest = self._ray.get(reply, timeout=timeout)
                 break
             except self._ray.exceptions.RayTaskError as error:
-                # Callers want the exception of the environment, for instance an AttributeError.
+                # The caller expects the exception of the environment, for instance an AttributeError.
                 raise (error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))) from error
             except self._ray.exceptions.GetTimeoutError:
                 self._ray.kill(self._actors[actor], no_restart=False)
@@ -233,7 +237,7 @@ class RayVecEnv(VecEnv):
         return [(self._receive(actor, reply)[1] or [None])[0] for actor, reply in replies]
 
     def reset(self) -> VecEnvObs:
-        """Start N episodes: observations, ``(N, *obs)``."""
+        """Start N episodes and return their observations, ``(N, *obs)``."""
         replies = [self._send(i, "reset", self._seeds[s], self._options[s]) for i, s in enumerate(self._shares)]
         parts, infos = self._receive_all(replies)
         self.reset_infos = list(itertools.chain(*infos))
@@ -242,7 +246,7 @@ class RayVecEnv(VecEnv):
         return self._join(parts)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Send each actor the actions of its environments, ``(N, U)`` in all."""
+        """Send to each actor the actions of its environments; ``actions`` has the shape ``(N, U)``."""
         if len(actions) != self.num_envs:
             raise ValueError(f"{len(actions)} actions were given: {self.num_envs} environments need as many")
         self._replies = [self._send(i, "step", actions[share]) for i, share in enumerate(self._shares)]
@@ -259,14 +263,14 @@ class RayVecEnv(VecEnv):
         return self._join(parts), np.concatenate(rewards), np.concatenate(dones), infos
 
     def _join(self, parts: Sequence[Any]) -> VecEnvObs:
-        """Join the observations of all actors, ``(B, *obs)`` each."""
+        """Join the observations of all actors; each has the shape ``(B, *obs)``."""
         space = self.observation_space
         self._last_observations = list(itertools.chain(*(iterate(batch_space(space), part) for part in parts)))
         out: Any = create_empty_array(space, self.num_envs)
         return concatenate(space, self._last_observations, out)
 
     def close(self) -> None:
-        """Close the environments and end the actors; closing twice is fine."""
+        """Close the environments and end the actors; a second call does nothing."""
         if self._is_closed:
             return
         self._is_closed = True

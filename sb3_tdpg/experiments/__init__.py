@@ -1,1 +1,1 @@
-"""Experiments: from a block of settings to trained and evaluated models on disk, resumable, on one machine or many."""
+"""Train and evaluate models from blocks of settings on one or many machines; interrupted experiments can be resumed."""

@@ -1,5 +1,5 @@
 """
-Train an open loop: a policy that sees the time and nothing else.
+Train an open-loop policy, which observes only the time.
 
 Dimension key: E environments, W waves.
 """
@@ -20,10 +20,11 @@ class BlindVecEnv(VecEnvWrapper):
     r"""
     Replace every observation by the time :math:`t`, as :math:`\cos(\pi k t / T)` for k = 1 to 8.
 
-    Any SB3 algorithm that trains behind it finds an open loop. States and rewards stay as they are.
+    An SB3 algorithm that trains in this wrapper learns an open-loop policy. The wrapper does not change states and
+    rewards.
 
     :param venv: Environments with a horizon T.
-    :raises ValueError: if they have none.
+    :raises ValueError: if the environments have no horizon.
     """
 
     def __init__(self, venv: VecEnv) -> None:
@@ -31,13 +32,13 @@ class BlindVecEnv(VecEnvWrapper):
         super().__init__(venv, observation_space=spaces.Box(-1.0, 1.0, (N_WAVES,)))
 
     def reset(self) -> np.ndarray:
-        """Start all episodes; return the observations of t = 0, ``(E, W)``."""
+        """Start all episodes; return the observations for t = 0, ``(E, W)``."""
         self.venv.reset()
         self._time = np.zeros(self.num_envs)
         return self._observe(self._time)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Finish a step; the last observation of an episode is the one of its end."""
+        """Finish a step; the terminal observation of an episode is the observation for t = T."""
         _, rewards, dones, infos = self.venv.step_wait()
         self._time += 1
         last = self._observe(self._time)

@@ -1,4 +1,4 @@
-"""Will the bottleneck pay on a task? A short sweep over shares of the improvement kept, and a verdict."""
+"""Predict whether the information penalty will improve robustness on a task, from a short sweep over cost limits."""
 
 import contextlib
 import glob
@@ -30,11 +30,11 @@ from sb3_tdpg.presets import DEFAULTS, preset_of
 
 SHARES = (99, 95, 90, 80)  # per cent
 NO_PENALTY, OPEN_LOOP = "no penalty", "open loop"
-# The verdict.
-IMPROVEMENT = 0.9  # of the improvement is kept
-INFORMATION = 0.1  # of the information is kept at most: with more of it, no limit has made a policy more robust
-PRICE = 0.5  # of the cost without a penalty: the open loop costs at most as much more
-KNEE = 0.1  # of the distance from the origin to the line of mixtures: a knee is at least as far below it
+# Thresholds of the verdict, as fractions.
+IMPROVEMENT = 0.9  # of the improvement must be kept
+INFORMATION = 0.1  # of the information may be kept: with more information, no limit has made a policy more robust
+PRICE = 0.5  # of the cost without a penalty: the open loop may cost at most this much more
+KNEE = 0.1  # of the distance from the origin to the line of mixtures: a knee is at least this far below the line
 
 
 def frontier(
@@ -51,14 +51,14 @@ def frontier(
     settings: Mapping[str, Any] | None = None,
 ) -> str:
     """
-    Train without a penalty, with limits on the cost, and blind. Draw cost against information, and say
-    whether the bottleneck pays.
+    Predict whether the information penalty will make policies for a task more robust.
 
-    Each limit keeps a share of the improvement over training (``beta="auto", cost_limit="95%"``). The *open loop* is
-    the same training with a policy that sees only the time. Its best seed is the *best open loop* that was found. The
-    information is the log-det bound on fresh episodes; an interval is a bootstrap of 95 % over the seeds, with three
-    seeds their range. Finished runs are kept: the same call resumes an interrupted one. See :func:`verdict` for the
-    rule, and :func:`knee`.
+    This function trains policies without the penalty, policies with limits on the cost, and open-loop policies. It
+    draws their cost against their information and writes a :func:`verdict`. Each limit keeps a share of the improvement
+    during training (``beta="auto", cost_limit="95%"``). An open-loop policy is trained in the same way but observes
+    only the time; the seed with the lowest cost is the *best open loop*. The information is the log-det bound on fresh
+    episodes. An interval is a 95 % bootstrap interval over the seeds; with three seeds it is their range. The figure
+    marks the :func:`knee`. Finished runs are kept, so that the same call resumes an interrupted one.
 
     :param env_id: A registered id.
     :param shares: Shares of the improvement in per cent, between 0 and 100.
@@ -67,13 +67,13 @@ def frontier(
         ``runs/``; default: ``results/frontier-<block or environment>``.
     :param jobs: Number of runs at a time; default: the number of cores.
     :param n_timesteps: Environment steps of each training; default: as in the block, or TDPG's default.
-    :param n_eval_episodes: Episodes of each evaluation.
-    :param block: Block of ``hyperparams/tdpg.yml``; default: that of the environment, if there is one, else TDPG's
-        defaults. Its callbacks are left out, and the estimator is the log-det bound.
+    :param n_eval_episodes: Number of episodes of each evaluation.
+    :param block: Block of ``hyperparams/tdpg.yml``; default: the environment's block if there is one, or else TDPG's
+        defaults. The block's callbacks are ignored, and the estimator is the log-det bound.
     :param env_kwargs: Keywords of the environment.
     :param settings: Settings that replace those of the block.
     :return: the summary, as Markdown
-    :raises ValueError: if an argument is malformed or does not fit; nothing has been trained by then.
+    :raises ValueError: if an argument is malformed or does not fit; no training has started in this case.
     """
     labels = [NO_PENALTY, *(f"{share:g} %" for share in sorted({*shares}, reverse=True)), OPEN_LOOP]
     if not shares or n_seeds < 1 or any(share_of(label.replace(" ", "")) is None for label in labels[1:-1]):
@@ -86,7 +86,7 @@ def frontier(
         with contextlib.suppress(KeyError):
             load_hyperparams(name)
             block = name
-    # The penalty is the bound that the figure shows. Callbacks would select epochs by rules of their own.
+    # The penalty is the bound that the figure shows. Callbacks are removed, because they would select other epochs.
     shared: dict[str, Any] = dict(policy="TRVPolicy", mi_estimator="logdet", mi_kwargs=None, callback=[])
     shared.update({**(settings or {}), **({"env_kwargs": dict(env_kwargs)} if env_kwargs else {})})
     if block is not None:
@@ -113,13 +113,13 @@ def frontier(
         rows = [finished_row(task, n_eval_episodes, {"label": key[0]}) for task, key in measured]
     runs = pd.DataFrame(rows)
     first = np.mean([read_progress(folder)["rollout/ep_cost_mean"].iloc[0] for _, folder, _ in tasks[:n_seeds]])
-    used = tasks[0][0].settings.get("env_kwargs") or {}  # also those of the block
+    used = tasks[0][0].settings.get("env_kwargs") or {}  # includes the keywords of the block
     config = dict(env_id=env_id, block=block, settings=shared)
     return _write(out, config, runs, frontier_table(runs, float(first)), used)
 
 
 def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str, seed: int, out: Path) -> Task:
-    """Return the run of one row and one seed, with its folder and its scenario."""
+    """Return the run for one row and one seed, with its folder and its scenario."""
     own: dict[str, Any] = dict(beta=math.inf, cost_limit=None)
     if label == OPEN_LOOP:
         wrappers = {**(load_hyperparams(block) if block else {}), **shared}.get("vec_env_wrapper", [])
@@ -135,13 +135,14 @@ def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
     """
     Summarise the runs of each label over seeds.
 
-    :param runs: ``label``, ``seed``, ``cost`` and ``information`` of each run; without a penalty, by share, blind.
+    :param runs: ``label``, ``seed``, ``cost`` and ``information`` of each run. The order of the labels is: no penalty,
+        the shares, open loop.
     :param first_cost: Cost of the first epoch of the training.
-    :return: a row for each label: ``seeds``, the means ``cost``, ``nats`` and ``kept`` (of the nats without a penalty
-        and with the same seed), each with the ends of its interval ``_low`` and ``_high``, the ``best`` cost of a seed,
-        and ``improvement``, the share of the improvement that the mean cost keeps
+    :return: a row for each label: ``seeds``; the means ``cost``, ``nats`` and ``kept`` (fraction of the nats that the
+        same seed has without a penalty), each with the ends ``_low`` and ``_high`` of its interval; the cost of the
+        ``best`` seed; and ``improvement``, the fraction of the improvement that the mean cost keeps
     """
-    # What a blind policy's memory shares with the state comes from its own actions, not from the sensor.
+    # An open-loop policy's memory shares information with the state only through its actions, not through the sensor.
     runs = runs.assign(nats=runs["information"].where(runs["label"] != OPEN_LOOP, 0.0))
     of_seed = runs[runs["label"] == NO_PENALTY].set_index("seed")
     runs["kept"] = runs["nats"] / of_seed["nats"].clip(lower=TIE).loc[runs["seed"]].to_numpy()
@@ -160,11 +161,12 @@ def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
 
 def knee(table: pd.DataFrame) -> str | None:
     """
-    Return the label of the row that saves most information for its cost, if any is better than a mixture.
+    Return the label of the limit with the best trade-off, or ``None`` if no limit is clearly better than a mixture.
 
-    A mixture runs the policy without a penalty in some episodes and the best open loop in the others: it lies on the
-    line between the two. The knee is the limit that lies farthest below this line, with nats and additional cost
-    in shares of those of its ends, and at least a tenth of the way.
+    A mixture uses the policy without a penalty in some episodes and the best open loop in the other episodes, so it
+    lies on the line between these two policies. Nats and additional cost are divided by their values at the ends of
+    the line. The knee is the limit that is farthest below the line, if this distance is at least a tenth of the
+    distance from the origin to the line.
 
     :param table: From :func:`frontier_table`.
     """
@@ -179,12 +181,13 @@ def knee(table: pd.DataFrame) -> str | None:
 
 def verdict(table: pd.DataFrame) -> str:
     """
-    Say in one sentence whether the bottleneck will pay.
+    Return a sentence that says whether the information penalty will probably make policies more robust.
 
-    Two questions. *Is information to spare?* A limit keeps at least 90 % of the improvement and at most a tenth of the
-    information. *Is the open loop cheap?* The best open loop costs at most 1.5 times as much as the policy without a
-    penalty (for a negative cost: at most half of its absolute value more). Two times yes: probably; once: perhaps;
-    else, and if the policy without a penalty carries no information: probably not.
+    The verdict depends on two conditions. First, a limit keeps at least 90 % of the improvement with at most a tenth of
+    the information. Second, the best open loop is cheap: it costs at most 1.5 times as much as the policy without a
+    penalty. (If that cost is negative, it costs at most half of the absolute value more.) The verdict is "probably" if
+    both conditions hold, "perhaps" if one holds, and otherwise "probably not". It is also "probably not" if the policy
+    without a penalty carries no information.
 
     :param table: From :func:`frontier_table`.
     """
@@ -212,10 +215,10 @@ def verdict(table: pd.DataFrame) -> str:
 
 def report_command(out: Path, runs: pd.DataFrame, env_id: str, env_kwargs: Mapping[str, Any]) -> str:
     """
-    Return the command that measures what the verdict predicts: each limit compared with no penalty, under every fault.
+    Return the command that tests the verdict: it compares each limit with no penalty under every fault.
 
     :param out: Folder of the frontier.
-    :param runs: ``label`` and ``folder`` of each run; those without a penalty come first.
+    :param runs: ``label`` and ``folder`` of each run; the runs without a penalty come first.
     """
     folders = runs[runs["label"] != OPEN_LOOP].groupby("label", sort=False)["folder"].first()
     start = {label: glob.escape(str(out / "runs" / folder.rpartition("seed")[0])) for label, folder in folders.items()}

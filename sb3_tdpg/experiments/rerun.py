@@ -22,23 +22,23 @@ from sb3_tdpg.experiments.runs import Run, SB3Run, complete_run
 
 def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progress_bar: bool = True) -> Path:
     """
-    Train and evaluate the run that a ``config.json`` describes; with the same versions it gives the same numbers.
+    Train and evaluate the run that a ``config.json`` describes. The same versions give the same numbers.
 
-    Rows whose sensor is changed by a function are left out: the file has only its name.
+    Rows with a function that changes the sensor are left out, because the file contains only the function's name.
 
-    :param config: The file. If the run started from the policy of another run, that policy must lie beside the file:
-        ``<name of that run>/model.zip``.
+    :param config: The file. If the run started from the policy of another run, that policy must be in the same folder
+        as the file: ``<name of that run>/model.zip``.
     :param out: Folder of the new run, see :func:`~sb3_tdpg.experiments.runs.complete_run`.
     :param progress_bar: Show progress bars.
     :return: ``out``
-    :raises ValueError: if the file does not describe a run, or the policy to start from is another one.
+    :raises ValueError: if the file does not describe a run, or if the policy to start from is not the recorded one.
     """
     config = Path(config)
     try:
         content = json.loads(config.read_text())
         rows = [row for row in content["scenarios"] if "sensor" not in row]
         scenarios, n_eval_episodes, start = scenarios_of(rows), content["n_eval_episodes"], content["start"]
-        # Without the block: all settings are recorded, and the block may have changed.
+        # The block is not read: all settings are recorded, and the block may have changed since.
         run = (partial(SB3Run, algo=content["algo"]) if "algo" in content else Run)(
             **{name: content[name] for name in ("method", "env_id", "seed", "max_attempts")},
             block=None,
@@ -62,7 +62,7 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
 
 
 def scenarios_of(rows: Sequence[Mapping[str, Any]]) -> list[Scenario]:
-    """Return the scenarios that a recorded run was evaluated on, without the functions that change a sensor."""
+    """Return the scenarios of a recorded run's evaluation that have no function that changes the sensor."""
     return [
         Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"]), n_episodes=row.get("n_episodes"))
         for row in rows
@@ -70,7 +70,7 @@ def scenarios_of(rows: Sequence[Mapping[str, Any]]) -> list[Scenario]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run :func:`rerun` from the command line; return the exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Run :func:`rerun` from the command line; return 0 if done, 2 for bad input and 130 if interrupted."""
     parser = argparse.ArgumentParser(prog="python -m sb3_tdpg.experiments.rerun", description="repeat a recorded run")
     parser.add_argument("config", help="the config.json of a run")
     parser.add_argument("out", help="folder for the new run")

@@ -1,4 +1,4 @@
-"""Training runs: from settings to a trained and evaluated model in a folder, resumable, one at a time or many."""
+"""Complete training runs: train and evaluate a model in a folder, resume it if needed, one run or many at a time."""
 
 import hashlib
 import json
@@ -31,26 +31,26 @@ from sb3_tdpg.experiments.training import make_training, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.tdpg import TDPG
 
-# A checkpoint resets the environments, so the number of epochs between checkpoints is part of the run.
+# A checkpoint resets the environments, so the number of epochs between checkpoints changes the result of a run.
 MAX_CHECKPOINT_EPOCHS = 50
-# Attempts must not share their seeds with other runs.
+# The attempts of a run must not use the seeds of other runs.
 SEEDS_BETWEEN_ATTEMPTS = 1000
 
 
 @dataclass(frozen=True)
 class Run:
     """
-    One method with one seed.
+    One training of one method with one seed.
 
     :param method: The label in tables ("PG", "TDPG").
     :param env_id: The training environment.
-    :param block: Block of ``hyperparams/<algo>.yml``; ``None``: the settings are the overrides alone.
+    :param block: Block of ``hyperparams/<algo>.yml``. ``None``: only the overrides are the settings.
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Maximum number of trainings from scratch, each with its own seed, until one meets the limits of
-        the block's selection. The paper likewise chooses its policy from several trainings.
-    :param start: Folder of a finished run whose policy the training starts from. With the same seed, the training meets
-        the initial states of that run's first epochs again.
+        the block's selection. The paper also chooses its policy from several trainings.
+    :param start: Folder of a finished run; the training starts from the policy of that run. With the same seed, it
+        begins with the same initial states as that run.
     """
 
     method: str
@@ -60,7 +60,7 @@ class Run:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
     start: Path | None = None
-    algo = "tdpg"  # no field: a TDPG's records do not name it
+    algo = "tdpg"  # not a field: the records of a TDPG run do not contain it
 
     def __post_init__(self) -> None:
         last = self.seed + SEEDS_BETWEEN_ATTEMPTS * (self.max_attempts - 1)
@@ -69,12 +69,12 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The block with the overrides."""
+        """The settings of the block, with the overrides."""
         return {**(load_hyperparams(self.block, self.algo) if self.block else {}), **self.overrides}
 
     @property
     def folder_name(self) -> str:
-        """A name made from the method and the seed; "1.25" keeps its point and is not "1/25"."""
+        """The folder's name, made from method and seed. Points are kept, because "1.25" must differ from "1/25"."""
         return "-".join([*re.findall(r"[^\W_]+(?:\.\d+)*", self.method.lower()), f"seed{self.seed}"])
 
     @property
@@ -91,10 +91,11 @@ class Run:
         Train once, or resume an interrupted training.
 
         :param attempt: Number of the training, from 0.
-        :param folder: Gets ``model.zip``, ``selected.json``, the training log and ``time.json``, the wall time and the
-            CPU time of the training in seconds, to which a resumed call adds; while training, a checkpoint.
+        :param folder: Folder for ``model.zip``, ``selected.json``, the training log and ``time.json``, and for the
+            checkpoint during the training. ``time.json`` contains wall time and CPU time in seconds; a resumed call
+            adds to them.
         :param progress_bar: Show a progress bar.
-        :return: the policy, and whether any epoch met the limits of the selection (otherwise it is the last epoch's)
+        :return: the policy, and whether an epoch met the limits of the selection (if not, the policy is the last one)
         """
         path = folder / "time.json"
         before = json.loads(path.read_text()) if path.exists() else dict(wall_s=0.0, cpu_s=0.0)
@@ -124,7 +125,7 @@ class Run:
             model = TDPG.load(checkpoint, env=model.env, device="cpu")
             n_timesteps = model.remaining_timesteps
         elif self.start is not None:
-            # Not the whole model: the optimiser's state belongs to another objective.
+            # Only the policy is copied, because the optimiser's state belongs to another objective.
             start = TDPG.load(self.start / "model.zip", device="cpu")
             model.policy.load_state_dict(start.policy.state_dict())
         suffix = f"_{model.num_timesteps:08d}"
@@ -144,13 +145,13 @@ class Run:
 
 @dataclass(frozen=True)
 class SB3Run(Run):
-    """A run of PPO or recurrent PPO, without a selection; an interrupted training begins anew."""
+    """A run of PPO or recurrent PPO, without a selection. An interrupted training starts again from the beginning."""
 
     algo: str = "ppo"  # or "ppo_lstm"; the block is in hyperparams/<algo>.yml
 
     @property
     def config(self) -> dict[str, Any]:
-        """The settings that make this run."""
+        """Everything that determines the result of the run."""
         return {**super().config, "algo": self.algo}
 
     def _train(
@@ -174,7 +175,7 @@ class SB3Run(Run):
 
 
 class _TimedCheckpoint(TrainingCheckpointCallback):
-    """Also keep the time until each checkpoint, which a killed training has taken."""
+    """Save a checkpoint and the training time up to it, so that the time is known after a killed training."""
 
     def __init__(self, save_path: Path, save_freq: int, keep_times: Callable[[], None]) -> None:
         super().__init__(save_path, save_freq)
@@ -187,28 +188,28 @@ class _TimedCheckpoint(TrainingCheckpointCallback):
 
 
 Task = tuple[Run, Path, Sequence[Scenario]]
-"""A run, its folder, and the scenarios that it is evaluated on."""
+"""A run, its folder, and the scenarios for its evaluation."""
 
 
 def complete_run(
     run: Run, folder: Path, scenarios: Sequence[Scenario], *, n_eval_episodes: int = 1000, progress_bar: bool = False
 ) -> Path:
     """
-    Train and evaluate, or resume an interrupted run, or do nothing if the run is finished.
+    Train and evaluate a run, or resume an interrupted run. Do nothing if the run is finished.
 
-    ``folder`` then holds ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information;
+    ``folder`` then contains ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information;
     missing if no epoch met the limits), ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings,
-    seeds, versions, commit) and, written last, ``episodes.csv`` (a row for each evaluation episode). Earlier attempts
-    stay as ``attempt<i>/``.
+    seeds, versions, commit) and ``episodes.csv`` (a row for each evaluation episode, written last). Earlier attempts
+    are in ``attempt<i>/``.
 
     :param run: The run.
     :param folder: Folder of the run.
     :param scenarios: Scenarios to evaluate the policy on; their environment keywords replace those of the run.
-    :param n_eval_episodes: Episodes of each scenario.
+    :param n_eval_episodes: Number of episodes of each scenario.
     :param progress_bar: Show progress bars.
     :return: ``folder``
-    :raises ValueError: if the folder holds a run with other settings, or there is no policy to start from; nothing is
-        changed then.
+    :raises ValueError: if the folder contains a run with other settings, or the policy to start from is missing; the
+        folder is not changed.
     """
     if run.start is not None and not (run.start / "model.zip").exists():
         raise ValueError(f"{run.folder_name} starts from the policy in {run.start}, and there is none: train it first")
@@ -223,7 +224,7 @@ def complete_run(
         if selected:
             break
     env_kwargs = run.settings.get("env_kwargs") or {}
-    # Another environment may not have the keywords of the training.
+    # Only rows with the training environment get its keywords, which another environment may not have.
     rows = [row.with_kwargs(**env_kwargs) if row.env_id == run.env_id else row for row in scenarios]
     records = evaluate_scenarios(
         {run.method: model},
@@ -232,7 +233,7 @@ def complete_run(
         labels=dict(train_seed=run.seed, attempts=attempt + 1, selected=selected),
         progress_bar=progress_bar,
     )
-    # A save that was killed leaves a part of a file behind.
+    # A process that is killed while it saves a file leaves a partial file.
     shutil.copytree(attempt_folder, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.partial"))
     write_frame_atomically(records, folder / "episodes.csv")
     shutil.rmtree(attempt_folder)
@@ -241,9 +242,9 @@ def complete_run(
 
 def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_episodes: int) -> dict[str, Any]:
     """
-    Return the content of ``config.json``; the parameters are those of :func:`complete_run`.
+    Return the content of ``config.json`` for a run. The parameters are those of :func:`complete_run`.
 
-    :raises ValueError: if the folder holds a run with other settings.
+    :raises ValueError: if the folder contains a run with other settings.
     """
     if (normalize := run.settings.get("normalize")) is not None and normalize.get("norm_obs", True):
         raise ValueError(
@@ -257,12 +258,12 @@ def check_folder(run: Run, folder: Path, scenarios: Sequence[Scenario], n_eval_e
 
 
 def read_progress(folder: Path) -> pd.DataFrame:
-    """Return the training log of a run, one row for each epoch, also if the run was resumed."""
+    """Return the training log of a run, with one row for each epoch even if the run was resumed."""
     frames = [pd.read_csv(path) for path in sorted(folder.glob("progress_*.csv"))]
     log, step = pd.concat([frame for frame in frames if len(frame)]), "time/total_timesteps"
-    # Epochs after the last checkpoint were run again, with the same numbers.
+    # A resumed run repeats the epochs after the last checkpoint, with the same numbers.
     log = log.drop_duplicates(step, keep="last").sort_values(step, ignore_index=True)
-    return log.assign(**{"time/iterations": range(1, len(log) + 1)})  # a resumed log begins with 1 again
+    return log.assign(**{"time/iterations": range(1, len(log) + 1)})  # in a resumed log the numbers start from 1 again
 
 
 def complete_runs(
@@ -273,16 +274,16 @@ def complete_runs(
     failures: dict[str, str] | None = None,
 ) -> None:
     """
-    Complete runs (see :func:`complete_run`) with a progress bar, as many at a time as ``jobs``, or as there are cores.
+    Complete runs (see :func:`complete_run`) with a progress bar, ``jobs`` at a time (default: the number of cores).
 
-    A run that starts from the policy of another one waits for it. Ctrl-C keeps finished runs and checkpoints.
+    A run that starts from the policy of another run waits for that run. Ctrl-C keeps finished runs and checkpoints.
 
-    :raises ValueError: if a folder holds a run with other settings; nothing has been run then.
+    :raises ValueError: if a folder contains a run with other settings; in this case no run has started.
     """
     jobs = jobs or usable_cores()
     if len({folder for _, folder, _ in tasks}) < len(tasks):
         raise ValueError(f"two of these runs have the same folder: {sorted(str(folder) for _, folder, _ in tasks)}")
-    for run, folder, scenarios in tasks:  # an error here comes before anything has been run
+    for run, folder, scenarios in tasks:  # errors are raised before the first run starts
         folder.parent.mkdir(parents=True, exist_ok=True)
         if run.start is None or (run.start / "model.zip").exists():
             check_folder(run, folder, scenarios, n_eval_episodes)
@@ -291,7 +292,7 @@ def complete_runs(
     n_epochs = 0  # of finished runs
     with tqdm(total=len(tasks), unit="run") as progress, process_pool(jobs) as pool:
         while unfinished:
-            # No more than there are workers, so that a run that has to wait keeps its place in the order.
+            # Submit only as many runs as there are free workers, so that a run that must wait keeps its place.
             for task in [t for t in waiting if t[0].start not in unfinished][: jobs - len(running)]:
                 waiting.remove(task)
                 running[pool.submit(complete_run, *task, n_eval_episodes=n_eval_episodes)] = task[1]

@@ -1,8 +1,8 @@
 """
-Optuna studies that any number of worker processes share, on one machine or on many.
+Run Optuna studies that any number of worker processes share, on one machine or on many.
 
-Optuna's heartbeats show which workers are alive, and the trial of a dead worker is put back into the queue. This module
-adds heartbeats for journal files, jobs that are run once each, and a loop that also waits for other workers' trials.
+Optuna's heartbeats show which workers are alive. The trial of a dead worker is put back into the queue. This module
+adds heartbeats for journal files, jobs that are run only once, and a loop that waits for the trials of other workers.
 """
 
 import contextlib
@@ -47,13 +47,13 @@ DONE = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
 class _Journal(JournalStorage, BaseHeartbeat):
-    """A journal file with heartbeats. Its workers run on one machine and read the same clock."""
+    """A journal file with heartbeats. Its workers run on one machine, so that their clocks agree."""
 
     def __init__(self, path: Path, grace_period: float) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and path.read_bytes()[:1] not in (b"", b"{"):
             raise ValueError("it is not a journal file")
-        # Absolute: through a link to this path workers see how old the lock of a dead one is.
+        # The path is absolute, because the lock is a link to it. Through the link, workers see the age of a lock.
         super().__init__(JournalFileBackend(str(path.absolute())))
         self.grace_period = grace_period
 
@@ -72,14 +72,14 @@ class _Journal(JournalStorage, BaseHeartbeat):
 
 
 class _Database(RDBStorage):
-    """A database whose heartbeats go on after an outage and also cover the first moment of a trial."""
+    """A database whose heartbeats continue after an outage and also cover the first moment of a trial."""
 
     def record_heartbeat(self, trial_id: int) -> None:
         with contextlib.suppress(StorageInternalError, sa.exc.SQLAlchemyError):
             super().record_heartbeat(trial_id)
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        # Optuna would wait forever for a worker that has died before its first heartbeat.
+        # Without this, Optuna would wait forever for a worker that died before its first heartbeat.
         early = [t._trial_id for t in _silent_trials(self, study_id) if t.user_attrs.get(STARTED) != t.number]
         return [*super()._get_stale_trial_ids(study_id), *early]
 
@@ -89,21 +89,22 @@ def _interval(grace_period: float) -> int:
 
 
 def _silent_trials(storage: Any, study_id: int) -> list[FrozenTrial]:
-    """Return the running trials without a sign of life in the grace period, by this machine's clock."""
+    """Return the running trials without a start or a heartbeat in the grace period, by this machine's clock."""
     trials = storage.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
     since = time.time() - storage.grace_period
-    # A trial that is run again has inherited an old heartbeat.
+    # A repeated trial has inherited an old heartbeat.
     return [t for t in trials if max(t.datetime_start.timestamp(), t.user_attrs.get(HEARTBEAT, 0.0)) < since]
 
 
 def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PERIOD) -> BaseStorage:
     """
-    Open the storage that workers share, make its tables or file if necessary, and turn off Optuna's messages.
+    Open the storage that workers share, create its tables or file if necessary, and turn off Optuna's messages.
 
-    :param storage: A path that ends in ``.log``: a journal file, for the processes of one machine. For many machines
-        ``postgresql://user:password@host:port/database`` (psycopg 3, unless the URL names another driver), or another
-        database that SQLAlchemy knows, except SQLite, which is not meant for several workers.
-    :param grace_period: Seconds without a heartbeat after which a worker counts as dead; the same for all workers.
+    :param storage: For the processes of one machine: the path of a journal file, which ends in ``.log``. For many
+        machines: ``postgresql://user:password@host:port/database`` (psycopg 3, unless the URL names another driver), or
+        another database that SQLAlchemy supports, except SQLite, which is not made for several workers.
+    :param grace_period: Seconds without a heartbeat after which a worker counts as dead. All workers must use the same
+        value.
     :raises ValueError: if the storage is malformed or does not answer.
     :raises ImportError: if the driver of the database is not installed.
     """
@@ -123,7 +124,7 @@ def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PE
         if "://" not in text:
             return _Journal(Path(text), grace_period)
         return _Database(
-            url.replace("{", "{{").replace("}", "}}"),  # Optuna formats it
+            url.replace("{", "{{").replace("}", "}}"),  # Optuna formats the URL
             dict(pool_pre_ping=True, connect_args=POSTGRES if url.startswith("postgresql") else {}),
             heartbeat_interval=_interval(grace_period),
             grace_period=int(grace_period),
@@ -134,7 +135,7 @@ def open_storage(storage: str | os.PathLike[str], grace_period: float = GRACE_PE
         for _ in range(OPEN_ATTEMPTS - 1):
             with contextlib.suppress(sa.exc.DBAPIError, AssertionError):
                 return open_once()
-            time.sleep(0.5)  # workers that start at once disturb each other while they make the tables
+            time.sleep(0.5)  # workers that start at the same time can fail when they create the tables
         return open_once()
     except ImportError as e:
         raise ImportError(f"storage {shown} needs a driver: pip install 'sb3_tdpg[postgres]'") from e
@@ -155,7 +156,7 @@ def open_study(storage: BaseStorage, name: str, *, space: Mapping[str, Any], **o
 
     :param storage: From :func:`open_storage`.
     :param name: Name of the study.
-    :param space: Everything that makes one trial comparable with another: search space, environment, settings.
+    :param space: Everything that must be equal for trials to be comparable: search space, environment, settings.
     :param options: ``directions``, ``sampler`` and ``pruner`` of ``optuna.create_study``.
     :raises ValueError: if the study was made with another space; the message names the differences.
     """
@@ -163,7 +164,7 @@ def open_study(storage: BaseStorage, name: str, *, space: Mapping[str, Any], **o
         study = optuna.create_study(storage=storage, study_name=name, **options)
     except DuplicatedStudyError:
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True, **options)
-        study.sampler.reseed_rng()  # two workers with the same seed would try the same points
+        study.sampler.reseed_rng()  # otherwise two workers with the same seed would try the same points
     if SPACE not in study.user_attrs:
         if study.get_trials(deepcopy=False):
             raise ValueError(f"study {name!r} was made by another program: choose another name")
@@ -176,12 +177,12 @@ def open_study(storage: BaseStorage, name: str, *, space: Mapping[str, Any], **o
 
 def enqueue_once(study: optuna.Study, jobs: Sequence[Mapping[str, Any]]) -> None:
     """
-    Enqueue the jobs that a study does not have yet, and those that have failed.
+    Enqueue the jobs that a study does not contain yet and the jobs that have failed.
 
-    A job that several workers enqueue at once is in the queue several times; :func:`work` runs it once.
+    If several workers enqueue a job at the same time, it is in the queue several times, but :func:`work` runs it once.
 
     :param study: From :func:`open_study`.
-    :param jobs: The parameters of each job. An objective gets them through ``trial.suggest_*``.
+    :param jobs: The parameters of each job. The objective reads them with ``trial.suggest_*``.
     """
     known = {trial.user_attrs.get(JOB) for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL}
     for job in jobs:
@@ -199,24 +200,24 @@ def work(
     report: Callable[[str], None] = print,
 ) -> None:
     """
-    Run trials until a study is finished, side by side with any number of other workers.
+    Run trials in parallel with any number of other workers until a study is finished.
 
-    A ``ValueError``, raised by a training that has diverged for instance, prunes the trial, which keeps the message as
-    its attribute ``reason``. Any other exception ends this worker and puts the trial back into the queue; so does
-    Ctrl-C. The trial of a worker that was killed is put back by another worker, or by the next one.
+    A ``ValueError``, for instance from a training that diverged, prunes the trial. The message becomes the trial's
+    attribute ``reason``. Any other exception and Ctrl-C end this worker and put the trial back into the queue. If a
+    worker was killed, another worker or the next one puts its trial back.
 
     :param study: From :func:`open_study`.
-    :param objective: Gets a trial, returns its value or values.
-    :param n_trials: Complete and pruned trials that the study is to have, all workers together; it may get up to one
-        more for each worker. ``None``: run the jobs of :func:`enqueue_once`.
-    :param describe: Describes a complete trial; default: its values.
-    :param report: Gets a line of text for each trial.
-    :raises ValueError: if the storage does not answer for a minute. After a shorter outage, the trials that it has cost
-        are run again.
+    :param objective: Function that gets a trial and returns its value or values.
+    :param n_trials: Number of complete and pruned trials of all workers together. Each worker may add up to one more.
+        ``None``: run the jobs of :func:`enqueue_once`.
+    :param describe: Function that describes a complete trial; default: its values.
+    :param report: Function that gets a line of text for each trial.
+    :raises ValueError: if the storage does not answer for a minute. After a shorter outage, the lost trials are run
+        again.
     """
     if n_trials is not None and n_trials < 1:
         raise ValueError(f"n_trials={n_trials} must be at least 1")
-    number: int | None = None  # of the trial that this worker runs
+    number: int | None = None  # number of the trial that this worker runs
     is_interrupted = False
 
     def attempt(trial: optuna.Trial) -> float | Sequence[float]:
@@ -226,13 +227,13 @@ def work(
             if job is None or any(t.user_attrs.get(JOB) == job and t.state != TrialState.FAIL for t in earlier):
                 return [float("nan")] * len(study.directions)  # for Optuna, the trial has failed
         number = trial.number
-        trial.set_user_attr(STARTED, number)  # a trial that is run again inherits the attribute
+        trial.set_user_attr(STARTED, number)  # a repeated trial inherits the attribute
         try:
             values = objective(trial)
             if np.isnan(values).any():
                 raise ValueError(f"the result is {values}")
             return values
-        except KeyboardInterrupt:  # Optuna forgets it where it cannot tell the state of the trial
+        except KeyboardInterrupt:  # Optuna loses this exception if it cannot store the state of the trial
             is_interrupted = True
             raise
         except (TrialPruned, ValueError) as e:
@@ -273,7 +274,7 @@ def work(
                     raise KeyboardInterrupt from e
                 continue
             if number is not None and trials[number].state == TrialState.FAIL:
-                # A trial may be interrupted any number of times.
+                # Interrupts and outages do not count towards the maximum number of retries.
                 max_retries = None if outage or is_interrupted else MAX_RETRIES
                 RetryHeartbeatStaleTrialCallback(max_retries)(study, trials[number])
             if is_interrupted:
@@ -283,14 +284,14 @@ def work(
 
 
 def _outage_in(error: BaseException | None) -> BaseException | None:
-    """Return the storage's error that has led to another one, as Optuna's ``tell`` raises after an outage."""
+    """Return the storage's error that caused an exception, such as the one that Optuna's ``tell`` raises."""
     while error is not None and not isinstance(error, OUTAGE):
         error = error.__cause__ or error.__context__
     return error
 
 
 def _trials_when_answered(study: optuna.Study) -> list[FrozenTrial]:
-    """Return the trials of a study; wait for a database that is being restarted."""
+    """Return the trials of a study; wait if the database is being restarted."""
     deadline = time.monotonic() + PATIENCE
     while True:
         try:

@@ -1,9 +1,9 @@
 """
-The paper's sweep over beta as one command: train, evaluate, select, draw; on one machine or on many.
+Run the paper's sweep over beta: train, evaluate, select and draw, on one machine or on many.
 
-With a storage, this process is one of any number of workers of an Optuna study, in which every run is a trial that also
-keeps the numbers of its run, so that every worker can write the summary. Give all workers the same folder where they
-share a file system: then the selected model is at hand, and a killed run goes on from its checkpoint.
+With a storage, this process is one of any number of workers of an Optuna study. Every run is a trial, which also stores
+the numbers of the run, so that every worker can write the summary. Workers that share a file system should use the same
+folder: then a killed run continues from its checkpoint, and the selected model is available.
 """
 
 import json
@@ -37,15 +37,15 @@ from sb3_tdpg.tdpg import TDPG
 Job = tuple[float, int]  # 1 / beta, seed
 N_INFORMATION = 1000  # episodes
 
-# Among policies with almost no information, which of them has the least is chance: the cheapest of them is taken.
+# Smaller differences in information are chance. So among runs within this of the least, the lowest cost decides.
 TIE = 0.01  # nats
 
 
 def parse_inverse_beta(beta: str | float) -> float:
     """
-    Read a beta and return 1 / beta, the weight of the information; ``"inf"`` gives 0.
+    Read a beta and return 1 / beta, the weight of the information. ``"inf"`` gives 0.
 
-    :raises ValueError: if it is not a positive number.
+    :raises ValueError: if the beta is not a positive number.
     """
     try:
         inverse = 0.0 if str(beta) == "inf" else float(1 / Fraction(str(beta)))
@@ -57,7 +57,7 @@ def parse_inverse_beta(beta: str | float) -> float:
 
 
 def beta_label(inverse_beta: float) -> str:
-    """Name a beta: ``"1/75"``, ``"0.3"``, ``"2"``, ``"inf"``."""
+    """Return the label of a beta: ``"1/75"``, ``"0.3"``, ``"2"`` or ``"inf"``."""
     if inverse_beta == 0:
         return "inf"
     return f"1/{inverse_beta:.0f}" if inverse_beta == round(inverse_beta) > 1 else f"{1 / inverse_beta:.6g}"
@@ -65,7 +65,7 @@ def beta_label(inverse_beta: float) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """The settings that all runs share; the first scenario is that of the training."""
+    """The settings that all runs share. The first scenario is the training scenario."""
 
     env_id: str
     block: str
@@ -77,10 +77,10 @@ class _Plan:
     study: tuple[str, str, float] | None  # storage, name, grace period
 
     def run(self, inverse_beta: float, seed: int) -> Run:
-        """Return the run of one beta and one seed."""
+        """Return the run for one beta and one seed."""
         overrides = {**self.settings, "beta": 1 / inverse_beta if inverse_beta else math.inf}
         if "cost_limit" in load_hyperparams(self.block):
-            overrides["cost_limit"] = None  # it belongs to beta="auto"
+            overrides["cost_limit"] = None  # only for beta="auto"
         return Run(f"beta {beta_label(inverse_beta)}", self.env_id, self.block, seed, overrides)
 
     def task(self, inverse_beta: float, seed: int) -> Task:
@@ -95,7 +95,7 @@ class _Plan:
 
     @property
     def config(self) -> dict[str, Any]:
-        """Everything that makes one run comparable with another."""
+        """Everything that must be equal for runs to be comparable."""
         settings = {name: value for name, value in self.run(1.0, 0).settings.items() if name != "beta"}
         rows = {row.name: dict(env_id=row.env_id, env_kwargs=dict(row.env_kwargs)) for row in self.scenarios}
         shared = {name: getattr(self, name) for name in ("env_id", "block", "n_eval_episodes")}
@@ -103,17 +103,17 @@ class _Plan:
 
 
 def _columns(scenarios: Sequence[Scenario]) -> dict[str, str]:
-    """Return the name of the column of ``runs.csv`` with the mean cost, by scenario."""
+    """Return for each scenario the column of ``runs.csv`` with its mean cost."""
     return {scenario.name: f"cost: {scenario.name}" for scenario in scenarios}
 
 
 def finished_row(task: Task, n_eval_episodes: int, labels: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Measure a finished run: its cost in each scenario and its information in the first; the row is kept in its folder.
+    Measure a finished run's cost in each scenario and its information in the first scenario; save and return this row.
 
     :param task: The run.
-    :param n_eval_episodes: Episodes for the information, 1000 at most.
-    :param labels: The first columns.
+    :param n_eval_episodes: Number of episodes for the information, at most 1000.
+    :param labels: The first columns of the row.
     """
     run, folder, scenarios = task
     path = folder / "sweep_row.json"
@@ -157,32 +157,32 @@ def sweep(
     grace_period: float = 60.0,
 ) -> str:
     """
-    Train every beta with every seed, evaluate the policies on the environment's scenarios, select one, draw.
+    Train every beta with every seed, evaluate the policies on the environment's scenarios, select one and draw figures.
 
-    The paper's rule selects the run with the least information among those whose cost is below the limit. Of the runs
-    within 0.01 nat of it the cheapest is taken. Finished runs are kept: the same call resumes an interrupted sweep, and
-    a call with more betas or seeds adds to it.
+    The paper's rule selects the run with the least information among the runs whose cost is below the limit. If several
+    runs are within 0.01 nat of the least information, the one with the lowest cost is selected. Finished runs are kept:
+    the same call resumes an interrupted sweep, and a call with more betas or seeds adds to it.
 
     :param env_id: A registered id.
     :param betas: Numbers, fractions (``"1/75"``) or ``"inf"`` (policy gradient).
     :param n_seeds: Number of training seeds of each beta, from seed 0 on.
-    :param cost_limit: Limit of the selection on the mean cost of the evaluation; default: minus the
-        ``reward_threshold`` that the environment is registered with.
+    :param cost_limit: Limit of the selection on the mean cost of the evaluation; default: minus the registered
+        ``reward_threshold`` of the environment.
     :param out: Folder for ``summary.md``, ``runs.csv``, ``sweep.png``, ``selected.zip``, ``selected.json``,
         ``config.json`` and ``runs/``; default: ``results/sweep-<block>``.
-    :param storage: Storage that all workers share, see :func:`~sb3_tdpg.experiments.studies.open_storage`; default:
-        none, and this machine works alone.
+    :param storage: Storage that all workers share, see :func:`~sb3_tdpg.experiments.studies.open_storage`. By default
+        there is no storage, and only this machine runs the sweep.
     :param study_name: Name of the study in the storage; default: ``sweep-<block>``.
-    :param jobs: Number of runs at a time on this machine; default: the number of cores, with a storage 1.
+    :param jobs: Number of runs at a time on this machine; default: the number of cores, or 1 with a storage.
     :param n_timesteps: Environment steps of each training; default: as in the block.
-    :param n_eval_episodes: Episodes of each scenario.
-    :param block: Block of ``hyperparams/tdpg.yml``; default: that of the environment.
+    :param n_eval_episodes: Number of episodes of each scenario.
+    :param block: Block of ``hyperparams/tdpg.yml``; default: the block of the environment.
     :param settings: Settings that replace those of the block: ``dict(mi_estimator="logdet")``.
     :param grace_period: Seconds without a heartbeat after which another worker of the study counts as dead.
     :return: the summary, as Markdown
-    :raises ValueError: if an argument is malformed or does not fit; nothing has been trained by then.
+    :raises ValueError: if an argument is malformed or does not fit; no training has started in this case.
     """
-    # The strongest penalty last: the legend and the tables go from the policy gradient to the least information.
+    # The strongest penalty comes last: legend and tables go from policy gradient to the least information.
     wanted = [(inverse, seed) for inverse in sorted({*map(parse_inverse_beta, betas)}) for seed in range(n_seeds)]
     if not wanted:
         raise ValueError("a sweep needs at least one beta and one seed: --betas 1/25 1/50 1/75 1/100 --seeds 5")
@@ -247,7 +247,7 @@ def _cost_limit(env_id: str, given: float | None) -> float:
 
 
 def build_once(make_run: Callable[[], Run]) -> Training:
-    """Build the model of a run, so that errors in the settings are found before any training."""
+    """Build the model of a run, to find errors in the settings before any training."""
     try:
         run = make_run()
         training = make_training(run.env_id, run.settings, seed=0, device="cpu")
@@ -272,7 +272,7 @@ def _open_study(plan: _Plan) -> Any:
 
 
 def _work(plan: _Plan, wanted: Sequence[Job]) -> None:
-    """Be one worker: run jobs of the study until none is left."""
+    """Run jobs of the study as one of its workers until no job is left."""
     from sb3_tdpg.experiments.studies import enqueue_once, work
 
     def objective(trial: Any) -> tuple[float, float]:
@@ -280,7 +280,7 @@ def _work(plan: _Plan, wanted: Sequence[Job]) -> None:
         task = plan.task(*job)
         try:
             check_folder(*task, plan.n_eval_episodes)
-        except ValueError as e:  # a job of another worker that does not fit into this one's folder: not to be pruned
+        except ValueError as e:  # the job does not fit into this worker's folder, but another worker can run it
             raise FileExistsError(str(e)) from e
         complete_run(*task, n_eval_episodes=plan.n_eval_episodes)
         row = plan.row(*job)
@@ -293,7 +293,7 @@ def _work(plan: _Plan, wanted: Sequence[Job]) -> None:
 
 
 def _results(study: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Return the rows of the finished runs of a study, and the reasons of the failed ones."""
+    """Return the rows of a study's finished runs, and the reasons why other runs failed."""
     attributes = [trial.user_attrs for trial in study.get_trials(deepcopy=False) if "job" in trial.user_attrs]
     rows = {each["job"]: each["row"] for each in attributes if "row" in each}
     reasons = {each["job"]: each.get("reason", "its worker failed or was killed") for each in attributes}
@@ -301,14 +301,14 @@ def _results(study: Any) -> tuple[list[dict[str, Any]], dict[str, str]]:
 
 
 def select(runs: pd.DataFrame, cost_limit: float) -> pd.Series | None:
-    """Select a run by the paper's rule (see :func:`sweep`), if one is below the limit."""
+    """Select a run by the paper's rule (see :func:`sweep`); return ``None`` if no run is below the limit."""
     below = runs[runs["cost"] < cost_limit]
     least = below[below["information"] <= below["information"].min() + TIE]
     return None if below.empty else least.loc[least["cost"].idxmin()]
 
 
 def _write(plan: _Plan, runs: pd.DataFrame, failures: Mapping[str, str]) -> str:
-    """Write everything except the runs, and return the summary; any worker may do so, and more than once."""
+    """Write all files except the runs, and return the summary. Every worker may call this more than once."""
     out, best = plan.out, select(runs, plan.cost_limit)
     write_frame_atomically(runs, out / "runs.csv")
     model, record = out / "selected.zip", out / "selected.json"

@@ -1,4 +1,4 @@
-"""The figures of a sweep and of a frontier: the cost of the runs against the information in their TRVs."""
+"""Draw the figures of a sweep and of a frontier: the cost of the runs against the information in their TRVs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ABOUT_NOTHING = 0.01  # nats: differences below it mean nothing, though a logarithmic axis shows them
+ABOUT_NOTHING = 0.01  # nats: smaller differences have no meaning, although a logarithmic axis shows them
 FLOOR = 1e-5  # nats
 ORDERED = "Sensor noise"  # prefix of the scenarios that follow the reference in order
 LIMIT_COLOR = "#D55E00"
@@ -22,11 +22,11 @@ LIMIT_COLOR = "#D55E00"
 
 def tradeoff_figure(runs: pd.DataFrame, rows: Mapping[str, str], best: pd.Series | None, cost_limit: float) -> Figure:
     """
-    Draw cost against information, one point for each run, and beside it the cost of each run in each scenario.
+    Draw two panels: cost against information with one point per run, and the cost of each run in each scenario.
 
     :param runs: ``label``, ``seed``, ``cost``, ``information`` (nats) and the columns of ``rows`` for each run, in the
-        order of drawing. ``best`` is the selected one.
-    :param rows: Column of the mean cost by name of the scenario, the reference first.
+        order of drawing. ``best`` is the selected run.
+    :param rows: The column of the mean cost for each scenario's name; the reference scenario comes first.
     """
     matplotlib = import_matplotlib()
     has_rows = len(rows) > 1
@@ -69,7 +69,7 @@ def tradeoff_figure(runs: pd.DataFrame, rows: Mapping[str, str], best: pd.Series
 
 
 def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: Mapping[Any, Any]) -> None:
-    """Draw each run as a dot in each row, the median over seeds as a bar, and a line where the rows have an order."""
+    """Draw a dot for each run in each row, a bar for the median over seeds, and a line through ordered rows."""
     names = list(rows)
     in_order = 1 + sum(name.startswith(ORDERED) for name in names)
     for i, (label, group) in enumerate(runs.groupby("label", sort=False)):
@@ -87,11 +87,11 @@ def _draw_rows(axes: Axes, runs: pd.DataFrame, rows: Mapping[str, str], colors: 
 
 def frontier_figure(runs: pd.DataFrame, table: pd.DataFrame, knee: str | None) -> Figure:
     """
-    Draw cost against information: a dot for each run, the means with their intervals, the open loop, the knee.
+    Draw cost against information: a dot for each run, the means with their intervals, the open loop and the knee.
 
     :param runs: ``label``, ``cost`` and ``information`` (nats) of each run.
-    :param table: From :func:`~sb3_tdpg.experiments.frontier.frontier_table`: without a penalty, by share, blind.
-    :param knee: Label of the row to mark.
+    :param table: From :func:`~sb3_tdpg.experiments.frontier.frontier_table`.
+    :param knee: Label of the row that is marked as the knee.
     """
     matplotlib = import_matplotlib()
     figure, ((axes,),) = new_panels(WIDTH * 0.75, 4.2)
@@ -101,7 +101,7 @@ def frontier_figure(runs: pd.DataFrame, table: pd.DataFrame, knee: str | None) -
     axes.plot(points["nats"], points["cost"], color=INK, linewidth=0.8, zorder=2)
     mixture: dict[str, Any] = dict(color=LIMIT_COLOR, linestyle=(0, (1, 2)), linewidth=1.2, zorder=1)
     axes.plot([start["nats"], 0], [start["cost"], end["best"]], label="mixtures of the two", **mixture)
-    sizes = np.linspace(9, 5, len(points))  # rows on top of each other stay visible
+    sizes = np.linspace(9, 5, len(points))  # different sizes keep overlapping points visible
     for color, size, (_, row) in zip([INK, *shades], sizes, points.iterrows(), strict=True):
         seeds = runs[runs["label"] == row["label"]]
         axes.plot(seeds["information"], seeds["cost"], ".", color=color, markersize=5, alpha=0.6, zorder=3)

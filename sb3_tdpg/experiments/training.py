@@ -1,4 +1,4 @@
-"""From a block of ``hyperparams/tdpg.yml`` to a model that is ready to learn."""
+"""Make a model that is ready to learn from a block of ``hyperparams/tdpg.yml``."""
 
 from collections.abc import Mapping
 from pkgutil import resolve_name
@@ -13,7 +13,7 @@ from sb3_tdpg.vec_env import make_episodes_env
 
 
 class Training(NamedTuple):
-    """A model with the callbacks and the number of timesteps of its training."""
+    """A model, and the callbacks and the number of timesteps for its training."""
 
     model: TDPG
     callbacks: list[BaseCallback]
@@ -29,9 +29,8 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     """
     Build model and callbacks from a block of settings, as rl-zoo3 does.
 
-    ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper``, ``normalize`` and ``callback`` are the zoo's keys;
-    ``lin_1e-3`` is a learning rate that falls linearly to zero; every other key is an argument of
-    :class:`~sb3_tdpg.tdpg.TDPG`.
+    ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper``, ``normalize`` and ``callback`` are keys of rl-zoo3. All other
+    keys are arguments of :class:`~sb3_tdpg.tdpg.TDPG`. ``lin_1e-3`` is a learning rate that decreases linearly to zero.
 
     :param env_id: A registered id.
     :param block: The settings, for instance from :func:`sb3_tdpg.hyperparams.load_hyperparams`.
@@ -46,10 +45,10 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
 
 def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
     """
-    Make the environments of a training, and remove their settings from a block.
+    Make the environments of a training, and remove the settings of the environments from a block.
 
-    These are ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of ``VecNormalize``,
-    to which the zoo adds ``gamma``).
+    These settings are ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of
+    ``VecNormalize``, to which the zoo adds ``gamma``).
     """
     env = make_episodes_env(
         env_id,
@@ -57,7 +56,7 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
         n_episodes=settings.get("n_episodes"),
         epoch_steps=settings.get("epoch_steps"),
         env_kwargs=settings.pop("env_kwargs", {}),
-        use_processes=False,  # runs are made side by side in processes of their own
+        use_processes=False,  # each run already has its own process
     )
     for entry in settings.pop("vec_env_wrapper", []):
         env = _make(VecEnvWrapper, entry, env)
@@ -71,6 +70,6 @@ def _make(kind: type, entry: str | Mapping[str, Mapping[str, Any]], *arguments: 
     if more:
         raise ValueError(f"a callback or a wrapper is one class with its keywords, not {entry}")
     cls = resolve_name(path)
-    if not (isinstance(cls, type) and issubclass(cls, kind)):  # settings may be another's: call no function
+    if not (isinstance(cls, type) and issubclass(cls, kind)):  # settings can come from others: call no other function
         raise ValueError(f"{path} is not a subclass of {kind.__name__}")
     return cls(*arguments, **keywords)

@@ -1,4 +1,4 @@
-"""Publish models on the Hugging Face Hub and load them from there, as Stable-Baselines3 models are."""
+"""Publish models on the Hugging Face Hub and load them from there, in the way of Stable-Baselines3."""
 
 try:
     import huggingface_hub  # noqa: F401

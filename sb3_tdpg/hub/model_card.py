@@ -1,4 +1,4 @@
-"""The model card: results with intervals, use, how the model was made, and the metadata that the Hub reads."""
+"""Write the model card: results with intervals, use, how the model was made, and metadata for the Hub."""
 
 import math
 import re
@@ -17,11 +17,11 @@ from sb3_tdpg.hub.publication import Publication, plain
 
 ALGORITHM = "tdpg"
 TAGS = ("deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3_tdpg")
-LEVEL = 0.95  # of the intervals
+LEVEL = 0.95  # confidence level of the intervals
 
 
 def model_name(env_id: str) -> str:
-    """Return the conventional name of a model and its repository for an environment id: ``tdpg-Lava-v0``."""
+    """Return the conventional name of the model and the repository for an environment id: ``tdpg-Lava-v0``."""
     return f"{ALGORITHM}-{env_id.rpartition(':')[2].replace('/', '-')}"
 
 
@@ -30,10 +30,11 @@ def results_with_intervals(records: pd.DataFrame) -> pd.DataFrame:
     Summarise the episodes of one policy, with 95 % confidence intervals over episodes.
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :return: a row for each scenario, the training environment first: the columns of
-        :func:`~sb3_tdpg.evaluation.summary_table`, ``low`` and ``high`` of the mean cost (Student's t) and, if the
-        records have failures, ``failure_low`` and ``failure_high`` of their share (Wilson)
-    :raises ValueError: if the records are of several policies, or there are fewer than two episodes of a scenario.
+    :return: a row for each scenario, the training environment first. To the columns of
+        :func:`~sb3_tdpg.evaluation.summary_table` it adds the interval of the mean cost, ``low`` and ``high``
+        (Student's t). If the records have failures, it also adds the interval of the failure rate, ``failure_low`` and
+        ``failure_high`` (Wilson)
+    :raises ValueError: if the records are from several policies, or a scenario has fewer than two episodes.
     """
     for column in ("model", "train_seed", "deterministic"):
         if column in records and records[column].nunique() > 1:
@@ -58,17 +59,17 @@ def model_card(
     publication: Publication, results: pd.DataFrame, repo_id: str, pictures: Collection[str] = ()
 ) -> ModelCard:
     """
-    Make the card of a repository, with the results of :func:`results_with_intervals`.
+    Make the model card of a repository, with the results of :func:`results_with_intervals`.
 
-    As for any Stable-Baselines3 model, the metric is the mean reward, here the negative cost. Of the ``pictures`` in
-    the folder, ``training.png`` and ``replay.mp4`` are shown.
+    As for any Stable-Baselines3 model, the metric is the mean reward, here the negative cost. The card shows
+    ``training.png`` and ``replay.mp4`` if they are among the ``pictures`` in the folder.
     """
     changes = {row.name: _changes(publication, row.env_kwargs) for row in publication.scenarios}
     task = "reinforcement-learning"
     rows: list[dict[str, str]] = []
     evaluations: list[EvalResult] = []
     for result in results.to_dict("records"):
-        # Digits after the point, so that the half-width of the interval shows two significant ones.
+        # The number of decimals shows two significant digits of the interval's half-width.
         half = (result["high"] - result["low"]) / 2
         digits = 2 if half == 0 else min(6, max(2, 1 - math.floor(math.log10(half))))
         mean, low, high, std = (f"{result[name]:.{digits}f}" for name in ("mean", "low", "high", "std"))
@@ -112,12 +113,12 @@ def model_card(
         make_arguments=", ".join([repr(publication.env_id), *make_keywords]),
         settings=yaml.safe_dump(plain(publication.settings), sort_keys=False).strip(),
     )
-    card.text = re.sub(r"\n{3,}", "\n\n", card.text) + "\n"  # left by conditions that do not hold
+    card.text = re.sub(r"\n{3,}", "\n\n", card.text) + "\n"  # false conditions of the template leave empty lines
     return card
 
 
 def _changes(publication: Publication, env_kwargs: Any) -> str:
-    """Return the keywords in which a scenario differs from the training environment."""
+    """Return the keywords of a scenario that differ from those of the training environment."""
     training = plain(publication.env_kwargs)
     changes = {key: value for key, value in plain(env_kwargs).items() if value != training.get(key)}
     return ", ".join(f"`{k}={v:.4g}`" if isinstance(v, float) else f"`{k}={v}`" for k, v in changes.items())

@@ -1,4 +1,4 @@
-"""What a model card is made from: the folder of a run, a folder of rl-zoo3, or a publication made by hand."""
+"""Read the content of a model card from the folder of a run or of rl-zoo3, or take it from a ``Publication``."""
 
 import json
 import shlex
@@ -35,19 +35,19 @@ class Publication:
 
     :param model: The model, or the file that ``model.save`` wrote.
     :param env_id: The training environment.
-    :param records: Episodes of this one policy, from :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :param scenarios: The scenarios of the records, for their keywords.
+    :param records: Episodes of this policy alone, from :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
+    :param scenarios: The scenarios of the records; the card shows their keywords.
     :param method: Name of the method ("PG", "TDPG").
-    :param settings: Hyperparameters, as a block of ``hyperparams/tdpg.yml``; ``env_kwargs`` are the keywords of the
-        training environment.
+    :param settings: Hyperparameters in the form of a block of ``hyperparams/tdpg.yml``. ``env_kwargs`` are the keywords
+        of the training environment.
     :param seed: Training seed.
     :param progress: Training log, see :func:`~sb3_tdpg.evaluation.training_curves`.
     :param notes: Sentences about the training.
     :param command: The command that made the model.
-    :param again: The command that makes it again, in the published folder.
-    :param how: From :func:`~sb3_tdpg.common.provenance.provenance`, at training.
+    :param again: The command that repeats the training in the published folder.
+    :param how: Result of :func:`~sb3_tdpg.common.provenance.provenance` at the time of the training.
     :param evaluated: When the records were made.
-    :param files: Further files: the path in the published folder, and the file.
+    :param files: Additional files; the keys are their paths in the published folder.
     :param metrics: Files for ``train_eval_metrics.zip``, which rl-zoo3 reads.
     """
 
@@ -74,12 +74,12 @@ class Publication:
 
 
 def plain(value: Any) -> Any:
-    """Turn a value into text, numbers (also infinite ones), lists and mappings, which YAML can hold."""
+    """Convert a value to text, numbers (finite or infinite), lists and mappings, which YAML can contain."""
     return with_numbers(jsonable(value))
 
 
 def read_publication(folder: Path, **evaluation: Any) -> Publication:
-    """Read the folder of a run (:func:`read_run`) or of rl-zoo3 (:func:`read_zoo_folder`), which is evaluated."""
+    """Read the folder of a run with :func:`read_run`, or evaluate a folder of rl-zoo3 with :func:`read_zoo_folder`."""
     refuse_links(folder)
     if (folder / "config.json").exists():
         try:
@@ -95,7 +95,7 @@ def read_publication(folder: Path, **evaluation: Any) -> Publication:
 
 
 def read_run(folder: Path) -> Publication:
-    """Read the folder of a finished run, see :func:`~sb3_tdpg.experiments.runs.complete_run`."""
+    """Read the folder of a finished run; see :func:`~sb3_tdpg.experiments.runs.complete_run`."""
     if missing := [n for n in ("config.json", "model.zip", "episodes.csv") if not (folder / n).exists()]:
         raise ValueError(
             f"{folder} holds no finished run, since {', '.join(missing)} is missing: finish it with the command that "
@@ -113,7 +113,8 @@ def read_run(folder: Path) -> Publication:
         refuse_links(folder.parent / start)
         notes.append(f"The training started from the policy of another run, {start}.")
         files[f"{start}/model.zip"] = folder.parent / start / "model.zip"
-    # The policy that the run started from may be gone, and a class among the settings is a text in the file.
+    # A run is not repeatable if the policy that it started from is missing, or if a setting was a class (the file
+    # contains only its name).
     has_class = "<class '" in json.dumps(config["settings"])
     is_repeatable = (start is None or files[f"{start}/model.zip"].exists()) and not has_class
     return Publication(
@@ -134,7 +135,7 @@ def read_run(folder: Path) -> Publication:
 
 
 def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
-    """Read the episodes of a run, and refuse a truncated file."""
+    """Read the episodes of a run; raise an error if the file is truncated."""
     expected = sum(row.get("n_episodes") or config["n_eval_episodes"] for row in config["scenarios"])
     try:
         records = pd.read_csv(path)
@@ -155,11 +156,11 @@ def read_zoo_folder(
     """
     Read a folder that rl-zoo3's ``train`` wrote (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
 
-    This is the policy at the end of the training or, if there is none, ``best_model.zip``.
+    The policy is the one from the end of the training or, if that is missing, ``best_model.zip``.
 
-    :param scenarios: Where to evaluate; default: the training environment and the test rows of the paper's table. The
-        keywords of the training hold unless a scenario replaces them.
-    :param n_eval_episodes: Episodes of each scenario.
+    :param scenarios: Scenarios of the evaluation; default: the training environment and the test rows of the paper's
+        table. A scenario has the keywords of the training unless it replaces them.
+    :param n_eval_episodes: Number of episodes of each scenario.
     :param seed: Seed of the evaluation.
     """
     inner = next(folder.glob("*/args.yml")).parent
@@ -183,20 +184,20 @@ def read_zoo_folder(
         if settings.get("frame_stack"):
             env = VecFrameStack(env, settings["frame_stack"])
     model = TDPG.load(model_path, env=env, device="cpu")
-    # Not the table's own first row: its keywords would replace those of the training.
+    # The table's first row is left out, because its keywords would replace those of the training.
     default = [Scenario("Training", env_id), *PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:]]
     rows = default if scenarios is None else scenarios
     options: Any = dict(seed=seed, env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))
     records = evaluate_scenarios({"TDPG": model}, rows, n_eval_episodes, **options)
     progress = None
-    if get_monitor_files(str(folder)):  # the mean cost of each epoch, from the log of episodes
+    if get_monitor_files(str(folder)):  # compute the mean cost of each epoch from the log of episodes
         log = load_results(str(folder))
-        # The length of an epoch is one in episodes, or in steps.
+        # The length of an epoch is a number of episodes or a number of steps.
         done = log["l"].cumsum().to_numpy() if model.n_episodes is None else np.arange(1, len(log) + 1)
         size = model.n_episodes or model.epoch_size
         means = -log["r"].groupby((done - 1) // size).mean()[: done[-1] // size]
         progress = pd.DataFrame({"time/iterations": np.arange(1, len(means) + 1), "rollout/ep_cost_mean": means})
-    # Our `train` saves the selected policy when it is finished, the zoo's the last one.
+    # A finished training of our `train` saves the selected policy; rl-zoo3's `train` saves the last policy.
     is_ours = (folder / "run.json").exists()
     if is_ours and is_last and not (folder / "checkpoint.zip").exists():
         note = _selection_note(folder, settings)
@@ -228,14 +229,14 @@ def _read_plain(path: Path) -> dict[str, Any]:
 
 
 def _typed_command(command: str) -> str | None:
-    """Return a command as a user would type it; ``None`` for that of a worker process, which says nothing."""
+    """Return a command as a user would type it, or ``None`` for the command of a worker process."""
     if "multiprocessing" in command or not command.strip():
         return None
     return shlex.join(as_typed(shlex.split(command)))
 
 
 def _saved_versions(model_path: Path) -> dict[str, Any]:
-    """Return what SB3 saves about the machine with a model."""
+    """Return the versions and the platform that SB3 saves with a model."""
     with zipfile.ZipFile(model_path) as archive:
         lines = archive.read("system_info.txt").decode().splitlines()
     versions = dict(line.removeprefix("- ").split(": ", 1) for line in lines if line.startswith("- ") and ": " in line)
@@ -243,7 +244,7 @@ def _saved_versions(model_path: Path) -> dict[str, Any]:
 
 
 def _selection_note(folder: Path, settings: Mapping[str, Any]) -> str:
-    """Say which epoch the policy is from."""
+    """Return a sentence that says which epoch the policy is from."""
     if (folder / "selected.json").exists():
         best = Candidate.from_json((folder / "selected.json").read_text())
         return f"The selection chose the policy of {best}, measured on the episodes of that epoch."

@@ -1,4 +1,4 @@
-"""Write the folder of a model, with the files that rl-zoo3 asks for, and exchange it with the Hugging Face Hub."""
+"""Write a model's folder with the files that rl-zoo3 needs, and exchange it with the Hugging Face Hub."""
 
 import json
 import os
@@ -28,7 +28,7 @@ from sb3_tdpg.hub.publication import Publication, plain, read_publication
 from sb3_tdpg.tdpg import TDPG
 
 LIBRARY: Any = dict(library_name="sb3_tdpg")  # for the statistics of the Hub
-# Files that only some models have: those of an earlier model must not be taken for the new one's.
+# Files that only some models have. An upload deletes them first, so that no file of an earlier model remains.
 OPTIONAL_FILES = ["command.txt", "replay.mp4", "selected.json", "training.png", "vec_normalize.pkl"]
 
 
@@ -43,17 +43,17 @@ def write_model_card(
     """
     Write a folder with a model, its card and its records, ready for :func:`push_to_hub`.
 
-    It has the files of a Stable-Baselines3 model on the Hub, ``results.json`` for the training environment, and also
-    ``episodes.csv``, ``config.json`` and ``training.png``. The folder appears only when it is complete.
+    The folder has the files of a Stable-Baselines3 model on the Hub, ``results.json`` for the training environment, and
+    also ``episodes.csv``, ``config.json`` and ``training.png``. It is created only when it is complete.
 
-    :param source: The folder of a run, a folder of rl-zoo3 (its policy is evaluated now), or a publication.
-    :param out: The folder; it must not exist, or be empty.
-    :param repo_id: The repository that it is for: ``organization/name``.
-    :param film_episodes: Episodes to show in ``replay.mp4``, which the Hub plays beside the card; 0: no video.
-    :param evaluation: For a folder of rl-zoo3, see ``sb3_tdpg.hub.publication.read_zoo_folder``.
+    :param source: The folder of a run, a folder of rl-zoo3 (whose policy is evaluated now), or a publication.
+    :param out: The folder. It must not exist, or it must be empty.
+    :param repo_id: The repository for which the folder is made: ``organization/name``.
+    :param film_episodes: Number of episodes in ``replay.mp4``, which the Hub plays beside the card. 0 means no video.
+    :param evaluation: For a folder of rl-zoo3: the arguments of ``sb3_tdpg.hub.publication.read_zoo_folder``.
     :return: ``out``
-    :raises ValueError: if ``out`` is not empty, the source is not finished, or the records are not of one policy with
-        two or more episodes of each scenario.
+    :raises ValueError: if ``out`` is not empty, the source is not finished, the records are from several policies, or a
+        scenario has fewer than two episodes.
     """
     if film_episodes < 0:
         raise ValueError(f"film_episodes={film_episodes} must be at least 0: the episodes in replay.mp4")
@@ -77,7 +77,7 @@ def write_model_card(
         if publication.progress is not None:
             figure = training_curves({publication.method: publication.progress})
             if "mi/total" not in publication.progress:
-                figure.axes[1].set_axis_off()  # it has no curve
+                figure.axes[1].set_axis_off()  # this panel has no curve
             save_figure(figure, folder / "training.png")
         if film_episodes:
             if isinstance(publication.model, Path):
@@ -100,13 +100,14 @@ def push_to_hub(
     token: str | None = None,
 ) -> str:
     """
-    Upload a folder of :func:`write_model_card`; the repository is created if it does not exist.
+    Upload a folder that :func:`write_model_card` wrote. The repository is created if it does not exist.
 
     :param folder: The folder.
     :param repo_id: ``organization/name``.
     :param private: Whether a new repository is private; default: the default of the organization.
-    :param commit_message: For the history of the repository.
-    :param token: Default: the one that ``hf auth login`` stored, or the variable ``HF_TOKEN``.
+    :param commit_message: Commit message for the history of the repository.
+    :param token: Access token; default: the token that ``hf auth login`` stored, or the environment variable
+        ``HF_TOKEN``.
     :return: the address of the repository
     :raises ValueError: if the folder has no model card, or the upload fails.
     """
@@ -133,17 +134,17 @@ def load_from_hub(
     **kwargs: Any,
 ) -> TDPG:
     """
-    Download a model, unless it is in the cache, and load it.
+    Load a model from the Hub; download it if it is not in the cache.
 
     :param repo_id: ``organization/name``.
-    :param filename: The model in it; default: the only ``tdpg-*.zip``.
+    :param filename: The model file in the repository; default: the only ``tdpg-*.zip``.
     :param env: See :meth:`TDPG.load <sb3_tdpg.TDPG.load>`.
-    :param revision: A branch, tag or commit; default: the newest.
-    :param token: For a private repository; default: see :func:`push_to_hub`.
+    :param revision: A branch, tag or commit; default: the newest commit.
+    :param token: Access token for a private repository; default: see :func:`push_to_hub`.
     :param trust_remote_code: Whether to unpickle the download, which can run any code. Default: whether the variable
         ``TRUST_REMOTE_CODE`` is set, as in ``huggingface_sb3``.
     :param kwargs: See :meth:`TDPG.load <sb3_tdpg.TDPG.load>`.
-    :raises ValueError: if ``trust_remote_code`` is not true, or if the repository has no such model of TDPG.
+    :raises ValueError: if ``trust_remote_code`` is not true, or if the repository has no such TDPG model.
     """
     if trust_remote_code is None:
         trust_remote_code = os.environ.get("TRUST_REMOTE_CODE", "").lower() in ("1", "true", "yes", "y", "on", "t")
@@ -155,7 +156,7 @@ def load_from_hub(
     with _one_line_errors(repo_id, "read"):
         if filename is None:
             files = huggingface_hub.HfApi(token=token).list_repo_files(repo_id, revision=revision)
-            # A folder holds the policy that the training started from.
+            # Models in folders are skipped: a folder contains the policy that the training started from.
             models = [name for name in files if "/" not in name and fnmatch(name, f"{ALGORITHM}-*.zip")]
             if len(models) != 1:
                 found = f"several models ({', '.join(models)})" if models else f"no {ALGORITHM}-*.zip"
@@ -169,12 +170,12 @@ def pull_from_hub(
     repo_id: str, out: str | os.PathLike[str], *, revision: str | None = None, token: str | None = None
 ) -> Path:
     """
-    Download a repository; nothing in it is run or unpickled. Nothing stays of a download that fails.
+    Download a repository without running or unpickling any file. A download that fails leaves nothing behind.
 
     :param repo_id: ``organization/name``.
-    :param out: The folder; it must not exist, or be empty.
-    :param revision: A branch, tag or commit; default: the newest.
-    :param token: For a private repository; default: see :func:`push_to_hub`.
+    :param out: The folder. It must not exist, or it must be empty.
+    :param revision: A branch, tag or commit; default: the newest commit.
+    :param token: Access token for a private repository; default: see :func:`push_to_hub`.
     :return: ``out``
     :raises ValueError: if ``out`` is not empty, or the download fails.
     """
@@ -201,16 +202,16 @@ def _empty(out: str | os.PathLike[str]) -> Path:
 
 
 def _check_model(path: Path) -> None:
-    """Refuse a damaged file, and unpickle nothing."""
+    """Raise an error if a model file is damaged; do not unpickle it."""
     try:
         load_from_zip_file(path, device="cpu", load_data=False)[1]["policy"]
-    except Exception as e:  # damaged bytes lead to any error
+    except Exception as e:  # damaged bytes can cause any error
         reason = " ".join(str(e).split())[:200]
         raise ValueError(f"{path} is not a model: the file is damaged, or another program made it ({reason})") from e
 
 
 def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -> None:
-    """Write the files that programs read; the publication may bring some of them."""
+    """Write the files for other programs, and copy the files of the publication."""
     env_kwargs, settings = plain(publication.env_kwargs), plain(publication.settings)
     args = dict(algo=ALGORITHM, env=publication.env_id, env_kwargs=env_kwargs, seed=publication.seed)
     for name, content in (("config.yml", settings), ("args.yml", args), ("env_kwargs.yml", env_kwargs)):
@@ -245,7 +246,7 @@ def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -
 
 @contextmanager
 def _one_line_errors(repo_id: str, action: str, comfort: str = "") -> Iterator[None]:
-    """Turn errors of the network and of the Hub into a ``ValueError`` that says what to do."""
+    """Convert errors of the network and of the Hub to a ``ValueError`` that says what to do."""
     try:
         yield
     except (OSError, HTTPError) as e:

@@ -1,1 +1,1 @@
-"""What only the reproduction of the paper's tables needs; nothing else imports it but the command line."""
+"""Reproduce the tables of the paper; only the command line imports this package."""

@@ -1,4 +1,4 @@
-"""Reproduce Table II, ball catching: TDPG and PG on the paper's rows, ablations and PPO on a hundred unseen walls."""
+"""Reproduce Table II, ball catching, and compare TDPG with PG, ablations and PPO in front of a hundred unseen walls."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -33,12 +33,12 @@ from sb3_tdpg.presets import IMAGE_ENCODER
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 
-# Fixed before any policy was evaluated on the test rows: the defaults were chosen on seeds below 100 and on the walls
-# random-100 to random-199.
+# These values were fixed before any policy was evaluated on the test rows. The defaults were chosen on seeds below 100
+# and on the walls random-100 to random-199.
 FIRST_SEED = 310
 WALLS = range(500, 600)
-N_EPISODES, N_WALL_EPISODES = 200, 20  # of a row, and in front of a wall
-N_CONTROLS = 5  # training seeds of the ablations and of the variants of PPO
+N_EPISODES, N_WALL_EPISODES = 200, 20  # number of episodes of each row, and in front of each wall
+N_CONTROLS = 5  # number of training seeds of the ablations and of the variants of PPO
 
 COLUMNS = ["model", "train_seed", "scenario", "renderer", "episode", "cost", "distance", "seed", "deterministic"]
 NOISE_ROWS = tuple(row.name for row in BALL_CATCH[1:5])
@@ -60,7 +60,7 @@ KINDS = {
 
 SHOWN = ("Training", NOISE_ROWS[-1], ALL_WALLS, WORST_WALLS, HELD, REDRAWN, GAMMA)
 
-# The largest interquartile mean over seeds, by method and row.
+# Upper limits of the interquartile mean over seeds, for each method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
     "TDPG": {
         "Training": 1.5,
@@ -74,8 +74,7 @@ GOALS: Mapping[str, Mapping[str, float]] = {
 
 BLOCK = "BallCatch-v0"
 LAUNCHES: Mapping[str, Mapping[str, Any]] = dict(fixed={}, varying=BALL_VARYING_LAUNCH)
-# The two layers of 12 channels and the memory without a gate, of a network for each time step, that were the default
-# until commit 7faaa94.
+# The default until commit 7faaa94: two layers of 12 channels, a memory without a gate, and one network per time step.
 EARLIER_ENCODER = dict(
     trv_dim=8,
     gate=False,
@@ -85,8 +84,8 @@ EARLIER_ENCODER = dict(
 
 
 def methods(launch: str) -> tuple[Method, ...]:
-    """List the methods; each differs from the user's one line in what its name says, and takes as many steps."""
-    env_kwargs = dict(LAUNCHES[launch])  # a proxy cannot be sent to another process
+    """List the methods. Each one is the default with the change in its name; all take the same number of steps."""
+    env_kwargs = dict(LAUNCHES[launch])  # a mapping proxy cannot be sent to another process
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:
         return Method(label, BLOCK, renderer=renderer, overrides={**overrides, "env_kwargs": env_kwargs})
@@ -117,7 +116,7 @@ WITHOUT_CONTROLS = ("TDPG", "PG", "RecurrentPPO")
 
 
 def gamma(images: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
-    """Square the brightness of every pixel, which the declared changes do not contain: uint8, any shape."""
+    """Square the brightness of every pixel (uint8, any shape). This is not one of the changes declared for training."""
     return np.rint(images.astype(np.float32) ** 2 / 255).astype(np.uint8)
 
 
@@ -130,21 +129,22 @@ SHIFTS: tuple[Scenario, ...] = (
     Scenario(REDRAWN, BLOCK, sensor=partial(PerturbedVecEnv, perturbation="images")),
     Scenario(GAMMA, BLOCK, sensor=partial(PerturbedVecEnv, perturbation=gamma)),
 )
-"""Rows of our own: walls that no policy was trained or tuned on, the changes of the training, and one that is not."""
+"""Rows that the paper does not have: unseen walls, the image changes of the training, and a change not in training."""
 
 
 def reproduce_ball(
     out: Path, *, launch: str = "fixed", controls: bool = True, n_seeds: int = 10, **options: Any
 ) -> str:
     """
-    Train every method with several seeds, evaluate it on the rows of Table II; write tables, figures and records.
+    Train every method with several seeds, evaluate it on the rows of Table II, and write tables, figures and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz`` (the paper's rows), ``shifts.csv.xz``
         (the rows ``SHIFTS``), figures, ``config.json`` and ``runs/``.
-    :param launch: ``"fixed"`` as in the paper, or ``"varying"``: a scenario of our own.
-    :param controls: Also train the ablations, PPO, and RecurrentPPO with our encoder; a later call may add them.
-    :param n_seeds: Training seeds of each method; the ablations and the further baselines get at most five.
-    :param options: See :class:`~sb3_tdpg.paper.common.Options`; 200 episodes a row by default, 20 in front of a wall.
+    :param launch: ``"fixed"`` as in the paper, or ``"varying"``, which the paper does not have.
+    :param controls: Also train the ablations, PPO, and RecurrentPPO with our encoder. A later call can add them.
+    :param n_seeds: Number of training seeds of each method, but at most five for the ablations and for the baselines
+        of ``controls``.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`. By default each row has 200 episodes and each wall 20.
     :return: the summary, as Markdown
     """
     given = common.Options(**{"n_eval_episodes": N_EPISODES, **options})
@@ -156,7 +156,7 @@ def reproduce_ball(
         if row.n_episodes is not None:
             others[i] = replace(row, n_episodes=min(row.n_episodes, given.n_eval_episodes))
     everything = common.seed_by_seed(chosen[: len(WITHOUT_CONTROLS)], FIRST_SEED, n_seeds)
-    # The last seeds: of the published runs only theirs draw the changes of the images in today's order.
+    # Use the last seeds, because only their published runs draw the changes of the images in today's order.
     n_controls = min(n_seeds, N_CONTROLS)
     everything += common.seed_by_seed(chosen[len(WITHOUT_CONTROLS) :], FIRST_SEED + n_seeds - n_controls, n_controls)
 
@@ -194,7 +194,7 @@ def reproduce_ball(
         replace(row, paper={m: PaperResult(p.distance) for m, p in row.paper.items() if p.distance is not None})
         for row in cost_rows
     ]
-    with threads(1):  # sums are the same on any number of cores
+    with threads(1):  # with one thread, sums do not depend on the number of cores
         knowledge = [
             dict(
                 model=m.label,
@@ -227,9 +227,9 @@ def reproduce_ball(
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:
     """
-    Append the records of :data:`GROUPS` and of the walls; all rows of a group have equally many episodes.
+    Append the records of :data:`GROUPS` and of the walls. All rows of a group have the same number of episodes.
 
-    The worst tenth of the walls is that of each policy.
+    The worst tenth of the walls is determined for each policy separately.
     """
     groups = [records[records["scenario"].isin(rows)].assign(scenario=name) for name, rows in GROUPS.items()]
     walls = records[records["scenario"].isin(WALL_ROWS)]

@@ -1,4 +1,4 @@
-"""Table II by the paper's own algorithm: does the penalty beat policy gradient, and policy gradient trained further?"""
+"""Reproduce Table II with the paper's own algorithm, and compare TDPG with PG that is trained longer."""
 
 import math
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ from sb3_tdpg.paper.common import Method
 from sb3_tdpg.paper.plots import robustness_curves
 
 FIRST_SEED = 400
-# Costs of policy gradient from which TDPG starts: the paper's limit for TDPG, the paper's own policy gradient, and
-# policy gradient that is trained further.
+# Costs at which policy gradient stops: the paper's limit for TDPG, the cost of the paper's policy gradient, and a lower
+# cost after more training. TDPG starts from the policies at PAPERS_LEVEL and above.
 LEVELS = (24.0, 8.7, 5.0)
 PAPERS_LEVEL = 8.7
-PRICES = (16, 28, 40)  # 1 / beta; the paper has every even number between
+PRICES = (16, 28, 40)  # 1 / beta; the paper has every even number from 16 to 40
 KINDS = {"training": ("Training",), "sensor noise": NOISE_ROWS, "test backgrounds": BACKGROUND_ROWS}
 
 
@@ -46,7 +46,7 @@ class StopAtCost(TDPGCallback):
 
     def _on_rollout_end(self) -> None:
         self._costs = [*self._costs, float(self.tdpg.rollout_buffer.episode_costs.mean())][-self.WINDOW :]
-        vars(self.tdpg)["recent_costs"] = self._costs  # saved with a checkpoint
+        vars(self.tdpg)["recent_costs"] = self._costs  # a checkpoint saves this attribute
 
     def _on_step(self) -> bool:
         return len(self._costs) < self.WINDOW or sum(self._costs) / self.WINDOW > self.cost
@@ -54,9 +54,10 @@ class StopAtCost(TDPGCallback):
 
 def methods() -> tuple[Method, ...]:
     """
-    List policy gradient at each of the levels, and TDPG with each price from those that cost as much as the paper's.
+    List policy gradient at each level, and TDPG with each price.
 
-    Each level of policy gradient goes on from the one before.
+    Policy gradient at a level starts from its policy at the level before. TDPG starts from the policies of policy
+    gradient that cost at least as much as the paper's.
     """
     found: list[Method] = []
     start = None
@@ -75,11 +76,11 @@ def methods() -> tuple[Method, ...]:
 
 def select(runs: pd.DataFrame, records: pd.DataFrame) -> pd.DataFrame:
     """
-    Select a policy by the paper's rule: for each seed and level, the price with the lowest information under the limit.
+    Select policies by the paper's rule: for each seed and level, the price with the least information under the limit.
 
-    :param runs: ``model``, ``train_seed`` and ``information`` (NaN where no epoch met the limit) of each run of TDPG.
+    :param runs: ``model``, ``train_seed`` and ``information`` (NaN if no epoch met the limit) of each run of TDPG.
     :param records: Episodes of all runs.
-    :return: the records of policy gradient and of the selected policies, which are called ``TDPG from <level>``
+    :return: the records of policy gradient and of the selected policies, with the label ``TDPG from <level>``
     """
     kept = [records[records["model"].str.startswith("PG")].assign(price=None)]
     level = runs["model"].str.split(" from ").str[1]
@@ -93,11 +94,11 @@ def select(runs: pd.DataFrame, records: pd.DataFrame) -> pd.DataFrame:
 
 def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
     """
-    Train by the paper's algorithm from policy gradient at several costs; write tables, a figure and records.
+    Train TDPG by the paper's algorithm from policies of policy gradient; write tables, a figure and records.
 
     :param out: Folder for ``summary.md``, ``runs.csv``, ``seeds.csv``, ``robustness.png``, ``config.json``, ``runs/``.
-    :param n_seeds: Training seeds of each method.
-    :param options: See :class:`~sb3_tdpg.paper.common.Options`; 200 episodes a row by default.
+    :param n_seeds: Number of training seeds of each method.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`. By default each row has 200 episodes.
     :return: the summary, as Markdown
     """
     given = common.Options(**{"n_eval_episodes": 200, **options})
@@ -138,14 +139,14 @@ def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
 
 
 def _progress(folder: Path) -> Mapping[str, float]:
-    """Return the number of epochs of a run, and the information of its selected epoch: NaN if there is none."""
+    """Return the number of epochs of a run, and the information of its selected epoch (NaN if there is none)."""
     path = folder / "selected.json"
     information = pd.read_json(path, typ="series")["information"] if path.exists() else math.nan
     return dict(epochs=len(read_progress(folder)), information=information)
 
 
 def _runs_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Average over seeds; and count the runs in which an epoch met the limit."""
+    """Average the runs over seeds, and count the runs in which an epoch met the limit."""
     groups = runs.groupby("model", sort=False)
     table = groups[["epochs", "cost", "information"]].mean().round(1).assign(selected=groups["information"].count())
     return table.astype(str).reset_index().rename(columns=dict(model="method"))

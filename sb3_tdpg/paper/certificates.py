@@ -1,4 +1,4 @@
-"""Certify saved policies of the lava problem: upper bounds on their cost under the paper's shifts and random ones."""
+"""Certify saved policies of the lava problem: bound their cost under the paper's shifts and under random shifts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAPER_INVERSE_BETAS = (25, 50, 75, 100)
-# Recorded episodes for the divergence: in the paper's rows, and in each of many random shifts.
+# Number of recorded episodes for the divergence in the paper's rows and in each random shift.
 N_BUDGET_EPISODES = 100_000
 N_RANDOM_BUDGET_EPISODES = 20_000
 
@@ -45,18 +45,17 @@ def certify_lava(
     Certify policies, and compare the certified bounds with the cost in the shifted environments.
 
     :param models: Files that ``model.save()`` wrote.
-    :param out: Folder for ``summary.md``, ``paper.csv``, ``theorem.csv``, ``config.json``, and with random shifts for
-        ``random.csv`` and ``certificate.png``.
+    :param out: Folder for ``summary.md``, ``paper.csv``, ``theorem.csv`` and ``config.json``. With random shifts it
+        also gets ``random.csv`` and ``certificate.png``.
     :param env_kwargs: Keywords of the training environment.
     :param n_random_shifts: Number of random shifts; see :func:`~sb3_tdpg.certificates.shifts.random_lava_shifts`.
     :param n_episodes: Number of recorded training episodes.
-    :param n_test_episodes: Episodes in each random shift; ten times as many in each of the paper's.
-    :param confidence: Confidence of each certificate.
-    :param cost_bound: Upper bound on the cost of an episode; default: ``wall_cost``, at which the certified cost is
-        clipped.
+    :param n_test_episodes: Number of episodes in each random shift. Each of the paper's shifts has ten times as many.
+    :param confidence: Confidence level of each certificate.
+    :param cost_bound: Upper bound at which the certified cost of an episode is clipped; default: ``wall_cost``.
     :param seed: Seed of the episodes and of the shifts.
     :return: the summary, as Markdown
-    :raises ValueError: if an argument is wrong; no episode has been run by then.
+    :raises ValueError: if an argument is wrong; no episode has been run in this case.
     """
     training = Scenario("Training", "Lava-v0", dict(env_kwargs or {}))
     # The divergences are relative to a sensor without bias and a uniform start.
@@ -70,7 +69,7 @@ def certify_lava(
     if cost_bound is not None and not (math.isfinite(cost_bound) and cost_bound > 0):
         raise ValueError(f"cost_bound={cost_bound} must be finite and above 0: it bounds the cost of an episode")
     loaded = load_models(models, training)
-    out.mkdir(parents=True, exist_ok=True)  # now, so that an error does not come at the very end
+    out.mkdir(parents=True, exist_ok=True)  # created first, so that an error does not come at the end
     std = float(training.env_kwargs.get("sensor_noise_std", LAVA[0].env_kwargs["sensor_noise_std"]))
     bound = wall_cost(next(iter(loaded.values())).horizon) if cost_bound is None else cost_bound
     settings: dict[str, Any] = dict(n_episodes=n_episodes, confidence=confidence, cost_bound=bound, seed=seed)
@@ -110,7 +109,7 @@ def _row(episodes: TrainingEpisodes, shift: Shift, n_test: int, **how: Any) -> d
 
 
 def _paper_row(episodes: TrainingEpisodes, shift: Shift, n_test: int) -> dict[str, Any]:
-    """Add two certificates: one without an allowance for sampling, and one of the unclipped cost."""
+    """Return a row with two more certificates: without an allowance for sampling, and for the unclipped cost."""
     row = _row(episodes, shift, n_test, seed=episodes.seed + 1)
     estimate = episodes.allowing(None).certify(shift).bound
     unclipped = episodes.allowing(episodes.confidence, episodes.true_cost_bound).certify(shift).bound
@@ -171,7 +170,7 @@ def _spread(values: pd.Series) -> str:
 
 
 def _theorem_table(theorem: pd.DataFrame, random: pd.DataFrame) -> str:
-    """Count the shifts that meet the condition of the theorem, and those among them that cost more than the bound."""
+    """Count the shifts that meet the theorem's condition, and how many of these shifts cost more than the bound."""
     rows = []
     for at in theorem.to_dict("records"):
         shifts = random[random["model"] == at["model"]]
@@ -189,7 +188,7 @@ def _theorem_table(theorem: pd.DataFrame, random: pd.DataFrame) -> str:
 
 
 def certificate_figure(random: pd.DataFrame, paper: pd.DataFrame, trivial: float) -> Figure:
-    """Draw the bound over the cost, and both over the size of the shift, from ``random.csv`` and ``paper.csv``."""
+    """Draw bound against cost, and both against the size of the shift; the frames are those of the CSV files."""
     figure, ((against_cost, against_size),) = new_panels(WIDTH, 4.0, 1, 2, sharey=True)
     for color, label in zip(cycle(PALETTE), random["model"].unique(), strict=False):
         group = random[random["model"] == label]

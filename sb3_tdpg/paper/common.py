@@ -1,4 +1,4 @@
-"""Shared by all reproductions: the runs of several methods, tables, and the files of a result."""
+"""Functions for all reproductions: make the runs of several methods, and write tables and the files of a result."""
 
 import json
 import math
@@ -18,18 +18,18 @@ from sb3_tdpg.evaluation import aggregate_seeds, paired_difference, probability_
 from sb3_tdpg.experiments.runs import Run, SB3Run, Task
 
 NO_PENALTY = "TDPG without the penalty"
-"""Label of the ablation, which differs from TDPG in the missing penalty only."""
+"""Label of the ablation, which differs from TDPG only in the missing penalty."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """
-    The options of every reproduction. Finished runs are kept: the same call continues an interrupted one.
+    The options of every reproduction. Finished runs are kept: the same call continues an interrupted reproduction.
 
-    :param n_eval_episodes: Episodes of each row.
+    :param n_eval_episodes: Number of episodes of each row.
     :param n_timesteps: Environment steps of each training; default: as in the blocks.
-    :param jobs: Parallel runs; default: the number of cores.
-    :param publish: Folder that gets a copy of everything but ``runs/``.
+    :param jobs: Number of parallel runs; default: the number of cores.
+    :param publish: Folder for a copy of all files except ``runs/``.
     """
 
     n_eval_episodes: int = 1000
@@ -50,12 +50,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Method:
-    """One column of a table, with the title ``label``: how it is trained (see ``Run``) and evaluated."""
+    """How a method with the title ``label`` is trained (see ``Run``) and evaluated."""
 
     label: str
     block: str
-    start: str | None = None  # label of the method whose policy it starts from, with the same seed
-    renderer: str = "fast"  # of the images in the evaluation, if the environment has several
+    start: str | None = None  # label of the method that trained the initial policy with the same seed
+    renderer: str = "fast"  # renderer of the evaluation, if the environment has several
     overrides: Mapping[str, Any] = field(default_factory=dict)
     max_attempts: int = 1
     algo: str = "tdpg"  # or "ppo", "ppo_lstm"; the block is in hyperparams/<algo>.yml
@@ -68,7 +68,7 @@ class Method:
 
 
 def seed_by_seed(methods: Sequence[Method], first_seed: int, n_seeds: int) -> list[tuple[Method, int]]:
-    """List methods with their seeds, so that an interrupted call has the same seeds of all methods."""
+    """List methods seed by seed, so that after an interrupt all methods have the same seeds."""
     return [(method, first_seed + i) for i in range(n_seeds) for method in methods if i < method.max_seeds]
 
 
@@ -80,9 +80,9 @@ def make_tasks(
     overrides: Mapping[str, Any],
 ) -> list[Task]:
     """
-    Make the runs of several methods with their seeds, and list the rows that each is evaluated on.
+    Make the runs of several methods with their seeds, and list the rows for the evaluation of each run.
 
-    A method that starts from the policy of another one with the same seed comes after it.
+    A method that starts from the policy of another method must come after that method.
     """
     tasks: list[Task] = []
     for method, seed in methods:
@@ -93,7 +93,7 @@ def make_tasks(
 
 
 def folders_of(tasks: Iterable[Task]) -> dict[tuple[str, int], Path]:
-    """Return the folders by method and seed."""
+    """Return the folder of each method and seed."""
     return {(run.method, run.seed): folder for run, folder, _ in tasks}
 
 
@@ -103,13 +103,13 @@ def read_records(tasks: Iterable[Task]) -> pd.DataFrame:
 
 
 def means_by_seed(records: pd.DataFrame, *columns: str) -> pd.DataFrame:
-    """Return the means over the episodes of each method, seed and row; default: of the cost."""
+    """Return the means of columns (default: the cost) over the episodes of each method, seed and row."""
     groups = records.groupby(["model", "train_seed", "scenario"], sort=False)
     return groups[list(columns or ["cost"])].mean().reset_index()
 
 
 def training_times(tasks: Iterable[Task]) -> pd.DataFrame:
-    """Return the total ``wall_s`` and ``cpu_s`` of the training of each run, including failed attempts."""
+    """Return the training time ``wall_s`` and ``cpu_s`` of each run, including failed attempts."""
     rows = []
     for run, folder, _ in tasks:
         times = [json.loads(path.read_text()) for path in (folder / "time.json", *folder.glob("attempt*/time.json"))]
@@ -119,7 +119,7 @@ def training_times(tasks: Iterable[Task]) -> pd.DataFrame:
 
 def methods_table(records: pd.DataFrame, rows: Sequence[str], times: pd.DataFrame) -> str:
     """
-    Write a table with a row for each method: its cost in each scenario, and the median time of its trainings.
+    Make a table with a row for each method: its cost in each scenario, and its median training time.
 
     :param times: From :func:`training_times`.
     """
@@ -142,12 +142,12 @@ def methods_table(records: pd.DataFrame, rows: Sequence[str], times: pd.DataFram
 
 
 def met(condition: bool) -> str:
-    """Say whether a goal was met, so that a miss is easy to see."""
+    """Return "met" or "MISSED"; the capitals make a missed goal easy to see."""
     return "met" if condition else "MISSED"
 
 
 def goals_table(aggregated: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
-    """Compare the interquartile means of ``aggregate_seeds`` with the largest allowed values, by method and row."""
+    """Compare the interquartile means of ``aggregate_seeds`` with the upper limits for each method and row."""
     cells = aggregated.set_index(["model", "scenario"])["iqm"]
     rows = [
         [method, row, f"<= {goal:g}", f"{cells[method, row]:.3g}", met(cells[method, row] <= goal)]
@@ -164,10 +164,10 @@ def comparisons_table(
     quantity: str = "mean cost",
 ) -> str:
     """
-    Write how likely a seed of one method beats a seed of another one, and the paired difference of their means.
+    Make a table of the probability that one method is better than another, and of the difference of their means.
 
-    Each mean is over the rows of one of ``kinds``, and over the seeds that both methods have. Comparisons with a method
-    that the records lack are left out.
+    The probability is for one seed of each method. Each mean is over the rows of one of ``kinds``, and over the seeds
+    that both methods have. Comparisons with a method that has no records are left out.
     """
     columns = ["method", "compared with", "rows", "seeds", "probability of being better [95 %]"]
     columns += [f"{quantity} of the method", f"{quantity} of the other", "difference [95 %]"]
@@ -185,7 +185,7 @@ def comparisons_table(
 
 
 def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> str:
-    """Write ``knowledge.csv`` with a row for each policy, and return the table of the means over seeds."""
+    """Write ``knowledge.csv`` with a row for each policy, and return a table of the means over seeds."""
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby(list(by), sort=False).mean().reset_index()
     return markdown_table(means.rename(columns=dict(model="method")), digits=2)
@@ -194,7 +194,7 @@ def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> st
 def write_results(
     out: Path, template: str, tasks: Sequence[Task], command: str, publish: Path | None, **values: Any
 ) -> str:
-    """Write ``summary.md`` and ``config.json``, copy all but the runs to ``publish`` if given, return the summary."""
+    """Write ``summary.md`` and ``config.json``, copy all but the runs to ``publish``, and return the summary."""
     how = provenance()
     write_run_config(out / "config.json", dict(runs=[run.config for run, *_ in tasks], provenance=how))
     # There are several commits if the reproduction was resumed after a change.

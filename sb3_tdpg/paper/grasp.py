@@ -16,22 +16,23 @@ from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.paper.plots import failures_by_camera, failures_by_yaw
 from sb3_tdpg.tdpg import TDPG
 
-# Seeds below 100 were used to make the blocks, and 100 to 104 for the earlier encoder; the camera's page has those.
+# Seeds below 100 were used to choose the blocks, and 100 to 104 for runs with the earlier encoder. The results with a
+# varying camera have the seeds 100 to 104.
 FIRST_SEEDS = dict(fixed=110, varying=100)
 
 TRAINING, ROTATION, TRANSLATION = (row.name for row in PANDA_GRASP)
 
-# The largest interquartile mean over seeds of the share of failed grasps, by method and row.
+# Upper limits of the interquartile mean over seeds of the failure rate, for each method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
     "PG": {TRAINING: 0.02, ROTATION: 0.04, TRANSLATION: 0.08},
     "TDPG": {TRAINING: 0.02, ROTATION: 0.04, TRANSLATION: 0.08},
 }
 
 COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG", "PG"), ("PG", "PG without the nuisance"))
-# At the rate of a training from scratch the first epoch of a second stage undoes the first stage, with the penalty and
-# without: where almost nothing fails, the gradient is mostly noise.
+# The second stage has a lower learning rate than a training from scratch. At that rate its first epoch would destroy
+# the result of the first stage, with and without the penalty: if few grasps fail, the gradient is mostly noise.
 SECOND_STAGE = dict(n_timesteps=8_000, learning_rate=2e-4)
-# About the cost of PG on tuning seeds: a higher limit would let TDPG get worse than the policy that it starts from.
+# About the cost of PG on tuning seeds. With a higher limit TDPG could become worse than its initial policy.
 LIMITS = dict(fixed=0.005, varying=0.01)
 
 
@@ -48,19 +49,19 @@ METHODS = dict(
     fixed=(*_methods("PandaGrasp-v0", LIMITS["fixed"]), NO_NUISANCE),
     varying=_methods("PandaGrasp-v0-camera", LIMITS["varying"]),
 )
-"""The methods, by whether the height of the camera is fixed or varies."""
+"""The methods for a fixed and for a varying height of the camera."""
 
 
 def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **options: Any) -> str:
     """
-    Train every method with several seeds, evaluate it on every row; write tables, figures and records.
+    Train every method with several seeds, evaluate it on every row, and write tables, figures and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
-    :param camera: ``"fixed"``, Table III; or ``"varying"`` in height, a scenario of our own.
-    :param n_seeds: Training seeds of each method.
+    :param camera: Height of the camera: ``"fixed"`` as in Table III, or ``"varying"``, which the paper does not have.
+    :param n_seeds: Number of training seeds of each method.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
-    :raises ValueError: if ``camera`` is unknown; nothing has been run by then.
+    :raises ValueError: if ``camera`` is unknown; no run has started in this case.
     """
     if camera not in METHODS:
         raise ValueError(f"camera={camera!r} must be one of {list(METHODS)}")
@@ -96,7 +97,7 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
     kinds = {row.name.lower(): (row.name,) for row in rows}
     logs = {seed: read_progress(folders["TDPG", seed]) for seed in seeds}
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
-    with threads(1):  # sums are the same on any number of cores
+    with threads(1):  # with one thread, sums do not depend on the number of cores
         known = knowledge.knowledge_table(models, rows[:2])
         first = {label: models[label, first_seed] for label in ("PG", "TDPG")}
         estimates = markdown_table(knowledge.estimates_table(first), digits=2) if is_fixed else ""

@@ -1,5 +1,5 @@
 """
-What the TRVs of the image problems know, by regression and by bounds on the information, and what the penalty did.
+Measure what the TRVs of the image problems encode, by regression and by bounds on the information.
 
 Dimension key: T horizon, N episodes, Z TRVs.
 """
@@ -30,17 +30,17 @@ from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
-# Walls that no policy was trained or tested on.
+# No policy was trained or tested on walls from this number on.
 FIRST_WALL = 1000
 DARKEST = 0.4
-MUGS_AT_A_TIME = 1000  # bounds the memory
+MUGS_AT_A_TIME = 1000  # limits the memory
 N_MUGS = 10_000  # for the regression
-N_BOUND = 2_000  # for the bounds, which compare every mug with every other
-FITTED_MUGS = 400  # for MINE, as in an epoch
+N_BOUND = 2_000  # for the bounds, which compare all pairs of mugs
+FITTED_MUGS = 400  # for MINE, as many as in an epoch
 LAST_EPOCHS = 5
 CRITICS: Mapping[str, Mapping[str, Any]] = {
-    # The numbers of steps are the paper's; rate, sizes and minibatches are those that it prints for the lava problem,
-    # since it prints none for this one. Without guards, and with one optimiser from beginning to end.
+    # The numbers of steps are the paper's. Learning rate, layer sizes and minibatches are the paper's values for the
+    # lava problem, because it prints none for grasping. There are no refits, and the optimiser is never reset.
     "MINE at 5e-5, the paper's numbers of steps": dict(
         learning_rate=5e-5, warmup_gradient_steps=500_000, gradient_steps=100_000,
         refit_below=-math.inf, refit_above=math.inf, reset_moments=False,
@@ -56,13 +56,14 @@ def trv_knowledge(
     """
     Regress the robot's position, the brightness and the wall's colour on the TRVs of a ball-catching policy.
 
-    Episodes run in front of random walls, with all images of an episode darkened by the same random factor. At each
-    time step a linear regression is fitted on half of the walls, and R^2 is computed on the other half: on the same
-    walls it could memorise the colours.
+    Episodes run in front of random walls. All images of an episode are darkened by the same random factor. At each time
+    step a linear regression is fitted on half of the walls, and R^2 is computed on the other half, because on the same
+    walls the regression could memorise the colours.
 
-    :param n_walls: Number of random walls, even, with ``n_episodes`` in front of each.
-    :return: R^2, averaged over time and not below 0, of ``"position"`` (d_t), ``"brightness"`` (the factor) and
-        ``"wall"`` (its mean colour, averaged over red, green and blue)
+    :param n_walls: Number of random walls, which must be even.
+    :param n_episodes: Number of episodes in front of each wall.
+    :return: R^2, averaged over time and clipped at 0, of ``"position"`` (d_t), ``"brightness"`` (the factor) and
+        ``"wall"`` (the wall's mean colour; this R^2 is averaged over red, green and blue)
     """
     seeds = evaluation_seeds(0)
     rng = np.random.default_rng(seeds.env)
@@ -88,9 +89,10 @@ def trv_knowledge(
 
 def pooled_information(model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_episodes: int = 160) -> float:
     """
-    Bound the information of a ball-catching policy on the images of its training, in nats, as its penalty does.
+    Bound the information of a ball-catching policy on its training images, in nats, as the penalty does.
 
-    It is the log-det bound of the steps of all times together, times the horizon; each image has declared changes.
+    The result is the log-det bound for the steps of all times together, times the horizon. Each image has the changes
+    that are declared for training.
     """
     sensor = partial(PerturbedVecEnv, perturbation="images")
     scenario = Scenario("training", "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast"}, sensor=sensor)
@@ -107,12 +109,12 @@ def _darkened(images: np.ndarray, factor: np.ndarray) -> np.ndarray:
 class Mugs(NamedTuple):
     """N mugs of the grasping problem, with their camera images."""
 
-    states: np.ndarray  # (N, 4): x, y, z, yaw; (N, 5) with the camera's height where it varies
+    states: np.ndarray  # (N, 4): x, y, z, yaw; (N, 5) with the camera's height if it varies
     images: np.ndarray  # (N, 1, 128, 128)
 
 
 def draw_mugs(env_kwargs: Mapping[str, Any] | None = None, *, n_mugs: int, seed: int = 0) -> Mugs:
-    """Draw mugs and their images from ``PandaGrasp-v0`` with these keywords, without grasping."""
+    """Sample mugs and their images from ``PandaGrasp-v0`` with these keywords, without simulating a grasp."""
     env = make_episodes_env("PandaGrasp-v0", n_episodes=n_mugs, env_kwargs=env_kwargs, use_processes=False)
     env.seed(evaluation_seeds(seed).env)
     images = cast(np.ndarray, env.reset())
@@ -122,7 +124,7 @@ def draw_mugs(env_kwargs: Mapping[str, Any] | None = None, *, n_mugs: int, seed:
 
 
 def encode_mugs(model: Any, mugs: Mugs) -> InformationBatch:
-    """Encode N mugs with a policy: states ``(1, N, 4 or 5)``; TRVs, means and standard deviations ``(1, N, Z)``."""
+    """Encode N mugs with a policy; states are ``(1, N, 4 or 5)``, TRVs, means and standard deviations ``(1, N, Z)``."""
     steps = []
     with isolated_randomness(evaluation_seeds(0).policy, model):
         for images in np.array_split(mugs.images, -(-len(mugs.images) // MUGS_AT_A_TIME)):
@@ -136,12 +138,12 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     """
     Regress the mug's pose on the TRVs of a grasping policy.
 
-    Each quantity is regressed on the TRVs and their squares and products for half of the mugs; R^2 is computed on the
-    other half. It is too low by about the number of regressors (152 for 16 TRVs) over half the number of mugs.
+    Each quantity is regressed on the TRVs and their squares and products for half of the mugs. R^2 is computed on the
+    other half. R^2 is too low by about the number of regressors (152 for 16 TRVs) divided by half the number of mugs.
 
     :param batch: From :func:`encode_mugs`, with an even number of mugs.
-    :return: R^2, not below 0, of ``"x"``, ``"y"`` and ``"yaw"`` (of its sine and cosine together), and of the
-        ``"camera"``'s height where it varies
+    :return: R^2, clipped at 0, of ``"x"``, ``"y"`` and ``"yaw"`` (its sine and cosine together), and of the height of
+        the ``"camera"`` if it varies
     """
     x, y, _, yaw, *camera = batch.states[0].numpy().astype(np.float64).T
     trvs = batch.trvs[0].numpy().astype(np.float64)
@@ -157,7 +159,7 @@ def _r2(trvs: np.ndarray, targets: np.ndarray, *, pooled: bool = False) -> float
     """
     Fit a linear regression to the first half of the episodes, and average its R^2 on the second half over time.
 
-    ``pooled`` weights the components by their variance, not equally.
+    ``pooled`` weights the components by their variance instead of equally.
     """
     half = trvs.shape[1] // 2
     x = np.concatenate([trvs, np.ones_like(trvs[..., :1])], axis=-1)
@@ -172,7 +174,7 @@ def _r2(trvs: np.ndarray, targets: np.ndarray, *, pooled: bool = False) -> float
 
 
 def knowledge_table(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[Scenario]) -> pd.DataFrame:
-    """Measure what the TRVs of each model (by label and seed) know of mugs, and bound their information."""
+    """Measure what the TRVs of each model (by label and seed) encode about mugs, and bound their information."""
     rows = []
     for row in scenarios:
         mugs = draw_mugs(row.env_kwargs, n_mugs=N_MUGS)
@@ -185,14 +187,14 @@ def knowledge_table(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[
 
 
 def bounds(batch: InformationBatch) -> dict[str, float]:
-    """Bound the information from below and from above, by the smaller one of two upper bounds."""
+    """Return a lower bound on the information, and the smaller one of two upper bounds."""
     sizes = (batch.states.shape[2], batch.trvs.shape[2])
     upper = min(cls(1, *sizes)(batch).item() for cls in (LeaveOneOut, LogDet))
     return {"lower bound": own_sample_bound(batch).item(), "upper bound": upper}
 
 
 def estimates_table(models: Mapping[str, TDPG]) -> pd.DataFrame:
-    """Compare MINE's estimates of the information in several policies, fitted one after the other, with the bounds."""
+    """Compare MINE's estimates of the information with the bounds; critics are fitted to one policy after another."""
     mugs = {f"{FITTED_MUGS} mugs of the fit": draw_mugs(n_mugs=FITTED_MUGS, seed=1)}
     mugs["fresh mugs"] = draw_mugs(n_mugs=min(N_MUGS, N_BOUND), seed=2)
     columns = {}
@@ -213,10 +215,10 @@ def estimates_table(models: Mapping[str, TDPG]) -> pd.DataFrame:
 
 
 def penalty_table(progress: Mapping[int, pd.DataFrame]) -> list[dict[str, Any]]:
-    """Summarise what the penalty did in training, with a row for each seed; ``progress`` has the logs by seed."""
+    """Summarise the penalty and the information in training, with a row for each seed in ``progress``."""
     rows = []
     for seed, log in progress.items():
-        # The weight of an epoch stands in the row after it, so that the first row has no weight.
+        # The weight of an epoch is in the next row, so the first row has no weight.
         weights = log["train/mi_coef"].fillna(0.0).to_numpy() if "train/mi_coef" in log else np.zeros(1)
         with_penalty = np.flatnonzero(weights > 0)
         information = log["mi/total"].dropna()

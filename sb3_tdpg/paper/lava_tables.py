@@ -29,10 +29,10 @@ from sb3_tdpg.tdpg import TDPG
 READINGS = ("table", "text")
 """Cost definitions of the lava problem: the one that fits Table I, and the one in the text of the paper."""
 
-# Method -> block of hyperparams/tdpg.yml; "-table" is appended for the cost definition that fits the table.
+# The block of hyperparams/tdpg.yml for each method. The cost definition that fits the table has the suffix "-table".
 METHODS = {"PG": "Lava-v0-pg", "TDPG": "Lava-v0", "TDPG (log-det)": "Lava-v0-logdet"}
 
-# Goals by cost definition: the largest mean, standard deviation and ratio (sigma^2 = 1 over training).
+# Upper limits of mean, standard deviation and ratio (cost at sigma^2 = 1 divided by cost in training).
 _TABLE_GOALS, _TEXT_GOALS = dict(mean=28.0, std=10.0, ratio=1.05), dict(mean=20.0, std=10.0, ratio=1.10)
 GOALS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "table": {"PG": dict(mean=14.0), "TDPG": _TABLE_GOALS, "TDPG (log-det)": _TABLE_GOALS},
@@ -42,7 +42,7 @@ GOALS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
 # Seeds below 300 were used to tune the blocks.
 FIRST_SEED = 300
 
-# Trainings of a policy with a penalty: another one only if the last one did not meet the limits of the block.
+# Maximum number of trainings of a policy with a penalty. A training is repeated only if it missed the block's limits.
 MAX_ATTEMPTS = 3
 
 TITLES = {
@@ -56,7 +56,7 @@ COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ra
 
 
 def methods(reading: str) -> list[Method]:
-    """List the methods for one cost definition: PG, and TDPG with each estimator. For ``"paper"``, use its settings."""
+    """List PG and TDPG with each estimator for a cost definition; ``"paper"`` gives the paper's own settings."""
     if reading == "paper":
         tdpg = [
             Method(f"paper's TDPG, 1/beta = {inverse}", "Lava-v0-paper", overrides=dict(beta=1 / inverse))
@@ -73,7 +73,7 @@ def methods(reading: str) -> list[Method]:
 def _write_figures(
     out: Path, suffix: str, records: pd.DataFrame, folders: Mapping[str, Path], models: Mapping[str, TDPG], reading: str
 ) -> None:
-    """Draw the figures of one seed; ``folders`` and ``models`` are by method."""
+    """Draw the figures of one seed; the keys of ``folders`` and ``models`` are the methods."""
     env_kwargs = dict(LAVA_TABLE_READING) if reading == "table" else {}
     save_figure(cost_histograms(records, LAVA), out / f"histograms{suffix}.png")
     save_figure(lava_trajectories(models, env_kwargs), out / f"trajectories{suffix}.png")
@@ -84,7 +84,7 @@ def demo(
     out: Path, *, reading: str = "table", seed: int = 0, n_eval_episodes: int = 1000, n_timesteps: int | None = None
 ) -> str:
     """
-    Train PG and TDPG on the lava problem, compare them on the rows of Table I, draw the figures; see also ``Options``.
+    Train PG and TDPG on the lava problem, compare them on the rows of Table I, and draw figures. See also ``Options``.
 
     :param out: Folder for ``episodes.csv``, ``table.md``, ``histograms.png``, ``trajectories.png``, ``training.png``,
         ``config.json`` and the runs with their models.
@@ -114,12 +114,13 @@ def demo(
 
 def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **options: Any) -> str:
     """
-    Train every method with both cost definitions and many seeds, and the paper's own settings; write tables, figures
-    and records.
+    Train all methods with many seeds on the lava problem, and write tables, figures and records.
+
+    Every method is trained with both cost definitions. The paper's own settings are trained, too.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes_*.csv.gz``, figures, ``config.json`` and ``runs/``.
-    :param n_seeds: Training seeds of each method.
-    :param n_paper_seeds: Training seeds of the paper's own settings.
+    :param n_seeds: Number of training seeds of each method.
+    :param n_paper_seeds: Number of training seeds for the paper's own settings.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
@@ -132,7 +133,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
         for group, of_group in runs.items()
     }
     everything = [task for of_group in tasks.values() for task in of_group]
-    # The longest runs first, so that the cores finish together.
+    # The longest runs come first, so that the cores finish at about the same time.
     longest_first = sorted(everything, key=lambda task: (task[0].method != "TDPG", task[0].method == "PG"))
     complete_runs(longest_first, **given.of_runs)
 
@@ -157,7 +158,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
-    """Return mean and standard deviation in training for each method and seed, and the ratio of the noisiest row."""
+    """Return each method's and seed's mean and standard deviation in training, and the ratio of the noisiest row."""
     summary = add_ratio(summary_table(records))
     keys = ["model", "train_seed"]
     training = summary[summary["scenario"] == LAVA[0].name].set_index(keys)[["mean", "std"]]

@@ -1,4 +1,9 @@
-"""Where the bottleneck pays: funnels, a cue, lava, an arm; against every range of training noise and told rivals."""
+"""
+Compare TDPG under sensor faults with baselines on the funnels, a task with a cue, lava, and an arm.
+
+The baselines include methods that are trained with sensor noise of several ranges, or with the faults themselves (label
+"told the faults").
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,9 +28,9 @@ from sb3_tdpg.paper.common import NO_PENALTY, Method
 from sb3_tdpg.presets import DEFAULTS
 from sb3_tdpg.robustness import PERTURBATIONS, PerturbedVecEnv
 
-# Seeds below 100 chose the defaults; faults and methods were fixed before the first of these was run.
+# The defaults were chosen on seeds below 100. Faults and methods were fixed before the first run with these seeds.
 FIRST_SEED = 500
-FIRST_CUE_SEED = 520  # an earlier study saw the task with a cue on the seeds from 500 on
+FIRST_CUE_SEED = 520  # an earlier study of the task with a cue used the seeds from 500 on
 TRAINING, MEAN, WORST = "Training", "mean of the faults", "worst fault"
 KINDS = {TRAINING: (TRAINING,), MEAN: (MEAN,), WORST: (WORST,)}
 BLIND = "blind"
@@ -38,7 +43,7 @@ NOISE_RANGES: Mapping[str, Any] = {
 }  # standard deviations
 _PERTURBED = "sb3_tdpg.robustness.PerturbedVecEnv"
 
-# Perturbation, severity, and the scale that makes its parameter the number in the name.
+# Perturbation, severity, and a scale with which the perturbation's parameter is the number in the fault's name.
 Fault = tuple[str, int, float]
 FAULTS: Mapping[str, Fault] = {
     "noise 1": ("vector_noise", 5, 1.25),
@@ -57,16 +62,16 @@ FAULTS: Mapping[str, Fault] = {
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """
-    A task with faults that nobody declares.
+    A task with faults that are not declared in TDPG's training.
 
-    :param block: Name of its block, the same in each algorithm's file of ``hyperparams/``.
-    :param scale: One unit of each component of the observation; 0: the component is never at fault.
+    :param block: Name of the task's block, which is the same in each algorithm's file in ``hyperparams/``.
+    :param scale: One unit of each component of the observation. With 0 the component never has a fault.
     :param faults: Faults of the sensor and of the actuator.
     :param plant: Keywords of the environment that change the plant, by name.
-    :param goals: The largest interquartile mean of TDPG over seeds, by row.
-    :param tested_in: Another environment, with its default keywords, into which the policies are carried.
-    :param n_episodes: Number of episodes of each row, if it is not that of all problems.
-    :param labels: The methods, by their labels; default: all.
+    :param goals: Upper limits of TDPG's interquartile mean over seeds, by row.
+    :param tested_in: Another environment, with its default keywords, in which the policies are tested.
+    :param n_episodes: Number of episodes of each row, if it differs from the other problems.
+    :param labels: Labels of the methods; default: all methods.
     :param first_seed: First seed of the trainings.
     """
 
@@ -84,7 +89,7 @@ class Problem:
     first_seed: int = FIRST_SEED
 
     def rows(self, method: Method) -> list[Scenario]:
-        """Return training and the faults; a blind policy stays blind."""
+        """Return the rows for training and for the faults. An open-loop policy observes only the time in all rows."""
         is_blind = method.label == BLIND
         plain, faulty = (BlindVecEnv, _BlindFaulty) if is_blind else (None, PerturbedVecEnv)
         env_id, env_kwargs = (self.tested_in, {}) if self.tested_in else (self.env_id, self.env_kwargs)
@@ -98,7 +103,7 @@ class Problem:
         return rows
 
     def methods(self) -> list[Method]:
-        """List TDPG by the block, its variants, and the rivals."""
+        """List TDPG with the settings of the block, its variants, and the baselines."""
 
         def ours(label: str, wrapper: Mapping[str, Any] | str | None = None, **overrides: Any) -> Method:
             wrappers = {} if wrapper is None else dict(vec_env_wrapper=[wrapper])
@@ -134,7 +139,7 @@ class Problem:
 
 
 class _BlindFaulty(BlindVecEnv):
-    """A blind policy's environment with a fault, which can be one of the actuator."""
+    """The environment of an open-loop policy with a fault, which can be a fault of the actuator."""
 
     def __init__(self, venv: VecEnv, **perturbation: Any) -> None:
         super().__init__(PerturbedVecEnv(venv, **perturbation))
@@ -172,7 +177,7 @@ PROBLEMS: Mapping[str, Problem] = {
         block="SqueezeInsert-v0-cue",
         scale=(1.0, 1.0, 0.0),
         env_kwargs=dict(cue=True),
-        faults=_NO_BLACKOUT,  # the cue itself never fails
+        faults=_NO_BLACKOUT,  # the cue never has a fault
         plant=_TURNS,
         goals={MEAN: 12.0},
         labels=(
@@ -182,7 +187,7 @@ PROBLEMS: Mapping[str, Problem] = {
         ),
         first_seed=FIRST_CUE_SEED,
     ),
-    # Trained in the batched model that fits PyBullet's squeezes, and carried over unchanged.
+    # Trained in the batched model that fits PyBullet's squeezes, and tested in PyBullet without further training.
     "panda": Problem(
         title="Squeezing with the Panda",
         env_id="SqueezeInsert-v0",
@@ -204,10 +209,10 @@ def reproduce_pays(
     out: Path, *, n_seeds: int = 10, controls: bool = True, problems: Sequence[str] = FUNNELS, **options: Any
 ) -> str:
     """
-    Train all methods on all problems, evaluate them under the faults; write tables, a figure and records.
+    Train all methods on all problems, evaluate them under the faults, and write tables, a figure and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``pays.png``, ``config.json``, ``runs/``.
-    :param n_seeds: Training seeds of each method.
+    :param n_seeds: Number of training seeds of each method.
     :param controls: Whether to train PPO and RecurrentPPO, which take most of the time.
     :param problems: Names in :data:`PROBLEMS`.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
@@ -221,7 +226,7 @@ def reproduce_pays(
         everything = common.seed_by_seed(chosen, problem.first_seed, n_seeds)
         tasks[name] = common.make_tasks(problem.env_id, out / "runs" / name, everything, problem.rows, given.overrides)
     of_all = [task for of_problem in tasks.values() for task in of_problem]
-    of_all.sort(key=lambda task: isinstance(task[0], SB3Run))  # the long runs last
+    of_all.sort(key=lambda task: isinstance(task[0], SB3Run))  # the long runs come last
     complete_runs(of_all, **given.of_runs)
 
     sections, frames = {}, {}
@@ -245,7 +250,7 @@ def reproduce_pays(
 
 
 def with_summary(records: pd.DataFrame) -> pd.DataFrame:
-    """Append the records of all faults as :data:`MEAN`, and those of each policy's worst fault as :data:`WORST`."""
+    """Append the records of all faults as :data:`MEAN`, and of each policy's worst fault as :data:`WORST`."""
     faults = records[records["scenario"] != TRAINING]
     policy = ["model", "train_seed"]
     worst = faults.groupby([*policy, "scenario"])["cost"].mean().groupby(policy).idxmax()
@@ -254,7 +259,7 @@ def with_summary(records: pd.DataFrame) -> pd.DataFrame:
 
 
 def _methods_table(by_seed: pd.DataFrame, times: pd.Series) -> pd.DataFrame:
-    """Show the mean over seeds, with the best and the worst seed, of training, of the mean and of the worst fault."""
+    """Show the cost in training, under all faults and under the worst fault: mean, best seed and worst seed."""
     rows = []
     for model, of_model in by_seed.groupby("model", sort=False):
         row = dict(method=model, seeds=str(of_model["train_seed"].nunique()))
@@ -266,14 +271,14 @@ def _methods_table(by_seed: pd.DataFrame, times: pd.Series) -> pd.DataFrame:
 
 
 def _faults_table(by_seed: pd.DataFrame) -> pd.DataFrame:
-    """Show the mean over seeds of each fault: one row for each method."""
+    """Show each method's mean cost over seeds under each fault, with a row for each method."""
     names = [row for row in by_seed["scenario"].unique() if row not in (MEAN, WORST)]
     means = by_seed.pivot_table("cost", "model", "scenario", sort=False).reindex(columns=names)
     return means.map("{:.3g}".format).reset_index().rename(columns=dict(model="method"))
 
 
 def _successes_table(records: pd.DataFrame) -> pd.DataFrame:
-    """Show the share of the episodes that succeed in %, means over seeds, and the largest fall by a fault in points."""
+    """Show the success rate in % (means over seeds), and its largest decrease under a fault in percentage points."""
     shares = 100 * (1 - records.groupby(["model", "train_seed", "scenario"], sort=False)["failure"].mean().unstack())
     falls = shares[TRAINING] - shares.drop(columns=TRAINING).min(axis=1)
     table = shares.groupby("model", sort=False).mean().map("{:.1f}".format)
@@ -284,7 +289,7 @@ def _successes_table(records: pd.DataFrame) -> pd.DataFrame:
 
 
 def figure(frames: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw the cost in training against the mean over the faults: a dot for each policy, a panel for each problem."""
+    """Draw the mean cost under the faults against the cost in training: a panel per problem and a dot per policy."""
     drawn, (panels,) = new_panels(4.2 * len(frames), 4.8, 1, len(frames))
     colours = import_matplotlib().colormaps["tab20"].colors
     for axes, (name, frame) in zip(panels, frames.items(), strict=True):

@@ -1,4 +1,4 @@
-"""The figures that only the reproduction of the paper draws."""
+"""Draw the figures that only the reproduction of the paper needs."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-N_BINS = 40  # of a histogram
-NOISE_VARIANCES = (1e-4, 1.0)  # of the sensor in the trajectories
+N_BINS = 40  # number of bins of a histogram
+NOISE_VARIANCES = (1e-4, 1.0)  # variances of the sensor noise in the figure of the trajectories
 
 
 def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Figure:
@@ -37,8 +37,8 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Fig
     Draw histograms of the episode cost, as in the paper's Fig. 3: one panel for each scenario.
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :param scenarios: The panels from left to right. Their bins are equal on a logarithmic axis, since costs range over
-        two decades, unless a cost is zero or negative.
+    :param scenarios: The panels from left to right. The bins have equal widths on a logarithmic axis, because costs
+        range over two decades. If a cost is zero or negative, the axis is linear.
     """
     names = [scenario.name for scenario in scenarios]
     shown = records[records["scenario"].isin(names)]
@@ -48,7 +48,7 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Fig
     low, high = shown["cost"].min(), shown["cost"].max()
     is_positive = low > 0
     if is_positive:
-        low = max(low, high / 1e3)  # a few costs near 0 must not stretch the axis: they go into the first bin
+        low = max(low, high / 1e3)  # a few costs near 0 are in the first bin, so that they do not stretch the axis
         bins = np.geomspace(low, high * 1.001, N_BINS + 1)
     else:
         bins = np.histogram_bin_edges(shown["cost"], N_BINS)
@@ -76,7 +76,7 @@ def lava_trajectories(
 
     :param models: SB3 models by their label.
     :param env_kwargs: Keywords of the environment other than its noise.
-    :param n_episodes: Number of episodes in a panel; all panels have the same start positions.
+    :param n_episodes: Number of episodes in each panel; all panels have the same initial positions.
     """
     matplotlib = import_matplotlib()
     n_rows = len(NOISE_VARIANCES)
@@ -102,9 +102,9 @@ def lava_trajectories(
 
 def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str]) -> Figure:
     """
-    Draw each method's mean cost over the rows of a table: a line for the median seed, a dot for each seed.
+    Draw each method's mean cost in the rows of a table: a line for the median over seeds, and a dot for each seed.
 
-    :param records: With a column ``train_seed``.
+    :param records: Episodes, with a column ``train_seed``.
     :param noise_rows: Ordered scenarios, which follow the training row in the left panel.
     :param other_rows: Unordered scenarios for the right panel.
     """
@@ -126,9 +126,9 @@ def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_ro
 
 def diagnosis_bars(records: pd.DataFrame) -> Figure:
     """
-    Draw the final distance of each method in each scenario of a diagnosis: a bar for the median, a dot for each seed.
+    Draw each method's final distance in the scenarios of a diagnosis: a bar for the median, and a dot for each seed.
 
-    :param records: With the columns ``train_seed`` and ``distance`` (m).
+    :param records: Episodes, with the columns ``train_seed`` and ``distance`` (m).
     """
     figure, ((axes,),) = new_panels(WIDTH, 3.2)
     rows, width = list(records["scenario"].unique()), 0.8 / records["model"].nunique()
@@ -144,10 +144,10 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
 
 def sorted_walls(seed_means: pd.DataFrame) -> Figure:
     """
-    Draw the mean cost in front of each wall, from the wall that costs least to the one that costs most.
+    Draw the mean cost in front of each wall, from the lowest to the highest cost.
 
-    :param seed_means: ``model``, ``train_seed``, ``scenario`` (a wall) and ``cost``. A line is the median over seeds of
-        each policy's own order of the walls.
+    :param seed_means: ``model``, ``train_seed``, ``scenario`` (a wall) and ``cost``. The walls are sorted for each
+        policy separately; a line is the median over seeds.
     """
     figure, ((axes,),) = new_panels(WIDTH, 3.4)
     for color, (model, group) in zip(cycle(PALETTE), seed_means.groupby("model", sort=False), strict=False):
@@ -163,7 +163,7 @@ def sorted_walls(seed_means: pd.DataFrame) -> Figure:
 def _seed_means(
     records: pd.DataFrame, column: str, rows: list[str], spacing: float
 ) -> Iterator[tuple[str, str, np.ndarray, pd.DataFrame]]:
-    """Yield the colour and the label of each method, its places on the axis, and its means ``(seeds, rows)``."""
+    """Yield the colour and the label of each method, its positions on the axis, and its means ``(seeds, rows)``."""
     means = records.groupby(["model", "train_seed", "scenario"], sort=False)[column].mean()
     models = records["model"].unique()
     for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
@@ -172,7 +172,7 @@ def _seed_means(
 
 
 def failures_by_yaw(records: pd.DataFrame) -> Figure:
-    """Draw the share of failed grasps over the mug's yaw (rad) in polar coordinates: the effect of the handle."""
+    """Draw the failure rate against the mug's yaw (rad) in polar coordinates, which shows the effect of the handle."""
     figure = new_figure(5.2, 5.2)
     axes = figure.add_subplot(projection="polar")
     _draw_failures(figure, axes, records, records["yaw"] % (2 * np.pi), np.linspace(0, 2 * np.pi, 25))
@@ -182,7 +182,7 @@ def failures_by_yaw(records: pd.DataFrame) -> Figure:
 
 
 def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
-    """Draw the share of failed grasps over the height of the camera above its usual place, ``camera`` (m)."""
+    """Draw the failure rate against ``camera``, the height of the camera above its usual position (m)."""
     figure, ((axes,),) = new_panels(WIDTH * 0.7, 3.2)
     centimetres = 100 * records["camera"]
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
@@ -193,7 +193,7 @@ def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
 
 
 def _draw_failures(figure: Figure, axes: Axes, records: pd.DataFrame, at: pd.Series, edges: np.ndarray) -> None:
-    """Draw the share of failures in each bin; curves in polar coordinates are closed."""
+    """Draw the failure rate in each bin; in polar coordinates the curves are closed."""
     middles = (edges[:-1] + edges[1:]) / 2
     order = np.arange(len(middles) + (axes.name == "polar")) % len(middles)
     for color, (label, group) in zip(cycle(PALETTE), records.groupby("model", sort=False), strict=False):
@@ -205,7 +205,7 @@ def _draw_failures(figure: Figure, axes: Axes, records: pd.DataFrame, at: pd.Ser
 
 
 def _draw_corridor(axes: Axes, horizon: int) -> None:
-    """Wall, goal and lava behind the trajectories."""
+    """Draw wall, goal and lava behind the trajectories."""
     low, high = WALL - 0.5, LAVA + 0.5
     axes.axhspan(low, WALL, color="#999999", linewidth=0)
     axes.axhspan(LAVA, high, color="#F0954B", linewidth=0)
@@ -226,7 +226,7 @@ def _title(scenario: Scenario) -> str:
 
 
 def _noise(variance: float) -> str:
-    """sigma^2 = 10^-3 in Matplotlib's mathematics."""
+    """Return a label such as sigma^2 = 10^-3 in Matplotlib's notation for formulas."""
     exponent = round(np.log10(variance or 1.0))
     is_power = exponent != 0 and np.isclose(variance / 10.0**exponent, 1.0)
     return rf"$\sigma^2 = 10^{{{exponent}}}$" if is_power else rf"$\sigma^2 = {variance:.3g}$"

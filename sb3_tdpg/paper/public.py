@@ -1,4 +1,4 @@
-"""The study on public tasks: our one preset, tuned blocks and a cost limit beside PPO and RecurrentPPO."""
+"""Compare TDPG with its preset, with tuned blocks and with a cost limit to PPO and RecurrentPPO on public tasks."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from sb3_tdpg.paper.public_trainings import (
     with_limit,
 )
 
-FIRST_SEED = 200  # those below were used for tuning
+FIRST_SEED = 200  # seeds below 200 were used for tuning
 N_CURVE_POINTS = 50
 
 
 def make_trainings(seeds: Sequence[int], n_eval_episodes: int = 100, n_timesteps: int | None = None) -> list[Training]:
-    """List all trainings, seed by seed, so that an interrupted call has the same seeds of all methods."""
+    """List all trainings seed by seed, so that after an interrupt all methods have the same seeds."""
     trainings = []
     for seed in seeds:
         for listed in TASKS:
@@ -54,7 +54,7 @@ def make_trainings(seeds: Sequence[int], n_eval_episodes: int = 100, n_timesteps
 
 
 def complete(training: Training, root: Path) -> list[Training]:
-    """Complete a training, and after that of the preset the one with a limit; return what is finished."""
+    """Complete a training, and for the preset also the training with a limit; return the finished trainings."""
     complete_training(training, root)
     if training.method != PRESET:
         return [training]
@@ -67,12 +67,12 @@ def reproduce_public(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
     """
     Train all methods on all tasks, and compare the returns.
 
-    It needs the extra ``public`` of the package. Each training has one thread.
+    This needs the extra ``public`` of the package. Each training has one thread.
 
     :param out: Folder of the trainings, and of ``summary.md``, ``curves.png``, ``config.json`` and the records.
-    :param n_seeds: Training seeds of each method.
-    :param options: See :class:`~sb3_tdpg.paper.common.Options`; 100 episodes by default, with and without the noise of
-        the policy each.
+    :param n_seeds: Number of training seeds of each method.
+    :param options: See :class:`~sb3_tdpg.paper.common.Options`. By default there are 100 episodes with the noise of the
+        policy and 100 episodes without it.
     :return: the summary, as Markdown
     """
     given = common.Options(**{"n_eval_episodes": 100, **options})
@@ -89,14 +89,14 @@ def reproduce_public(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
 
 class Records:
     """
-    What trainings left: returns of evaluation episodes, times, learning curves.
+    The records of trainings: returns of evaluation episodes, times and learning curves.
 
     :param trainings: Finished trainings.
-    :param root: The folder that they lie in.
+    :param root: The folder that contains the trainings.
     """
 
     def __init__(self, trainings: Sequence[Training], root: Path) -> None:
-        self.runs: list[Any] = [(each, root / each.folder_name, ()) for each in trainings]  # no rows of scenarios
+        self.runs: list[Any] = [(each, root / each.folder_name, ()) for each in trainings]  # without scenarios
         self.episodes = common.read_records(self.runs)
         times, curves = [], []
         for each, folder, _ in self.runs:
@@ -110,7 +110,7 @@ class Records:
 
     @property
     def tasks(self) -> list[PublicTask]:
-        """The tasks that there are records of."""
+        """The tasks that have records."""
         return [task for task in TASKS if task.env_id in set(self.episodes["env_id"])]
 
     def means(self, task: PublicTask, method: str, deterministic: bool) -> np.ndarray:
@@ -121,7 +121,7 @@ class Records:
         return frame.groupby("train_seed")["return"].mean().to_numpy()
 
     def write(self, out: Path, publish: Path | None = None) -> str:
-        """Write the records, ``config.json``, ``curves.png`` and ``summary.md``, and return the latter."""
+        """Write the records, ``config.json``, ``curves.png`` and ``summary.md``; return the summary."""
         for name in ("episodes", "times", "curves"):
             write_frame_atomically(getattr(self, name).round(3), out / f"{name}.csv.xz")
         save_figure(self.figure(), out / "curves.png")
@@ -130,7 +130,7 @@ class Records:
         return common.write_results(out, "public.md", self.runs, "sb3-tdpg reproduce public", publish, **tables)
 
     def returns_table(self, deterministic: bool) -> str:
-        """Compare the final returns with those of the rival."""
+        """Compare the final returns of TDPG and of the baseline."""
         rows = []
         for task in self.tasks:
             rival, ours, tuned = (self.means(task, m, deterministic) for m in (task.rival, PRESET, TUNED))
@@ -151,7 +151,7 @@ class Records:
         return markdown_table(rows)
 
     def limit_table(self) -> str:
-        """Say how much of the return, and of the information, each seed keeps under its cost limit."""
+        """Show what share of the return and how much information the seeds keep with a cost limit."""
         rows = []
         nats = self.times.groupby(["env_id", "method"])["nats"].median()
         for task in self.tasks:
@@ -175,7 +175,7 @@ class Records:
         return markdown_table(rows)
 
     def time_table(self) -> str:
-        """Compare CPU times of the same number of steps: the median of the trainings on the last day of each kind."""
+        """Compare median CPU times for the same number of steps; for each task and method, only the last day counts."""
         kind, dates = ["env_id", "method"], self.times["date"].fillna("")
         is_last = dates == dates.groupby([self.times[column] for column in kind]).transform("max")
         medians = self.times[is_last].groupby(kind)["cpu_s"].median()
@@ -219,7 +219,7 @@ class Records:
 
 
 def learning_curve(folder: Path, n_timesteps: int) -> pd.DataFrame:
-    """Average the returns of a training's episodes over equal numbers of steps."""
+    """Average the returns of a training's episodes in intervals with equal numbers of steps."""
     episodes = pd.read_csv(folder / "training.csv")
     width = n_timesteps // N_CURVE_POINTS
     episodes["timestep"] = ((episodes["timestep"] - 1) // width + 1) * width

@@ -1,4 +1,4 @@
-"""Public tasks, and one training on one of them with its evaluation: ours, or PPO and RecurrentPPO through rl-zoo3."""
+"""Train and evaluate TDPG, or PPO and RecurrentPPO through rl-zoo3, on a public task."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from sb3_tdpg.common.provenance import check_same_config, jsonable, write_frame_
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.information.logdet import LogDet
 
-N_HOPPER_POSITIONS = 5  # of an observation; the other components are velocities
+N_HOPPER_POSITIONS = 5  # number of positions in an observation; all other components are velocities
 N_EVAL_ENVS = 10
-EVAL_SEED = 10_000  # its environments are seeded alike for all methods
+EVAL_SEED = 10_000  # seed of the evaluation environments, the same for all methods
 
 PRESET, TUNED, LIMIT = "TDPG, one preset", "TDPG, tuned", "TDPG, cost limit"
-"""Methods: without any setting; with the block of ``hyperparams/tdpg.yml``; with a limit, see :func:`with_limit`."""
-SHARE = 0.95  # of the return
+"""Methods: no settings; the block of ``hyperparams/tdpg.yml``; a cost limit, see :func:`with_limit`."""
+SHARE = 0.95  # share of the return that the cost limit keeps
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,11 @@ class PublicTask:
     """
     A task that others made.
 
-    :param env_id: Its registered id.
-    :param block: Block of rl-zoo3's settings, where it is of an older version of the environment or of a similar one.
-    :param n_timesteps: Length of a training, the same for all methods.
-    :param hidden: Whether a memory is needed: the rival is RecurrentPPO instead of PPO.
-    :param tuned: Block of ``hyperparams/tdpg.yml``.
+    :param env_id: Registered id of the task.
+    :param block: Block of rl-zoo3's settings. It can be for an older version of the environment or for a similar one.
+    :param n_timesteps: Length of a training in environment steps, the same for all methods.
+    :param hidden: Whether the task needs a memory. If so, the baseline is RecurrentPPO instead of PPO.
+    :param tuned: Block of ``hyperparams/tdpg.yml`` with tuned settings.
     """
 
     env_id: str
@@ -59,15 +59,15 @@ class PublicTask:
 
     @property
     def rival(self) -> str:
-        """The method to compare with."""
+        """The baseline: PPO or RecurrentPPO."""
         return "RecurrentPPO" if self.hidden else "PPO"
 
     def zoo_block(self) -> dict[str, Any]:
-        """Read rl-zoo3's settings for the rival."""
+        """Read rl-zoo3's settings for the baseline."""
         file = Path(rl_zoo3.__file__).parent / "hyperparams" / ("ppo_lstm.yml" if self.hidden else "ppo.yml")
         block = dict(yaml.safe_load(file.read_text())[self.block])
         if isinstance(gym.spec(self.env_id).make().observation_space, gym.spaces.Discrete):
-            block.pop("normalize")  # VecNormalize refuses it
+            block.pop("normalize")  # VecNormalize does not accept discrete observations
         return block
 
 
@@ -84,14 +84,14 @@ TASKS = (
     PublicTask("CartPoleNoVel-v1", "CartPoleNoVel-v1", hidden=True),
     PublicTask("PendulumNoVel-v1", "PendulumNoVel-v1", hidden=True),
     PublicTask("HopperNoVel-v5", "Hopper-v4", hidden=True),
-    # rl-zoo3 has no settings for POPGym: those of the nearest task.
+    # rl-zoo3 has no settings for POPGym, so these tasks use the settings of the most similar task.
     PublicTask("NoisyPositionOnlyCartPoleEasy-v0", "CartPoleNoVel-v1", hidden=True),
     PublicTask("RepeatPreviousEasy-v0", "CartPoleNoVel-v1", hidden=True),
 )
 
 
 def make_hopper_without_velocities(**kwargs: Any) -> gym.Env:
-    """Make Hopper-v5 with the first components of its observation, the positions, only."""
+    """Make Hopper-v5 whose observation contains only the positions, which are its first components."""
     env = gym.make("Hopper-v5", **kwargs)
     full: Any = env.observation_space
     low, high = (bound[:N_HOPPER_POSITIONS] for bound in (full.low, full.high))
@@ -100,7 +100,7 @@ def make_hopper_without_velocities(**kwargs: Any) -> gym.Env:
 
 
 gym.register("HopperNoVel-v5", make_hopper_without_velocities, max_episode_steps=1000)
-# POPGym's environments end by themselves but declare no time limit, which TDPG needs.
+# POPGym's environments end on their own, but they do not declare a time limit, which TDPG needs.
 for _module, _name, _horizon in (
     ("noisy_position_only_cartpole", "NoisyPositionOnlyCartPoleEasy", 200),
     ("repeat_previous", "RepeatPreviousEasy", 51),
@@ -111,17 +111,17 @@ for _module, _name, _horizon in (
 @dataclass(frozen=True)
 class Training:
     """
-    One method with one seed on one task.
+    One training of one method with one seed on one task.
 
     :param method: Label in tables.
-    :param settings: Arguments of TDPG; ``None``: the rival with rl-zoo3's settings.
+    :param settings: Arguments of TDPG. ``None`` means the baseline with rl-zoo3's settings.
     """
 
     task: PublicTask
     method: str
     seed: int
     settings: dict[str, Any] | None = None
-    n_eval_episodes: int = 100  # without and with the noise of the policy, each
+    n_eval_episodes: int = 100  # number of episodes without the policy's noise, and also with it
 
     @property
     def config(self) -> dict[str, Any]:
@@ -132,17 +132,17 @@ class Training:
 
     @property
     def labels(self) -> dict[str, Any]:
-        """The columns that all records have."""
+        """The values of the columns that all records have."""
         return dict(env_id=self.task.env_id, method=self.method, train_seed=self.seed)
 
     @property
     def folder_name(self) -> str:
-        """A name made from task, method and seed."""
+        """The name of the folder, made from task, method and seed."""
         return f"{self.task.env_id}/{self.method.replace(', ', '-').replace(' ', '_')}/seed{self.seed}"
 
 
 class EpisodeLog(BaseCallback):
-    """Keep step, return and length of every training episode."""
+    """Record step, return and length of every training episode."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ class EpisodeLog(BaseCallback):
 
 
 def complete_training(training: Training, root: Path) -> Path:
-    """Train and evaluate, unless ``episodes.csv``, written last, says that this is done."""
+    """Train and evaluate, unless ``episodes.csv`` exists, which is written last."""
     folder = root / training.folder_name
     check_same_config(folder / "config.json", training.config, "training")
     if (folder / "episodes.csv").exists():
@@ -176,7 +176,7 @@ def complete_training(training: Training, root: Path) -> Path:
 
 
 def with_limit(training: Training, root: Path) -> Training:
-    """Add a cost limit of 95 % of the return that a finished training reached with the stochastic policy."""
+    """Return a training whose cost limit keeps 95 % of a finished training's return with the stochastic policy."""
     episodes = pd.read_csv(root / training.folder_name / "episodes.csv")
     reached = episodes.loc[~episodes["deterministic"], "return"].mean()
     limit = (1 - SHARE) * abs(reached) - reached
@@ -184,14 +184,14 @@ def with_limit(training: Training, root: Path) -> Training:
 
 
 def _ours(training: Training, log: EpisodeLog) -> tuple[BaseAlgorithm, Callable[[], Any]]:
-    """Make TDPG as a user would; return the model, and a function that trains it."""
+    """Make a TDPG model as a user would; return the model, and a function that trains it."""
     block = {"policy": "TRVPolicy", "n_timesteps": training.task.n_timesteps, **(training.settings or {})}
     model, callbacks, n_timesteps = make_training(training.task.env_id, block, seed=training.seed, device="cpu")
     return model, lambda: model.learn(n_timesteps, [*callbacks, log])
 
 
 def _rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[BaseAlgorithm, Callable[[], Any]]:
-    """Make PPO or RecurrentPPO by rl-zoo3, with its settings for the task."""
+    """Make PPO or RecurrentPPO with rl-zoo3 and its settings for the task; return the model and a training function."""
     task, blocks = training.task, folder / "zoo.yml"
     write_atomically(blocks, yaml.safe_dump({task.env_id: task.zoo_block()}))
     manager = ExperimentManager(
@@ -207,7 +207,7 @@ def _rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[BaseAlgor
         verbose=0,
         log_interval=-1,
     )
-    with redirect_stdout(io.StringIO()):  # it prints its settings
+    with redirect_stdout(io.StringIO()):  # the manager prints its settings
         ready = manager.setup_experiment()
     assert ready is not None
     manager.callbacks.append(log)
@@ -215,13 +215,13 @@ def _rival(training: Training, log: EpisodeLog, folder: Path) -> tuple[BaseAlgor
 
 
 def nats_per_step(model: TDPG) -> float:
-    """Measure the information that the TRVs have about the state in the last rollouts: the log-det bound."""
+    """Return the log-det bound on the information per step that the TRVs have about the state in the last rollouts."""
     batch = model.rollout_buffer.episode_batch(whole_horizon=False).information_batch(pooled=True)
     return float(LogDet(1, model.state_dim, model.policy.trv_dim)(batch).sum())
 
 
 def evaluate(training: Training, model: BaseAlgorithm) -> pd.DataFrame:
-    """Return the returns of evaluation episodes, with and without noise in the policy: one row for each."""
+    """Return the returns of evaluation episodes with and without noise in the policy, one row per episode."""
     env = make_vec_env(training.task.env_id, n_envs=N_EVAL_ENVS)
     if (norm := model.get_vec_normalize_env()) is not None:
         env = VecNormalize(env, training=False, norm_reward=False)

@@ -1,4 +1,4 @@
-"""The robustness report: models in an environment, every perturbation in every severity, one page to read."""
+"""Write a robustness report: one page about models in an environment under every perturbation and severity."""
 
 from sb3_tdpg.report.main import robustness_report
 from sb3_tdpg.report.models import load_model, parse_models

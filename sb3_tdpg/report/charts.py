@@ -1,4 +1,4 @@
-"""The figures of a report."""
+"""Draw the figures of a report."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^vP"
-MAX_STEPS = 100  # of the episode that shows the perturbations: more cannot be told apart
+MAX_STEPS = 100  # of the episode that shows the perturbations; more steps would be too close to each other
 
 
 def degradation_curves(numbers: Numbers) -> Figure:
-    """Draw the cost of each method over the severities with its interval, in a panel for each perturbation."""
+    """Draw the cost of each method with its interval against the severity, in one panel per perturbation."""
     names, levels = numbers.perturbations, numbers.levels
     figure, panels = _grid(len(names))
     for axes, name in zip(panels.flat, names, strict=False):
@@ -67,7 +67,7 @@ def own_rows_figure(numbers: Numbers) -> Figure:
 
 
 def comparison_figure(numbers: Numbers) -> Figure:
-    """Draw in which share of the pairs a model of each method costs less than one of the first method."""
+    """Draw for each method the share of pairs of models in which its model costs less than the first method's."""
     reference = numbers.models[0]
     frame = numbers.comparisons[[numbers.can_be_clear(label) for label in numbers.comparisons["model"]]]
     costs = numbers.model_groups.pivot(index=["model", "train_seed"], columns="perturbation", values="cost")
@@ -90,8 +90,8 @@ def _by_row(numbers: Numbers, frame: pd.DataFrame, of_models: pd.DataFrame) -> t
     """
     Draw a value for each perturbation (rows) and method, with a dot for each model.
 
-    :param frame: ``perturbation``, ``model``, ``value``, and either the ends of intervals or ``is_filled``.
-    :param of_models: ``perturbation``, ``model``, ``cost``.
+    :param frame: Columns ``perturbation``, ``model``, ``value``, and either the ends of intervals or ``is_filled``.
+    :param of_models: Columns ``perturbation``, ``model``, ``cost``.
     """
     names, labels = list(frame["perturbation"].unique()), list(frame["model"].unique())
     figure, ((axes,),) = new_panels(WIDTH, 1.1 + 0.24 * len(names))
@@ -118,8 +118,8 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     """
     Draw one component of the observations of an episode, unperturbed and under each perturbation.
 
-    The model acts on the unperturbed observations, so that the true episode is the same in all panels. The component is
-    the one that varies most, in multiples of its scale.
+    The model acts on the unperturbed observations, so that the true episode is the same in all panels. The figure shows
+    the component with the largest variation, relative to its scale.
     """
     observations, space = _episode(plan, model)
     scales = plan.scale if isinstance(plan.scale, Mapping) else {"": plan.scale}
@@ -130,7 +130,7 @@ def vector_examples(plan: Plan, rows: Sequence[Row], model: Any) -> Figure:
     key = max(spread, key=lambda key: spread[key].max())
     component = int(np.argmax(spread[key]))
     unperturbed = parts[key].reshape(len(observations), -1)[:, component]
-    shown = {"shown": [key or component]}  # of all groups that can fail
+    shown = {"shown": [key or component]}  # only this group of components can fail
     sensor = Sensor(space, plan.scale, len(observations), shown)
     names = list(dict.fromkeys(row.perturbation for row in rows))
     figure, panels = _grid(len(names))
@@ -162,7 +162,7 @@ def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space]:
         seen.append(observations)
         return observations
 
-    # The sensor is inside the wrappers of a model, which change the observations.
+    # The recorder is inside the model's wrappers, because they change the observations.
     sensor = partial(PerturbedVecEnv, perturbation=keep)
     scenario = Scenario(UNPERTURBED, plan.env_id, plan.env_kwargs, sensor=sensor)
     with closing(scenario_env(scenario, model, n_episodes=1, n_envs=1)) as env:
@@ -172,14 +172,14 @@ def _episode(plan: Plan, model: Any) -> tuple[list[Any], spaces.Space]:
 
 
 def _grid(n: int) -> tuple[Figure, np.ndarray]:
-    """Make a figure with n panels that share their axes, in evenly filled rows of up to five."""
+    """Make a figure with n panels that share their axes, in rows of equal length with up to five panels."""
     n_columns = n if n <= 5 else min((5, 4, 3), key=lambda columns: -n % columns)
     n_rows = -(-n // n_columns)
     figure, panels = new_panels(WIDTH, 0.7 + 1.8 * n_rows, n_rows, n_columns, sharex=True, sharey=True)
     for axes in panels.flat[n:]:
         axes.set_axis_off()
     for axes in panels.flat[max(0, n - n_columns) : n]:
-        axes.tick_params(labelbottom=True)  # also above a missing panel
+        axes.tick_params(labelbottom=True)  # needed above a missing panel
     return figure, panels
 
 

@@ -1,4 +1,4 @@
-"""Make a report: check the arguments, run the missing rows, aggregate, draw, write."""
+"""Make a report: check the arguments, run the missing rows, aggregate the costs, draw figures and write the page."""
 
 import sys
 import time
@@ -36,8 +36,8 @@ from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
 N_INFORMATION = 500  # episodes
-N_STEPS = 10_000  # of each model in each row
-PAUSE = 4  # between two unfinished pages, as a multiple of the time that one takes to write
+N_STEPS = 10_000  # number of steps of each model in each row
+PAUSE = 4  # pause between two unfinished pages, as a multiple of the time to write one
 DPI = 110
 
 
@@ -59,34 +59,34 @@ def robustness_report(
     progress_bar: bool = True,
 ) -> str:
     """
-    Run every model under every perturbation, and write a page that says which method is more robust, and where.
+    Run every model under every perturbation, and write a page that says where each method is more robust.
 
     ``out`` then contains ``report.md``, ``report.html`` (one file with its pictures) and the files that
-    docs/guide/report.md names. While rows are missing, the page is written again and again with those that are
-    finished. An interrupted call continues, and a later call may ask for other perturbations or severities: finished
-    rows are not run again.
+    docs/guide/report.md names. During the run, the page is updated with the finished rows. The same call continues an
+    interrupted report. A later call can have other perturbations or severities; finished rows are not run again.
 
-    :param models: Models by method: one model or a list with one model for each training seed. A model is a file
-        (:class:`~pathlib.Path` or text) or a model of TDPG, Stable-Baselines3 or sb3-contrib. All methods are compared
-        with the first one.
-    :param env_id: A registered id, also in the ``module:id`` form.
+    :param models: The models of each method: one model, or a list with one model for each training seed. A model is a
+        file (:class:`~pathlib.Path` or text) or a model of TDPG, Stable-Baselines3 or sb3-contrib. All methods are
+        compared with the first method.
+    :param env_id: A registered id, or ``module:id``.
     :param out: Folder of the results.
     :param env_kwargs: Keywords of the environment in all rows.
     :param perturbations: Perturbations of the sensor and of the scene; default: all that apply.
     :param severities: Severities from 1 to 5.
     :param scenarios: Test rows of the environment; default: the test rows of the paper's table, if there are any.
-    :param n_episodes: Episodes of each model in each row; default: as many as ``n_steps`` allows, at most 100 with
-        images and 500 with vectors.
-    :param n_steps: Steps of each model in each row, at most: the budget that sets ``n_episodes``.
+    :param n_episodes: Number of episodes of each model in each row; default: as many as ``n_steps`` allows, but at most
+        100 with images and 500 with vectors.
+    :param n_steps: Maximum number of steps of each model in each row, from which ``n_episodes`` is computed.
     :param information: Also measure the information in the TRVs of the first TDPG model of each method. With long
         episodes this takes much longer than the rest of the report.
     :param seed: Seed of environments, policies, perturbations and bootstrap.
-    :param deterministic: Act without noise.
+    :param deterministic: Whether the policies act without noise.
     :param jobs: Number of processes, if all models are files.
     :param progress_bar: Show progress on stderr.
     :return: the page, as Markdown
-    :raises ValueError: if an argument is wrong, or the folder contains another report; nothing has been run by then.
-    :raises ImportError: without the extra ``plots``.
+    :raises ValueError: if an argument is wrong, or the folder contains another report; no row has been run in this
+        case.
+    :raises ImportError: if the extra ``plots`` is not installed.
     """
     _import_extra()
     out = Path(out)
@@ -135,7 +135,7 @@ def robustness_report(
 
 @dataclass
 class _Writer:
-    """Write the page and its files, for all rows or for those that are finished."""
+    """Write the page and its files, for all rows or for the finished rows."""
 
     plan: Plan
     rows: Sequence[Row]
@@ -147,7 +147,7 @@ class _Writer:
     not_before: float = 0.0
 
     def say_how_long(self, horizon: int | None, jobs: int) -> None:
-        """Print an estimate of the time before the rows run."""
+        """Print an estimate of the time that the missing rows will take."""
         if not (missing := missing_rows(self.rows, self.out / "rows")):
             return
         seconds = seconds_of_a_row(self.plan, self.rows[0], self.models, horizon)
@@ -160,21 +160,21 @@ class _Writer:
         )
 
     def write_unfinished(self, records: Mapping[Row, pd.DataFrame]) -> None:
-        """Write the page of the finished rows, unless the last one was written just now."""
+        """Write the page with the finished rows, unless the last page has been written only a short time ago."""
         began = time.monotonic()
         if self.rows[0] not in records or len(records) == len(self.rows) or began < self.not_before:
             return
-        # A mean over the mild severities alone would look better than it is.
+        # A perturbation is shown only with all its severities: a mean over the mild ones alone would look too good.
         open_names = {row.perturbation for row in self.rows if row not in records and row.kind != "own"}
         rows = [row for row in self.rows if row in records and row.perturbation not in open_names]
-        if len(rows) == 1:  # not a perturbation yet
+        if len(rows) == 1:  # no perturbation is finished yet
             return
         self.write(rows, pd.concat([records[row] for row in rows], ignore_index=True))
         self.not_before = time.monotonic() + PAUSE * (time.monotonic() - began)
 
     def write(self, rows: Sequence[Row], records: pd.DataFrame, knowledge: Sequence[Knowledge] = ()) -> str:
-        """Write the page of some rows, and return it as Markdown."""
-        # The first method is the one that the others are compared with; finished rows may have another order.
+        """Write the page with some rows, and return it as Markdown."""
+        # The first method must come first, because all methods are compared with it.
         records = pd.concat([records[records["model"] == label] for label in self.names], ignore_index=True)
         out, numbers = self.out, make_numbers(records, seed=self.plan.seed)
         is_finished = len(rows) == len(self.rows)
@@ -191,7 +191,7 @@ class _Writer:
         return text
 
     def _draw(self, numbers: Numbers, rows: Sequence[Row]) -> dict[str, str]:
-        """Draw the figures that this report has, with examples of some rows, and return their files by name."""
+        """Draw the figures of this report, with examples of the given rows; return the file of each figure."""
         figures = {}
         if numbers.perturbations:
             figures["degradation"] = degradation_curves(numbers)
@@ -199,7 +199,7 @@ class _Writer:
             figures["own_rows"] = own_rows_figure(numbers)
         if any(map(numbers.can_be_clear, numbers.models[1:])):
             figures["comparison"] = comparison_figure(numbers)
-        # One picture does not show the timing.
+        # The examples leave out perturbations of the timing, which one picture cannot show.
         of_sensor = [row for row in rows if row.kind == "sensor"]
         shown = [row for row in of_sensor if PERTURBATIONS[row.perturbation].kind == "image"]
         shown += [row for row in rows if row.kind == "scene"]
@@ -227,13 +227,13 @@ class _Writer:
                     known.append(_knowledge(label, report, self.out, f"information-{number}"))
                     if model.auto_weight is not None and (kept := model.auto_weight.kept()) is not None:
                         known[-1].text += f" By the estimate of the training, {kept}."
-                except ValueError as e:  # for instance a state that never varies: the rest of the page is still useful
+                except ValueError as e:  # for instance a constant state; the rest of the page is still useful
                     known.append(Knowledge(label, f"not measured: {e}."))
         return known
 
 
 def _import_extra() -> None:
-    """Check the optional dependencies before the work begins."""
+    """Check that the optional dependencies are installed before the work begins."""
     try:
         for name in ("jinja2", "markdown_it", "matplotlib", "rliable"):
             import_module(name)
@@ -242,7 +242,7 @@ def _import_extra() -> None:
 
 
 def _sources(models: Mapping[str, Any]) -> dict[str, list[Source]]:
-    """Check the models, and turn single models into lists and text into paths."""
+    """Check the models; convert single models to lists and text to paths."""
     if not isinstance(models, Mapping) or not models:
         raise ValueError(
             f"models={models!r} must be a dictionary with at least one method, for instance "
@@ -286,7 +286,7 @@ def _check_fit(models: Models, rows: Sequence[Row]) -> None:
 def _check_different(
     fingerprints: Mapping[str, Sequence[str]], names: Mapping[str, Sequence[str]], kinds_of: Mapping[str, set[str]]
 ) -> None:
-    """Refuse a policy that occurs twice: as two training seeds it would make intervals too narrow."""
+    """Raise an error if a policy occurs twice: if it counted as two training seeds, intervals would be too narrow."""
     for label, kinds in kinds_of.items():
         if len(kinds) > 1:
             raise ValueError(f"{label!r} has models of {' and '.join(sorted(kinds))}: give each a label, LABEL=FILE")

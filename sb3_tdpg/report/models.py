@@ -11,7 +11,7 @@ from typing import Any
 
 from sb3_tdpg.evaluation.loading import load_model
 
-# File names that any model may have: then the folder names the model.
+# File names that do not identify a model. A model with such a name gets the name of its folder.
 PLAIN_NAMES = re.compile(r"model|best_model|final_model|selected|last|rl_model_\d+_steps")
 SEED = re.compile(r"[-_. ]*(seed[-_. ]?\d+|_\d+)$", re.IGNORECASE)
 
@@ -24,12 +24,13 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
     Read models from the command line, and group them into methods.
 
     An argument is a file, a folder with a ``model.zip``, or a pattern such as ``runs/pg-seed*/model.zip``, with an
-    optional ``LABEL=`` in front. Without a label, the name of the method is that of the file, or that of its folder if
-    any model may have the file's name (``model.zip``, ``best_model.zip``, the environment's id), without the seed:
-    ``runs/pg-seed3/model.zip`` is a model of ``pg``, and ``logs/ppo/Lava-v0_1/Lava-v0.zip`` of ``ppo Lava-v0``.
+    optional ``LABEL=`` in front. Without a label, the method has the name of the file without the seed. If the file's
+    name does not identify a model (``model.zip``, ``best_model.zip``, the environment's id), the method has the name of
+    the folder without the seed. For example, ``runs/pg-seed3/model.zip`` is a model of ``pg``, and
+    ``logs/ppo/Lava-v0_1/Lava-v0.zip`` is a model of ``ppo Lava-v0``.
 
     :return: the files of each method, in the order of the arguments
-    :raises ValueError: if a file does not exist or is given twice, or two in a folder are named after it.
+    :raises ValueError: if a file does not exist or is given twice, or if two files would get the name of one folder.
     """
     methods: dict[str, list[Path]] = {}
     seen: dict[Path, str] = {}
@@ -57,7 +58,7 @@ def label_of(path: Path, env_id: str = "") -> str:
     name = SEED.sub("", name) or name
     if name != env_id.rpartition(":")[2]:
         return name
-    # Every training of the environment by `train` is logs/<algo>/<env>_<n>/<env>.zip.
+    # `train` saves every model as logs/<algo>/<env>_<n>/<env>.zip.
     record = path.parent / "run.json"
     block = json.loads(record.read_text()).get("block") if record.exists() else None
     return f"{path.absolute().parent.parent.name} {block or name}"
@@ -93,7 +94,7 @@ def _files(pattern: str, argument: str) -> list[Path]:
 def load_all(
     sources: Mapping[str, Sequence[Source]], env_id: str, env_kwargs: Mapping[str, Any]
 ) -> dict[str, list[Any]]:
-    """Load the models that are given as files."""
+    """Load the models that are files; return all models."""
     return {
         label: [load_model(s, env_id, env_kwargs) if isinstance(s, Path) else s for s in of_method]
         for label, of_method in sources.items()
@@ -101,7 +102,7 @@ def load_all(
 
 
 def fingerprint(model: Any) -> str:
-    """Return a hash of the weights of a model and of the statistics that it normalises observations with."""
+    """Return a hash of a model's weights and of the statistics with which it normalises observations."""
     digest = hashlib.sha256(type(model).__name__.encode())
     for name, values in sorted(model.policy.state_dict().items()):
         digest.update(name.encode())

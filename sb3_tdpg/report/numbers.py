@@ -15,8 +15,8 @@ from sb3_tdpg.evaluation.statistics import LEVEL, interquartile_means
 from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 
 CLEAR = 0.05
-"""A difference is clear up to this p-value."""
-MAX_EXACT = 8  # models: up to here the test is exact, as SciPy does without equal costs
+"""A difference counts as clear up to this p-value."""
+MAX_EXACT = 8  # up to this number of models the test is exact; SciPy does this only without equal costs
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,15 @@ class Numbers:
     """The cost of each method in each row: ``model``, ``perturbation``, ``severity``, ``kind``, ``n_seeds``, ``iqm``,
     ``low``, ``high``."""
     groups: pd.DataFrame
-    """The mean over the severities of each perturbation, for each method: the same columns without ``severity``, and
-    ``added``, ``added_low``, ``added_high``, the cost above the unperturbed cost, and whether the cost is clearly the
-    ``lowest``: below that of every other method, and their intervals do not overlap."""
+    """The mean over the severities of each perturbation, for each method. The columns are those of ``levels`` without
+    ``severity``, the cost above the unperturbed cost with its interval (``added``, ``added_low``, ``added_high``), and
+    ``lowest``: whether the cost is clearly below the cost of every other method, and the intervals do not overlap."""
     comparisons: pd.DataFrame
-    """Each method compared with the first one (``reference``), with a row for each perturbation: the share ``p_cost``
-    of the pairs of models in which its model costs less, and ``p_added`` in which the perturbation adds less to its
-    cost; ``pvalue_...`` of the exact Mann-Whitney test, two-sided. ``cost`` and ``added`` are the verdicts: ``"less"``
-    or ``"more"`` up to a p-value of 0.05, else ``"undecided"``."""
+    """The comparison of each method with the first method (``reference``), with a row for each perturbation. ``p_cost``
+    is the share of the pairs of models in which the method's model costs less. ``p_added`` is the share in which the
+    perturbation adds less to the cost of the method's model. ``pvalue_...`` is from the exact two-sided Mann-Whitney
+    test. ``cost`` and ``added`` are the verdicts: ``"less"`` or ``"more"`` up to a p-value of 0.05, otherwise
+    ``"undecided"``."""
     model_levels: pd.DataFrame
     """The mean cost of each model in each row: ``model``, ``train_seed``, ``perturbation``, ``severity``, ``cost``."""
     model_groups: pd.DataFrame
@@ -47,7 +48,7 @@ class Numbers:
         return list(self.levels["model"].unique())
 
     def can_be_clear(self, label: str) -> bool:
-        """Whether any difference from the first method could be clear, with so many models of each."""
+        """Return whether the two methods have enough models for a clear difference from the first method."""
         n, of_reference = self.n_models(label), self.n_models(self.models[0])
         return p_value(np.arange(n), n + np.arange(of_reference)) <= CLEAR
 
@@ -57,7 +58,7 @@ class Numbers:
 
     @property
     def perturbations(self) -> list[str]:
-        """The perturbations with severities."""
+        """The perturbations that have severities."""
         return list(self.groups.loc[self.groups["kind"].isin(PERTURBED), "perturbation"].unique())
 
 
@@ -65,7 +66,7 @@ def p_value(costs: np.ndarray, of_others: np.ndarray) -> float:
     """Return the p-value of a difference between the models of two methods."""
     from scipy.stats import mannwhitneyu
 
-    # With equal costs "auto" is a normal approximation, which is far too sure of a few models.
+    # With equal costs "auto" uses a normal approximation, whose p-value is far too low for a few models.
     method = "exact" if min(len(costs), len(of_others)) <= MAX_EXACT else "auto"
     return float(mannwhitneyu(costs, of_others, method=method).pvalue)
 
@@ -75,9 +76,9 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
     Aggregate the records of ``run_row``.
 
     The number of a model is its mean cost over episodes (for a perturbation, also over severities). The number of a
-    method is the interquartile mean over its models, with a stratified bootstrap interval over the models. The interval
-    of a single model is that of its mean over episodes, by the normal approximation, or Wilson's if all costs are 0
-    or 1 (failures): it is about this model, not about the method.
+    method is the interquartile mean over its models, with a stratified bootstrap interval over the models. If a method
+    has a single model, the interval is for this model, not for the method. It is the interval of the mean over
+    episodes: a normal approximation, or Wilson's interval if all costs are 0 or 1 (failures).
 
     :param records: The records of all rows.
     :param seed: Seed of the bootstrap.
@@ -90,7 +91,7 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
     levels, summaries, by_seed, by_row = [], [], {}, {}
     for label, of_model in records.groupby("model", sort=False):
         cube = _cube(of_model, rows)
-        # An episode begins in the same state in every row, and is averaged with itself.
+        # An episode begins in the same state in every row, so that its costs can be averaged over rows.
         cost = np.stack([cube[:, group].mean(axis=1) for group in groups.values()], axis=1)  # (S, G, E)
         added = cost - cube[:, plain].mean(axis=1, keepdims=True)
         is_share = bool(np.isin(cube, (0.0, 1.0)).all())
@@ -113,7 +114,7 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
 
 
 def _long(by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
-    """Turn arrays ``(S, rows)`` by method and name into a frame with a row for each model and row."""
+    """Convert the arrays of each method and name, ``(S, rows)``, to a frame with a row for each model and row."""
     frames = [
         pd.DataFrame(dict(model=label, train_seed=number, **keys, **{name: x[number] for name, x in arrays.items()}))
         for label, arrays in by_seed.items()
@@ -123,7 +124,7 @@ def _long(by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -
 
 
 def _lowest(summary: pd.DataFrame, by_seed: Mapping[str, Mapping[str, np.ndarray]]) -> np.ndarray:
-    """Tell for each method and group whether its cost is clearly lower than that of every other method."""
+    """Return for each method and group whether its cost is clearly below the cost of every other method."""
     n_groups = len(summary) // len(by_seed)
     low, high = (summary[name].to_numpy().reshape(len(by_seed), n_groups) for name in ("low", "high"))
     costs = [arrays["cost"] for arrays in by_seed.values()]
@@ -142,7 +143,7 @@ def _cube(of_model: pd.DataFrame, rows: pd.DataFrame) -> np.ndarray:
 
 
 def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
-    """Return the indices of the rows of each perturbation, by its name and kind."""
+    """Return the indices of each perturbation's rows; the keys are its name and kind."""
     groups = {key: group.index for key, group in rows.groupby(["perturbation", "kind"], sort=False)}
     perturbed = rows[rows["kind"].isin(PERTURBED)]
     if perturbed["perturbation"].nunique() > 1:
@@ -152,7 +153,7 @@ def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
 
 
 def _interval_columns(cube: np.ndarray, seed: int, is_share: bool = False, prefix: str = "") -> dict[str, np.ndarray]:
-    """Aggregate ``(S, G, E)`` over models: a column with the number, and two with the ends of its interval."""
+    """Aggregate ``(S, G, E)`` over models; return a column with the number and two with the ends of its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
     one = len(cube) == 1
     columns = _mean_of_one(cube[0], is_share) if one else interquartile_means(cube.mean(axis=2), seed)
@@ -170,15 +171,15 @@ def _mean_of_one(costs: np.ndarray, is_share: bool) -> tuple[np.ndarray, ...]:
     if not is_share:
         half = z * np.sqrt(variance / (n - 1))
         return mean, mean - half, mean + half
-    # Wilson's interval, with as many independent trials as give the mean this variance: n of a single row, more of
-    # several. No failure in n trials does not mean that there are none.
+    # Wilson's interval, for the number of independent trials that gives the mean this variance. One row has n trials,
+    # several rows have more. Zero failures in n trials do not mean that the failure rate is zero.
     trials = np.divide(n * mean * (1 - mean), variance, out=np.full_like(mean, n), where=variance > 0)
     center, half = mean + z**2 / (2 * trials), z * np.sqrt(mean * (1 - mean) / trials + (z / (2 * trials)) ** 2)
     return mean, *(np.clip((center + sign * half) / (1 + z**2 / trials), 0.0, 1.0) for sign in (-1, 1))
 
 
 def _compare(label: str, by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
-    """Compare a method with the first one."""
+    """Compare a method with the first method."""
     reference = next(iter(by_seed))
     frame = keys.assign(model=label, reference=reference)
     for name, costs in by_seed[label].items():

@@ -1,4 +1,4 @@
-"""The page of a report: compute its tables and verdicts, and fill the Markdown template."""
+"""Write the page of a report: compute its tables and verdicts, and fill the Markdown template."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED, Row
 from sb3_tdpg.robustness.registry import PERTURBATIONS
 
 MIN_SEEDS = 5
-"""With fewer models of a method, its interval is not reliable."""
+"""If a method has fewer models, its interval is not reliable."""
 
 
 @dataclass
@@ -24,22 +24,22 @@ class Knowledge:
     """The information in the TRVs of the first model of a method."""
 
     label: str
-    text: str  # the result in a line, or the reason why there is none
+    text: str  # the result in one line, or the reason why there is no result
     badge: str = ""  # table of the checks, in Markdown
     figures: Sequence[str] = ()
 
 
 @dataclass
 class Page:
-    """The content of a page beside its numbers."""
+    """The content of a page, except its numbers."""
 
     plan: Plan
     rows: Sequence[Row]
-    sources: Mapping[str, Sequence[str]]  # names of the models, by method
-    figures: Mapping[str, str]  # files: degradation, own_rows, comparison, examples
+    sources: Mapping[str, Sequence[str]]  # names of each method's models
+    figures: Mapping[str, str]  # the files of degradation, own_rows, comparison and examples
     knowledge: Sequence[Knowledge]
     made: str  # the last sentence
-    n_rows: int  # also those that are missing
+    n_rows: int  # including the missing rows
 
 
 def write_page(numbers: Numbers, page: Page) -> str:
@@ -65,7 +65,7 @@ def write_page(numbers: Numbers, page: Page) -> str:
 
 
 class Costs:
-    """Write all costs with the number of decimals that gives the unperturbed costs three significant digits."""
+    """Format costs with the number of decimals that gives the unperturbed costs three significant digits."""
 
     def __init__(self, numbers: Numbers) -> None:
         self.numbers = numbers
@@ -75,18 +75,18 @@ class Costs:
         self.digits = 3 if np.isnan(size) else int(np.clip(2 - np.floor(np.log10(size)), 1, 4))
 
     def number(self, value: float, sign: str = "") -> str:
-        """Write one number, as in ``31.0``."""
+        """Return a number as text, as in ``31.0``."""
         return f"{round(value, self.digits) + 0.0:{sign}.{self.digits}f}"  # + 0.0: no -0
 
     def cell(self, row: pd.Series, name: str = "iqm") -> str:
-        """Write a number and its interval, as in ``31.0 [30.1, 32.2]``; the interval is never broken across lines."""
+        """Return a number and its interval as text, as in ``31.0 [30.1, 32.2]``, without a line break in between."""
         sign = "" if name == "iqm" else "+"
         low, high = (row[end] if name == "iqm" else row[f"{name}_{end}"] for end in ("low", "high"))
         interval = "" if np.isnan(low) else f" [{self.number(low, sign)},\N{NO-BREAK SPACE}{self.number(high, sign)}]"
         return self.number(row[name], sign) + interval
 
     def sentence(self, name: str) -> str:
-        """Say what every method costs under a perturbation."""
+        """Return a sentence with the cost of every method under a perturbation."""
         return ", ".join(f"{escaped(m)} costs {self.cell(self.groups.loc[(m, name)])}" for m in self.numbers.models)
 
     def worst_case(self, label: str) -> dict[str, Any]:
@@ -125,7 +125,7 @@ class Costs:
 
 
 def _verdict(numbers: Numbers, label: str) -> dict[str, Any]:
-    """Say where a method is better than the first one."""
+    """Return where a method is better than the first method."""
     reference, names = numbers.models[0], numbers.perturbations
     ours, theirs = escaped(label), escaped(reference)
     sizes = [numbers.n_models(each) for each in (label, reference)]
@@ -142,7 +142,7 @@ def _by_word(words: pd.Series) -> dict[str, list[str]]:
 
 
 def _comparisons_table(numbers: Numbers) -> str:
-    """Make a table of how often a model is better than one of the first method; empty if nothing can be clear."""
+    """Make a table of how often a model beats a model of the first method; empty if no difference can be clear."""
     rows = []
     for row in numbers.comparisons.to_dict("records"):
         if numbers.can_be_clear(row["model"]):
@@ -154,13 +154,13 @@ def _comparisons_table(numbers: Numbers) -> str:
 
 
 def _share(row: Mapping[str, Any], name: str) -> str:
-    """Write a share of the pairs of models, with its p-value."""
+    """Return the share of the pairs of models as text, with its p-value."""
     share, p = row[f"p_{name}"], row[f"pvalue_{name}"]
     return "" if np.isnan(share) else f"{share:.0%} (p = {p:.2g})"
 
 
 def _severities_table(page: Page) -> str:
-    """Make a table of what the perturbations do, with the parameter of each severity; empty if there are none."""
+    """Make a table of the perturbations' effects, with the parameter of each severity; empty without perturbations."""
     lines = []
     perturbed = [row for row in page.rows if row.kind in PERTURBED]
     for name in dict.fromkeys(row.perturbation for row in perturbed):
@@ -186,7 +186,7 @@ def _severities_table(page: Page) -> str:
 
 
 def _models_table(page: Page) -> str:
-    """Make a table of the models, with their numbers in the records."""
+    """Make a table of the models, with each model's number in the records."""
     sources = page.sources.items()
     rows = [(escaped(label), str(i), f"`{name}`") for label, names in sources for i, name in enumerate(names)]
     return markdown_table(rows, ["method", "`train_seed` in the records", "model"])
@@ -194,9 +194,9 @@ def _models_table(page: Page) -> str:
 
 def to_html(markdown: str, folder: Path, title: str, *, reload: bool = False) -> str:
     """
-    Turn Markdown into an HTML page that contains its pictures; HTML in the Markdown is shown as text.
+    Convert Markdown to an HTML page that contains its pictures. HTML in the Markdown is shown as text.
 
-    :param reload: Whether the browser shall load the page again after some seconds.
+    :param reload: Whether the browser loads the page again after some seconds.
     """
     from markdown_it import MarkdownIt
 

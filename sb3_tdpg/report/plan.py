@@ -1,4 +1,4 @@
-"""Run the episodes of a report: every model in every row, in parallel, with a file for each finished row."""
+"""Run the episodes of a report: every model in every row, in parallel, with one file per finished row."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,11 +25,11 @@ from sb3_tdpg.report.rows import Row
 from sb3_tdpg.robustness import PerturbedVecEnv
 
 COLUMNS = ("episode", "cost", "length", "failure")
-"""The columns of :func:`~sb3_tdpg.evaluation.records.run_episodes` that are kept; ``failure`` only if it is known."""
+"""The columns of :func:`~sb3_tdpg.evaluation.records.run_episodes` that are kept; ``failure`` is kept if known."""
 
-SIDE_BY_SIDE = 50  # environments that are not of this package
-UNKNOWN_LENGTH = 1_000  # steps of an episode without a time limit
-N_TIMED = 20  # steps
+SIDE_BY_SIDE = 50  # number of parallel environments that are not from this package
+UNKNOWN_LENGTH = 1_000  # assumed steps of an episode without a time limit
+N_TIMED = 20  # number of steps that are timed
 MAX_EPISODES = {"image": 100}  # by kind of observation
 MAX_EPISODES_OF_OTHERS = 500
 
@@ -39,20 +39,20 @@ Models = Mapping[str, Sequence[Any]]
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings that all rows share."""
+    """The settings that all rows share."""
 
     env_id: str
-    env_kwargs: Mapping[str, Any]  # of the unperturbed environment
-    sources: Mapping[str, Sequence[Source]]  # by method; files, if several processes run them
-    n_episodes: int  # of each model in each row
-    seed: int  # of environments, policies and perturbations
+    env_kwargs: Mapping[str, Any]  # keywords of the unperturbed environment
+    sources: Mapping[str, Sequence[Source]]  # models of each method; files, if several processes run them
+    n_episodes: int  # for each model in each row
+    seed: int  # for environments, policies and perturbations
     deterministic: bool
-    scale: Any  # of the components of a vector, by key in a Dict, the same for all models; None for images
+    scale: Any  # scale of each vector component (for each key of a Dict), the same for all models; None for images
 
 
 def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
     """
-    Run every model in one row, with the same initial states and perturbations as far as the environment allows.
+    Run every model in one row; all models get the same initial states and perturbations if the environment allows it.
 
     The columns are ``model`` (the method), ``train_seed`` (the number of the model, from 0), ``perturbation``,
     ``severity`` and ``kind``, followed by :data:`COLUMNS`.
@@ -77,18 +77,18 @@ def default_episodes(kind: str | None, horizon: int | None, n_steps: int) -> int
     """
     Return how many episodes a budget of steps allows.
 
-    :param kind: of the observations
-    :param horizon: The longest episode, if there is a limit.
-    :param n_steps: The budget.
+    :param kind: Kind of the observations.
+    :param horizon: Maximum length of an episode, if there is a limit.
+    :param n_steps: The budget of steps.
     """
     most = MAX_EPISODES.get(kind or "", MAX_EPISODES_OF_OTHERS)
     n = max(1, min(most, n_steps // (horizon or UNKNOWN_LENGTH)))
-    # Each environment runs the same number of episodes: 53 of them would run one after the other.
+    # Each environment runs the same number of episodes, so that 53 episodes would run in a single environment.
     return n if n <= SIDE_BY_SIDE else n - n % SIDE_BY_SIDE
 
 
 def seconds_of_a_row(plan: Plan, row: Row, models: Models, horizon: int | None) -> float:
-    """Estimate how long a row takes at most, from some steps of the first model of each method."""
+    """Estimate the maximum time of a row from some steps of the first model of each method."""
     total = 0.0
     with threads(1):
         for first, *others in models.values():
@@ -105,7 +105,7 @@ def seconds_of_a_row(plan: Plan, row: Row, models: Models, horizon: int | None) 
 
 
 def missing_rows(rows: Sequence[Row], folder: Path) -> list[Row]:
-    """Return the rows that have no file in a folder yet."""
+    """Return the rows that do not have a file in a folder yet."""
     return [row for row in rows if not (folder / row.file_name).exists()]
 
 
@@ -120,9 +120,9 @@ def complete_rows(
     at_row: Callable[[Mapping[Row, pd.DataFrame]], Any] = lambda records: None,
 ) -> pd.DataFrame:
     """
-    Run the rows that have no file in a folder yet, and return the records of all rows.
+    Run the rows that do not have a file in a folder yet, and return the records of all rows.
 
-    :param at_row: Called with the records of the finished rows whenever a row is finished.
+    :param at_row: Function that is called after each finished row, with the records of all finished rows.
     """
     missing = missing_rows(rows, folder)
     finished = {row: _read_row(row, folder) for row in rows if row not in missing}
@@ -141,7 +141,7 @@ def complete_rows(
 
 
 def _read_row(row: Row, folder: Path) -> pd.DataFrame:
-    # "1" or "None" may be the name of a method or of a row.
+    # These columns are read as text, because "1" or "None" can be the name of a method or of a row.
     names = dict.fromkeys(("model", "perturbation", "kind"), str)
     return pd.read_csv(folder / row.file_name, dtype=names, keep_default_na=False, na_values=[""])
 

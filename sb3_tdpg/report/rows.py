@@ -1,4 +1,4 @@
-"""List the rows of a report: the unperturbed environment, each perturbation by severity, and the own test rows."""
+"""List the rows of a report: the unperturbed environment, the perturbations by severity, and the test rows."""
 
 import hashlib
 import json
@@ -16,7 +16,7 @@ from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS, find_appli
 UNPERTURBED = "unperturbed"
 ALL = "all perturbations"
 PERTURBED = ("sensor", "plant", "scene")
-"""The kinds of rows with severities: other observations, other actions, other keywords of the environment."""
+"""The kinds of rows with severities. They change observations, actions, or keywords of the environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Row:
     """One condition in which every model is run."""
 
     perturbation: str  # its name, or the title of a test row of the environment
-    severity: int  # 1 to 5, and 0 if there are no severities
+    severity: int  # 1 to 5, or 0 if the row has no severity
     kind: str  # "unperturbed", "own" (a test row of the environment), or one of PERTURBED
     scenario: Scenario
     value: float | None = None  # the parameter of a perturbation of sensor or plant
@@ -36,7 +36,7 @@ class Row:
 
     @property
     def file_name(self) -> str:
-        """The file name of its records, which changes with the environment and with the value of the severity."""
+        """The name of the file with the row's records; it depends on the environment and on the severity's value."""
         slug = "".join(c if c.isalnum() else "-" for c in self.title.lower())
         env: list[Any] = [self.scenario.env_id, self.scenario.env_kwargs]
         if self.scenario.sensor is not None:
@@ -81,11 +81,11 @@ def make_rows(
             else:
                 kind = "plant" if found.kind == "action" else "sensor"
                 rows.append(Row(name, severity, kind, plain, found.value(severity)))
-    # The first row of a table of the paper is the training row.
+    # The first row is left out, because in a table of the paper it is the training row.
     for own in PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:] if scenarios is None else scenarios:
         kept = replace(own, env_kwargs={**env_kwargs, **own.env_kwargs}, n_episodes=None)
         rows.append(Row(own.name, 0, "own", kept))
-    # In the tables the name of a perturbation stands for all its severities, and ALL for all perturbations.
+    # In the tables, the name of a perturbation means all its severities, and ALL means all perturbations.
     titles = [row.title for row in rows]
     groups = {ALL, *(row.perturbation for row in rows if row.kind != "own")}
     twice = {row.title for row in rows if row.kind == "own"} & groups

@@ -1,4 +1,4 @@
-"""Train, watch, tune and plot from the command line: the programs of rl-zoo3 with TDPG among the algorithms."""
+"""Train, watch, tune and plot from the command line, with the programs of rl-zoo3 and TDPG as an algorithm."""
 
 from sb3_tdpg.zoo.manager import register
 

@@ -1,4 +1,4 @@
-"""The experiment manager of rl-zoo3, extended for the environments and the algorithm of this plugin."""
+"""Extend the experiment manager of rl-zoo3 to the environments and the algorithm of this package."""
 
 import copy
 import inspect
@@ -39,9 +39,9 @@ from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import batched_class, largest_divisor, make_episodes_env
 
 CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
-# A checkpoint resets the environments: rare enough not to matter, frequent enough to lose little.
+# A checkpoint resets the environments, so checkpoints are rare, but frequent enough that an interrupt loses little.
 CHECKPOINT_EPOCHS = 10
-# Keys whose text the zoo evaluates.
+# Keys whose text the zoo evaluates as Python code.
 EVALUATED = {"monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
 KEYWORDS_OF = {"monitor_kwargs": Monitor, "normalize": VecNormalize}
 # Keys that the zoo itself reads; all others are arguments of the algorithm.
@@ -52,15 +52,15 @@ ZOO_KEYS = (
 
 
 def find_file(algo: str, block: str) -> str | None:
-    """Return the path of this plugin's file for an algorithm if it has that block, otherwise ``None``."""
+    """Return the path of this package's file for an algorithm if the file has the block, or else ``None``."""
     path = resources.files(yaml_files).joinpath(f"{algo}.yml")
     if algo == "tdpg" or (path.is_file() and block in yaml.safe_load(path.read_text(encoding="utf-8"))):
-        return str(path)  # the zoo has no file for tdpg
+        return str(path)  # for tdpg the zoo has no file of its own
     return None
 
 
 def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
-    """Refuse unknown keys, and numbers that YAML reads as text; ``where`` names the block in the message."""
+    """Raise an error for unknown keys and wrong values in a block; ``where`` names the block in the message."""
     cls = ALGOS[algo]
     arguments = {name for base in cls.__mro__[:-1] for name in inspect.signature(base).parameters}
     if unknown := sorted(set(block) - set(ZOO_KEYS) - arguments):
@@ -88,7 +88,7 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
     for key, value in block.items():
         try:
             _read(key, value)
-        except Exception as e:  # it may be code
+        except Exception as e:  # the value can be code, which can raise any error
             reason = " ".join(str(e).split())
             raise ValueError(f"{where} has {key}: {value!r}, which rl-zoo3 cannot read ({reason}): correct it") from e
     for key in ("seed", "device", "verbose"):
@@ -99,7 +99,7 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
 
 
 def _read(key: str, value: Any) -> None:
-    """Read a value as the zoo does, whose errors do not name the key."""
+    """Read a value as the zoo does, to find errors early: the zoo's messages do not name the key."""
     if key in EVALUATED and isinstance(value, str):
         value = eval(value, vars(rl_zoo3.exp_manager))
     if key in KEYWORDS_OF and isinstance(value, dict):
@@ -116,16 +116,16 @@ class TDPGExperimentManager(ExperimentManager):
     """
     Set up and run one training of rl-zoo3.
 
-    - Environments of this plugin run as a :class:`~sb3_tdpg.vec_env.BatchedVecEnv`, for every algorithm, unless
+    - Every algorithm runs environments of this package as a :class:`~sb3_tdpg.vec_env.BatchedVecEnv`, unless
       ``--vec-env subproc`` or wrappers of single environments are given.
-    - Blocks of this plugin's files are found without ``--conf-file``, and are checked before anything is written.
-    - The evaluation environment gets the ``env_kwargs`` of the block unless it is given its own.
-    - TDPG is evaluated with the stochastic policy that it trains.
-    - An interrupted training of TDPG leaves a checkpoint to resume from, a finished one the policy that the
-      :class:`~sb3_tdpg.SelectionCallback` of its block selected.
+    - Blocks in this package's files are found without ``--conf-file``, and are checked before any file is written.
+    - The evaluation environment gets the ``env_kwargs`` of the block unless other keywords are given for it.
+    - The evaluation of TDPG uses the stochastic policy that is trained.
+    - An interrupted training of TDPG leaves a checkpoint from which it can be resumed. A finished training leaves the
+      policy that the :class:`~sb3_tdpg.SelectionCallback` of its block selected.
     """
 
-    # The zoo has no flags for these: a program sets them in a subclass.
+    # The zoo has no flags for these values: a program sets them in a subclass.
     block: str | None = None
     resume: Path | None = None
     arguments: tuple[str, ...] = ()
@@ -146,20 +146,20 @@ class TDPGExperimentManager(ExperimentManager):
             self.continue_training = True
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """Create the environment and the model; if this fails, remove the folder that was made for them."""
+        """Create the environment and the model; if this fails, remove the folder that was created for them."""
         was_there = os.path.exists(self.save_path)
         try:
             return super().setup_experiment()
         except BaseException:
             if self.has_claimed:
                 shutil.rmtree(self.save_path, ignore_errors=True)
-            elif not was_there:  # another process may have begun there meanwhile
+            elif not was_there:  # another process may have started to use the folder in the meantime
                 with suppress(OSError):
                     os.rmdir(self.save_path)
             raise
 
     def create_log_folder(self) -> None:
-        """Make the folder of the training; of several processes that start at once, each gets a number of its own."""
+        """Create the folder of the training; processes that start at the same time get different numbers."""
         while not (self.has_claimed or self.resume is not None or self.optimize_hyperparameters):
             try:
                 os.makedirs(self.save_path)
@@ -172,7 +172,7 @@ class TDPGExperimentManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read and check the block of hyperparameters."""
         env_name, block = self.env_name, self.block or self.env_name.gym_id
-        self.env_name = EnvironmentName(block)  # the name by which the zoo looks the block up
+        self.env_name = EnvironmentName(block)  # the zoo searches for the block by this name
         try:
             hyperparams, saved = super().read_hyperparameters()
         except (OSError, ValueError, TypeError, AttributeError, yaml.YAMLError) as e:  # TypeError: an empty block
@@ -197,13 +197,13 @@ class TDPGExperimentManager(ExperimentManager):
     def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
         if self.algo != "tdpg":
             return super()._preprocess_schedules(hyperparams)
-        # Not the zoo's class, without which the model could not be loaded; it also takes no end other than 0.
+        # The zoo's class is not used: its schedules always end at 0, and loading a model with it needs the zoo.
         names = {"learning_rate", "clip_range"} & set(hyperparams)
         return {**hyperparams, **{name: schedule_of(name, hyperparams[name]) for name in names}}
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if self.algo == "tdpg" and "n_envs" not in hyperparams:
-            # The keywords of the command line replace those of the block.
+            # Keywords from the command line replace those of the block.
             env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs")
             hyperparams["n_envs"] = self._default_n_envs(env_kwargs, hyperparams)
         processed, wrap, *others = super()._preprocess_hyperparams(hyperparams)
@@ -224,13 +224,13 @@ class TDPGExperimentManager(ExperimentManager):
             raise ValueError(f"{self.env_name.gym_id} cannot be made with env_kwargs={env_kwargs}: {e}") from e
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """Create the environments, as a batch where this is possible."""
+        """Create the environments, as a batch if this is possible."""
         if self.is_batch and self.env_wrapper is None:
             is_logged = not (eval_env or no_log or self.optimize_hyperparameters)
             env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
             self.vec_env_class = partial(self._make_batch, env_kwargs, is_logged)  # type: ignore[assignment]
         elif self.resume is not None and not (eval_env or no_log):
-            # Monitor would begin its files anew: those of the first start get higher numbers.
+            # Monitor would overwrite its files, so the files of the first start get higher numbers.
             logs = {int(path.name.partition(".")[0]): path for path in Path(self.save_path).glob("*.monitor.csv")}
             for number, path in sorted(logs.items(), reverse=True):
                 path.rename(path.with_name(f"{number + n_envs}.monitor.csv"))
@@ -245,13 +245,13 @@ class TDPGExperimentManager(ExperimentManager):
         # A resumed training logs its episodes to another file; the zoo's plots read all files of a folder.
         n_logs = len(list(Path(self.save_path).glob("*.monitor.csv")))
         with warnings.catch_warnings():
-            # The batch reports the returns of its episodes itself, but does not write them to a file.
+            # The batch already reports the returns of its episodes, but it does not write them to a file.
             warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Monitor`")
             file = os.path.join(self.save_path, str(n_logs)) if is_logged else None
             return VecMonitor(env, file, tuple(self.monitor_kwargs.get("info_keywords", ())))
 
     def create_callbacks(self) -> None:
-        """Create the callbacks. TDPG's write the selected policy and the checkpoint to the folder of the training."""
+        """Create the callbacks; those of TDPG write the selected policy and the checkpoint to the training's folder."""
         super().create_callbacks()
         if self.algo != "tdpg" or self.optimize_hyperparameters:
             return
@@ -271,12 +271,12 @@ class TDPGExperimentManager(ExperimentManager):
                 assert isinstance(model, TDPG)
                 n_timesteps, kwargs["reset_num_timesteps"] = model.remaining_timesteps, False
                 for callback in self.callbacks:
-                    callback.n_calls = model.num_timesteps // model.n_envs  # its rhythm
+                    callback.n_calls = model.num_timesteps // model.n_envs  # keeps the interval between evaluations
                     if isinstance(callback, EvalCallback):
                         _go_on_evaluating(callback, model.num_timesteps)
             try:
                 model.learn(n_timesteps, **kwargs)
-            except KeyboardInterrupt:  # the zoo swallows it
+            except KeyboardInterrupt:  # the zoo catches this exception without raising it again
                 self.is_interrupted = True
                 raise
 
@@ -284,7 +284,7 @@ class TDPGExperimentManager(ExperimentManager):
         super().learn(SimpleNamespace(env=model.env, policy=model.policy, learn=learn))  # type: ignore[arg-type]
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """Save the model, at the end of a training with the policy that was selected."""
+        """Save the model; after a finished training it has the selected policy."""
         selections = [] if self.is_interrupted else [c for c in self.callbacks if isinstance(c, SelectionCallback)]
         for selection in selections:
             assert isinstance(model, TDPG)
@@ -304,7 +304,7 @@ class TDPGExperimentManager(ExperimentManager):
         raise KeyboardInterrupt
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        if self.resume is None:  # otherwise the record of the first start stays
+        if self.resume is None:  # a resumed training keeps the record of the first start
             super()._save_config(saved_hyperparams)
             env_id = self.env_name.gym_id
             config: dict[str, Any] = dict(algo=self.algo, env_id=env_id, block=self.block or env_id, seed=self.seed)
@@ -314,7 +314,7 @@ class TDPGExperimentManager(ExperimentManager):
 
 def register(manager: type[ExperimentManager] = TDPGExperimentManager) -> None:
     """
-    Add TDPG to the algorithms of rl-zoo3 in this process: its programs then accept ``--algo tdpg``.
+    Add TDPG to the algorithms of rl-zoo3 in this process, so that rl-zoo3's programs accept ``--algo tdpg``.
 
     :param manager: The experiment manager that ``train`` uses.
     """
@@ -327,7 +327,11 @@ def _without_addresses(settings: Mapping[str, Any]) -> Any:
 
 
 def _without_drawing(evaluate: Callable[[], bool]) -> Callable[[], bool]:
-    """Evaluate without a change of the training's random numbers: a resumed training evaluates other episodes."""
+    """
+    Return an evaluation that does not change the training's random numbers.
+
+    A resumed training evaluates other episodes, but it must draw the same random numbers.
+    """
 
     def apart() -> bool:
         with th.random.fork_rng():
@@ -337,7 +341,7 @@ def _without_drawing(evaluate: Callable[[], bool]) -> Callable[[], bool]:
 
 
 def _go_on_evaluating(callback: EvalCallback, n_timesteps: int) -> None:
-    """Keep the evaluations before a checkpoint, and the best model."""
+    """Restore the evaluations before a checkpoint, and the best reward, in a resumed callback."""
     path = Path(f"{callback.log_path}.npz")
     if callback.log_path is None or not path.exists():
         return
@@ -348,7 +352,7 @@ def _go_on_evaluating(callback: EvalCallback, n_timesteps: int) -> None:
         callback.evaluations_length = found["ep_lengths"][kept].tolist()
         if "successes" in found:
             callback.evaluations_successes = found["successes"][kept].tolist()
-        # The best model may be of an evaluation after the checkpoint.
+        # The best model may come from an evaluation after the checkpoint.
         callback.best_mean_reward = float(found["results"].mean(axis=1).max())
 
 

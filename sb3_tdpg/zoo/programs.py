@@ -1,4 +1,4 @@
-"""The command-line programs of rl-zoo3, with a few flags of this plugin in front of the zoo's."""
+"""Run the command-line programs of rl-zoo3 with a few additional flags of this package."""
 
 import argparse
 import json
@@ -19,12 +19,12 @@ from rl_zoo3.utils import StoreDict
 from sb3_tdpg.common.trust import PlainLoader, check_plain, say_what_is_trusted
 from sb3_tdpg.zoo.manager import CHECKPOINT, RECORD, TDPGExperimentManager, register
 
-# The information cannot be measured with five episodes, the zoo's default.
+# The zoo's default of five episodes is too small to measure the information.
 TUNING_DEFAULTS = ("--eval-episodes", "200", "--n-trials", "50", "--num-threads", "1", "--verbose", "0")
 HELP = {"-h", "--help"}
 LOGS, FILES = ("-tb", "--tensorboard-log"), ("-conf", "--conf-file", "-i", "--trained-agent", "--storage")
-BLOCK = dict(help="block of hyperparameters (default: that of the environment)")
-# The flags of each program beside the zoo's.
+BLOCK = dict(help="block of hyperparameters (default: the environment's block)")
+# The additional flags of each program.
 FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "train": {
         "--block": BLOCK,
@@ -34,15 +34,15 @@ FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "--block": BLOCK,
         "--objective": dict(
             choices=("information", "shift"),
-            help="of TDPG: the least information under the cost limit, or the least cost under --eval-env-kwargs "
-            "(default if they are given)",
+            help="for TDPG: minimise the information under the cost limit, or the cost under --eval-env-kwargs "
+            "(default if these are given)",
         ),
-        "--cost-limit": dict(type=float, help="on the expected cost (default: the block's, or the environment's)"),
-        "--space": dict(type=Path, metavar="FILE", help="search space like hyperparams/tdpg-search.yml"),
+        "--cost-limit": dict(type=float, help="limit on the expected cost (default: from the block or environment)"),
+        "--space": dict(type=Path, metavar="FILE", help="search space, in the form of hyperparams/tdpg-search.yml"),
     },
     "plot": {
         "--kind": dict(choices=("train", "from-file", "all"), default="train", help="which plot of the zoo"),
-        "--save": dict(type=Path, metavar="FILE", help="write the figure there instead of showing it"),
+        "--save": dict(type=Path, metavar="FILE", help="write the figure to this file instead of showing it"),
     },
 }
 
@@ -51,25 +51,25 @@ def run(program: str, arguments: Sequence[str]) -> None:
     """
     Run a program of the zoo (``train``, ``tune``, ``enjoy``, ``record-video`` or ``plot``) with its flags and ours.
 
-    :raises ValueError: if the zoo refuses them.
+    :raises ValueError: if the zoo does not accept the arguments.
     """
     given, flags = _split(program, arguments)
     register()
-    # The programs of the zoo read their flags from there.
+    # The zoo's programs read their flags from sys.argv.
     argv, sys.argv = sys.argv, [f"sb3-tdpg {program}"]
     try:
         if program in ("enjoy", "record-video"):
             _watch(program.replace("-", "_"), given, flags)
         else:
             dict(train=_train, tune=_tune, plot=_plot)[program](given, flags)
-    except (AssertionError, yaml.YAMLError, gym.error.Error) as e:  # the zoo refuses bad input with these
+    except (AssertionError, yaml.YAMLError, gym.error.Error) as e:  # the zoo raises these for bad input
         raise ValueError(" ".join(str(e).split())) from e
     finally:
         sys.argv = argv
 
 
 class _PlainDict(StoreDict):
-    """Reads ``key:value``; the zoo evaluates the value, so it must be plain data."""
+    """Parse ``key:value`` and accept only plain data, because the zoo evaluates the value as code."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
         for text in values:
@@ -80,7 +80,7 @@ class _PlainDict(StoreDict):
 def _split(
     program: str, arguments: Sequence[str], keywords: type[StoreDict] = StoreDict
 ) -> tuple[argparse.Namespace, list[str]]:
-    """Return the values of our flags, and the remaining flags, which are the zoo's."""
+    """Return the values of our flags, and the remaining flags, which are for the zoo."""
     ours = argparse.ArgumentParser(f"sb3-tdpg {program}", add_help=False, allow_abbrev=False)
     for flag, options in FLAGS.get(program, {}).items():
         ours.add_argument(flag, **options)
@@ -104,7 +104,7 @@ def _split(
 
 
 def _say_what_is_loaded(flags: list[str], *paths: str | Path) -> None:
-    """Name the files that the program trusts; with ``--help`` it loads none."""
+    """Print the files that the program trusts, except with ``--help``, which loads no file."""
     if not HELP & set(flags):
         say_what_is_trusted(*paths)
 
@@ -114,14 +114,15 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
         raise ValueError("train does not tune TDPG: use `sb3-tdpg tune` with the same flags, but without -optimize")
     folder, seed = given.resume, []
     rl_zoo3.train.StoreDict = StoreDict if folder is None else _PlainDict  # type: ignore[misc]
-    _say_what_is_loaded(flags, *(flag for flag in flags if flag.endswith(".zip")))  # of -i
+    _say_what_is_loaded(flags, *(flag for flag in flags if flag.endswith(".zip")))  # the values of -i
     if folder is not None:
         record = _read_record(folder, bool(flags or given.block))
         say_what_is_trusted(folder)
         given, flags = _split("train", record["arguments"], _PlainDict)
-        seed = ["--seed", str(record["seed"])]  # it was drawn if none was given
+        seed = ["--seed", str(record["seed"])]  # a random seed if the first start gave none
     typed = ["--block", given.block, *flags] if given.block else flags
-    # --resume works in any folder. What does not exist is a package or the address of a database.
+    # Paths become absolute, so that --resume works in any folder. A word that is not an existing path is the name of a
+    # package or the address of a database.
     recorded = [
         os.path.abspath(word) if flag in LOGS or (flag in FILES and os.path.exists(word)) else word
         for flag, word in zip(["", *typed], typed, strict=False)
@@ -135,7 +136,7 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
             if self.algo == "tdpg" and self.storage and self.study_name:
                 from sb3_tdpg.zoo.tuning import block_of_trial
 
-                # Not in the zoo's way, which takes number 0 for no number, and then loads no trial.
+                # The zoo's own code treats trial number 0 as no number and then loads no trial.
                 trial = block_of_trial(self.storage, self.study_name, self.trial_id)
                 self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
                 self.trial_id = None
@@ -146,7 +147,7 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
 
 
 def _read_record(folder: Path, has_flags: bool) -> dict[str, Any]:
-    """Return how the training in a folder was started, if it can be resumed."""
+    """Return the record of how the training in a folder was started; raise an error if it cannot be resumed."""
     if not (folder / RECORD).exists():
         raise ValueError(f"--resume {folder} is not the folder of a training: it has no {RECORD}")
     try:
@@ -178,11 +179,11 @@ def _tune(given: argparse.Namespace, flags: list[str]) -> None:
 
 
 def _watch(program: str, given: argparse.Namespace, flags: list[str]) -> None:
-    """Find models where ``train`` saves them, and let TDPG act with the stochastic policy that it trained."""
+    """Run ``enjoy`` or ``record-video`` on models in ``train``'s folder, with the stochastic policy for TDPG."""
     is_stochastic = given.algo == "tdpg" and "--deterministic" not in flags
     _say_what_is_loaded(flags, given.folder)
     sys.argv += ["--algo", "tdpg", "-f", "logs", *(["--stochastic"] if is_stochastic else []), *flags]
-    unsafe, yaml.UnsafeLoader = yaml.UnsafeLoader, PlainLoader  # the zoo's would run what a file says
+    unsafe, yaml.UnsafeLoader = yaml.UnsafeLoader, PlainLoader  # the zoo's loader would run code in a file
     try:
         runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
     except (EOFError, pickle.UnpicklingError) as e:
@@ -197,7 +198,7 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
 
     sys.argv += [*(["-a", "tdpg", "-f", "logs"] if given.kind == "train" else []), *flags]
     if given.save is not None:
-        plt.switch_backend("agg")  # the plots end with plt.show(), which does nothing here
+        plt.switch_backend("agg")  # the plots end with plt.show(), which does nothing with this backend
         warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
     if given.kind == "from-file":
         _say_what_is_loaded(flags, *(flag for flag in flags if Path(flag).is_file()))
@@ -213,5 +214,5 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
             raise ValueError(f"`{' '.join(flags)}` gives an empty figure: {mend}")
         given.save.parent.mkdir(parents=True, exist_ok=True)
         plt.savefig(given.save, dpi=150)
-        plt.close()  # the next plot would draw over it
+        plt.close()  # otherwise the next plot would draw into this figure
         print(f"the figure is in {given.save}")

@@ -1,4 +1,4 @@
-"""The search space of ``tune``: read from YAML, sampled by Optuna, put into a block."""
+"""Read the search space of ``tune`` from YAML, sample it with Optuna, and put the values into a block."""
 
 import copy
 import inspect
@@ -17,14 +17,14 @@ from sb3_tdpg.tdpg import TDPG
 
 Space = Mapping[str, Mapping[str, Any]]
 
-WEIGHT = "mi_coef"  # stands for beta, see tdpg-search.yml
+WEIGHT = "mi_coef"  # this name of the space sets beta, see tdpg-search.yml
 
 
 def read_space(path: Path | None = None) -> Space:
     """
     Read and check a search space.
 
-    :param path: A file; default: ``hyperparams/tdpg-search.yml``.
+    :param path: The file; default: ``hyperparams/tdpg-search.yml``.
     :raises ValueError: if the space is malformed.
     """
     file = resources.files(hyperparams).joinpath("tdpg-search.yml") if path is None else path
@@ -60,13 +60,13 @@ def _check_range(where: str, entry: Any) -> None:
 
 
 def relevant(space: Space, block: Mapping[str, Any]) -> Space:
-    """Remove the weight of the information from a space if the block's beta leaves no choice of it."""
+    """Remove the weight of the information from a space if the block's beta determines this weight."""
     is_fixed = block.get("beta") in (None, "auto", math.inf)
     return {name: entry for name, entry in space.items() if not (name == WEIGHT and is_fixed)}
 
 
 def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
-    """Sample a value for each name."""
+    """Sample a value for each name in the space."""
 
     def suggest(name: str, entry: Mapping[str, Any]) -> Any:
         if "choices" in entry:
@@ -79,9 +79,9 @@ def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
 
 def put_in(block: Mapping[str, Any], values: Mapping[str, Any], cost_scale: float) -> dict[str, Any]:
     """
-    Return a block with the values of :func:`sample` in it; the other ``policy_kwargs`` of the block stay.
+    Return a copy of a block with the values of :func:`sample`; its other ``policy_kwargs`` do not change.
 
-    :param cost_scale: Unit of :data:`WEIGHT`: the absolute value of the cost limit.
+    :param cost_scale: The unit of :data:`WEIGHT`, which is the absolute value of the cost limit.
     """
     block = {**block, "policy_kwargs": copy.deepcopy(dict(block.get("policy_kwargs") or {}))}
     for name, value in values.items():

@@ -1,9 +1,10 @@
 """
-Hyperparameter tuning with Optuna through the zoo.
+Tune hyperparameters with Optuna through the zoo.
 
-Tuning on the reward alone would remove the bottleneck, since its penalty costs reward in the training environment.
-Hence there are two objectives: ``information`` is the least information under a limit on the expected cost (the paper's
-rule for selecting a policy), ``shift`` the least expected cost in an environment other than the training environment.
+Tuning on the reward alone would remove the information penalty, because the penalty lowers the reward in the training
+environment. So there are two other objectives. ``information`` minimises the information under a limit on the expected
+cost, which is the paper's rule for selecting a policy. ``shift`` minimises the expected cost in an environment that
+differs from the training environment.
 """
 
 import contextlib
@@ -32,15 +33,15 @@ from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
 
 N_EVALUATIONS = 10
-BEHIND = "behind the others"  # why a trial is pruned that could be trained
+BEHIND = "behind the others"  # reason why a trial without an error is pruned
 RECORD = "study.json"  # settings of a study, in the folder of its results
-COST, INFORMATION = "cost", "information"  # attributes of a trial; cost minus limit is also a constraint
+COST, INFORMATION = "cost", "information"  # attributes of a trial; cost minus limit is also its constraint
 
 
 class TuningManager(TDPGExperimentManager):
-    """Tune TDPG. Other algorithms are tuned as the zoo does it."""
+    """Tune TDPG for its own objectives, and other algorithms as the zoo does."""
 
-    # Set by the program, since the zoo has no flags for them.
+    # The program sets these, because the zoo has no flags for them.
     objective_kind: str | None = None
     cost_limit: float | None = None
     space_path: Path | None = None
@@ -67,20 +68,20 @@ class TuningManager(TDPGExperimentManager):
         self.space: Space = read_space(self.space_path)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Read the block and find the limit on the cost; see the zoo."""
+        """Read the block and find the limit on the cost; see the base class."""
         block, saved = super().read_hyperparameters()
         if self.algo == "tdpg":
             self.settings = copy.deepcopy(dict(saved))
-            if self.env_kwargs:  # of the command line, which the zoo adds to a block that has some
+            if self.env_kwargs:  # from the command line and the block; the zoo merges them
                 self.settings["env_kwargs"] = dict(self.env_kwargs)
-            if self.n_timesteps > 0:  # decides the schedules
+            if self.n_timesteps > 0:  # the schedules depend on it
                 self.settings["n_timesteps"] = self.n_timesteps
             policy_kwargs = self.settings.get("policy_kwargs")
-            if isinstance(policy_kwargs, str):  # as on the command line, and in the zoo's own files
+            if isinstance(policy_kwargs, str):  # the command line and the zoo's own files give text
                 self.settings["policy_kwargs"] = eval(policy_kwargs, {"nn": th.nn})
             try:
                 yaml.safe_dump(self.settings)
-            except yaml.YAMLError as e:  # before the trials rather than after them
+            except yaml.YAMLError as e:  # raised before the trials instead of after them
                 reason = " ".join(str(e).split())
                 raise ValueError(f"tune writes the best block as YAML, which this one has no form in: {reason}") from e
             self.space = relevant(self.space, block)
@@ -106,7 +107,7 @@ class TuningManager(TDPGExperimentManager):
         raise ValueError(f"tuning needs {needed}, a finite number other than 0: give --cost-limit")
 
     def objective(self, trial: optuna.Trial) -> float:
-        """Train with the hyperparameters that a trial samples; return the value to be minimised."""
+        """Train with the hyperparameters that a trial samples; return the value that is minimised."""
         if self.algo != "tdpg":
             return super().objective(trial)
         assert self.cost_limit is not None
@@ -121,7 +122,7 @@ class TuningManager(TDPGExperimentManager):
             contextlib.closing(self.create_envs(self.n_eval_episodes, eval_env=True)) as eval_env,
         ):
             model = TDPG(env=env, seed=trial.number, device=self.device, **hyperparams)
-            model.set_logger(Logger(None, []))  # SB3 would make a folder in /tmp for each trial
+            model.set_logger(Logger(None, []))  # SB3's own logger would create a folder in /tmp for each trial
             is_constrained = self.objective_kind == "information"
             limit = self.cost_limit if is_constrained else math.inf
             measuring = _Measuring(trial, eval_env, limit, self.n_timesteps // self.n_evaluations)
@@ -138,7 +139,7 @@ class TuningManager(TDPGExperimentManager):
             return information if is_constrained else cost
 
     def hyperparameters_optimization(self) -> None:
-        """Run trials, side by side with other workers, until the study has as many as asked for."""
+        """Run trials, in parallel with other workers, until the study has the requested number."""
         if self.algo != "tdpg":
             super().hyperparameters_optimization()
             return
@@ -147,7 +148,7 @@ class TuningManager(TDPGExperimentManager):
         description: dict[str, Any] = {name: getattr(self, name) for name in names}
         description.update(env_id=self.env_name.gym_id, objective=self.objective_kind, block=self.settings)
         record = Path(self.save_path, RECORD)
-        if Path(self.storage) != record.with_name("study.log"):  # that one names the study in its message
+        if Path(self.storage) != record.with_name("study.log"):  # for this file, open_study() checks the settings
             check_same_config(record, dict(study=self.study_name, **description), "study")
         self._check_trials()
         sampler, pruner = self._create_sampler(self.sampler), self._create_pruner(self.pruner)
@@ -157,7 +158,7 @@ class TuningManager(TDPGExperimentManager):
         self._write_results(study, description)
 
     def _check_trials(self) -> None:
-        """Refuse before the first trial what would prune all of them."""
+        """Raise an error before the first trial for settings with which every trial would be pruned."""
         self.create_envs(1, eval_env=True).close()
         with contextlib.closing(self.create_envs(self.n_envs, no_log=True)) as env:
             model = TDPG(env=env, device=self.device, **self._hyperparams)
@@ -173,7 +174,7 @@ class TuningManager(TDPGExperimentManager):
         if self.algo != "tdpg" or sampler_method != "tpe":
             return super()._create_sampler(sampler_method)
         options: dict[str, Any] = dict(n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True)
-        # As the zoo's, except that workers which choose at the same time avoid each other's running trials.
+        # Like the zoo's sampler, except that workers avoid points near the running trials of other workers.
         return optuna.samplers.TPESampler(**options, constant_liar=True)
 
     def _write_results(self, study: optuna.Study, description: dict[str, Any]) -> None:
@@ -202,11 +203,11 @@ class TuningManager(TDPGExperimentManager):
 
 
 class _Measuring(BaseCallback):
-    """Measure cost and information on fresh episodes at intervals, and stop a training that falls behind others."""
+    """Measure cost and information on fresh episodes at intervals, and stop a training that the pruner rejects."""
 
     def __init__(self, trial: optuna.Trial, env: VecEnv, limit: float, interval: int) -> None:
         super().__init__()
-        # With an infinite limit the cost itself is minimised. The interval is in environment steps.
+        # With an infinite limit the cost is minimised instead of the information. The interval is in environment steps.
         self.trial, self.env, self.limit, self.interval = trial, env, limit, interval
         self.is_pruned, self.last, self._next, self._n_reports = False, (math.inf, math.inf), interval, 0
 
@@ -234,7 +235,11 @@ class _Measuring(BaseCallback):
 
 
 def _rank(cost: float, information: float, limit: float) -> float:
-    """Order policies: those that meet the limit first, below 1, by their information; then the others by their cost."""
+    """
+    Return a number that orders policies; lower is better.
+
+    Policies that meet the limit have values below 1, ordered by information. All other policies are ordered by cost.
+    """
     if math.isinf(limit):
         return cost
     if cost <= limit:
@@ -251,11 +256,11 @@ def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
 
 def block_of_trial(storage: str, study_name: str, number: int | None = None) -> dict[str, Any]:
     """
-    Return the hyperparameters of a trial of :class:`TuningManager`; default: the best one.
+    Return the hyperparameters of a trial of :class:`TuningManager`; default: the best trial.
 
     :raises ValueError: if there is no such study or trial.
     """
-    if "://" not in storage and not Path(storage).exists():  # opening it would make the file
+    if "://" not in storage and not Path(storage).exists():  # opening it would create the file
         raise ValueError(f"there is no storage {storage}: give the --storage that tune was run with")
     try:
         study = optuna.load_study(study_name=study_name, storage=open_storage(storage))
