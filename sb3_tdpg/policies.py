@@ -46,8 +46,8 @@ MAX_ACTION_VAR = math.exp(8)
 
 class TRVPolicy(BasePolicy):
     r"""
-    Policy with encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head :math:`\pi^\psi(u_t | \tilde
-    x_t)`.
+    Policy with encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head
+    :math:`\pi^\psi(u_t | \tilde x_t)`.
 
     Encoder and action head are diagonal Gaussians; for a discrete action space the head is SB3's distribution. The
     action head gets only the TRVs. At the first step of an episode the previous TRVs are zero.
