@@ -7,7 +7,7 @@ import warnings
 
 LEAST_SLACK = 0.01  # smallest slack as a share of the limit or the improvement, since costs scatter
 RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
-MAX_GROWTH = 1000.0  # relative to the starting weight; if no information is needed, w would grow forever
+MAX_GROWTH = 1000.0  # largest ratio of w to its start; without it, w grows forever if no information is needed
 # The following constants are for a limit that is a share of the improvement.
 WINDOW = 5  # number of epochs over which a cost is averaged
 LEVEL_EPOCHS = 10  # a cost has levelled off if it falls by less than the slack in this many epochs
@@ -41,12 +41,12 @@ class AutoWeight:
     weight also grows more slowly than it shrinks, ``clip(., -3, 0.3)``, because a policy loses its return within a few
     epochs and takes many epochs to recover it.
 
-    **A share s of the improvement** as the limit needs no cost in advance: C = first - s * (first - best). Here
-    ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs so far. The
-    weight starts when this mean cost has levelled off (it falls by less than C - best in ten epochs), and at the latest
-    in the middle of the training. An earlier start would change the attainable cost. In the second half of the training
-    the weight grows more and more slowly, so that the last policy has settled. Costs may have either sign. A share
-    implies ``by_slack``.
+    If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
+    best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs
+    so far. The weight starts when this mean cost has levelled off (it falls by less than C - best in ten epochs), and
+    at the latest in the middle of the training. An earlier start would change the attainable cost. In the second half
+    of the training the weight grows more and more slowly, so that the last policy has settled. Costs may have either
+    sign. A share implies ``by_slack``.
 
     :param cost_limit: C, or a share such as ``"95%"``.
     :param by_slack: See above.
@@ -64,7 +64,7 @@ class AutoWeight:
         self.by_slack = by_slack or self.share is not None
         self.first_cost = first_cost
         self.limit = math.nan if isinstance(cost_limit, str) else cost_limit
-        """C; NaN while it is a share and fewer than five epochs have been run."""
+        """C; NaN if a share is given and fewer than five epochs have been run."""
         self.value = 0.0
         """w = 1 / beta, in units of cost per nat."""
         self.information_before: float | None = None
@@ -121,7 +121,7 @@ class AutoWeight:
         return len(self._costs) == WINDOW + LEVEL_EPOCHS and before - smoothed < slack
 
     def kept(self) -> str | None:
-        """Describe how much information the last epoch kept, as in ``"12.1 of 20.3 nats kept, ..."``, if known."""
+        """Describe how much information the last epoch kept, as in ``"12.1 of 20.3 nats kept, ..."``, or ``None``."""
         if self.information_before is None:
             return None
         cost, information = self._last

@@ -44,7 +44,7 @@ class EpisodeBatch(NamedTuple):
     means: th.Tensor  #: ``(T, N, Z)`` of q(x~_t | x~_{t-1}, y_t)
     stds: th.Tensor  #: ``(T, N, Z)``
     actions: th.Tensor  #: ``(T, N, U)``, u_t before clipping
-    costs: th.Tensor  #: ``(T, N)``, zero after the end
+    costs: th.Tensor  #: ``(T, N)``, zero after the end of the episode
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
     advantages: th.Tensor  #: ``(T, N)``, zero until they are computed
     prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at t = 0

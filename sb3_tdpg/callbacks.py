@@ -106,8 +106,9 @@ class SelectionCallback(TDPGCallback):
     :param save_path: File of the selected model (``.zip``); a ``.json`` file beside it holds the epoch, cost and
         information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; in training, if a
-        ``VecNormalize`` normalises the observations: the policy can do so itself (``normalize_observations``).
+    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; at the start of a training,
+        also if a ``VecNormalize`` normalises the observations. The policy can normalise them itself
+        (``normalize_observations``).
     """
 
     def __init__(

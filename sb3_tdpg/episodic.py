@@ -81,7 +81,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     information: np.ndarray | None = None
     """Estimate of I[x_t; x~_t] for the last rollouts in nats, ``(T,)``; None without a penalty."""
     normalizes: bool = False
-    """Whether the environment of the training normalised observations (``VecNormalize``)."""
+    """Whether the training environment normalised observations (``VecNormalize``)."""
     _random_state: RandomState | None = None
     _problem: Problem | None = None
 
@@ -168,7 +168,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self._last_obs
 
     def _steps_of_this_epoch(self) -> int:
-        """Return its steps: with ``epoch_steps`` at most the remaining ones, but at least a tenth of an epoch."""
+        """Return the steps of this epoch: with ``epoch_steps`` those left, but at least a tenth of an epoch."""
         size = self.epoch_size
         if self.epoch == 0:
             return size
@@ -264,7 +264,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         if self.env is None:
             raise ValueError("the model has no environment to learn in: set_env(...) first, or load(path, env=...)")
-        self._last_obs = None  # somebody may have stepped the environments since the last epoch
+        self._last_obs = None  # a user may have stepped the environments since the last epoch
         if reset_num_timesteps:
             self.epoch = 0
             self._current_progress_remaining = 1.0

@@ -17,7 +17,7 @@ def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.T
     depend on the sample at t, such as past costs or a baseline of the state, leaves the expected gradient unchanged.
 
     :param log_prob: log-probabilities at the *stored* samples, ``(T, N)``
-    :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
+    :param advantages: of costs, not rewards: positive values are worse than expected, ``(T, N)``
     :param alive: ``(T, N)``
     :return: scalar
     """
@@ -29,8 +29,7 @@ def clipped_policy_loss(
     log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor, clip_range: float
 ) -> th.Tensor:
     """
-    Return PPO's surrogate (Schulman et al., 2017) for costs: the maximum of the plain and the clipped ratio times the
-    advantage.
+    Return PPO's surrogate loss (Schulman et al., 2017) for costs: the maximum of its plain and its clipped term.
 
     At ``log_prob == old_log_prob`` its gradient is that of :func:`policy_gradient_loss`. It allows several updates on
     the same rollouts, because a sample has no gradient once its ratio has left ``[1 - clip_range, 1 + clip_range]`` in
@@ -38,7 +37,7 @@ def clipped_policy_loss(
 
     :param log_prob: log-probabilities under the current policy, ``(T, N)``
     :param old_log_prob: log-probabilities under the policy of the rollouts, ``(T, N)``
-    :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
+    :param advantages: of costs, not rewards: positive values are worse than expected, ``(T, N)``
     :param alive: ``(T, N)``
     :param clip_range: Largest change of the probability ratio.
     :return: scalar

@@ -39,7 +39,7 @@ from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, PolicyDefaults, default, fill_in_extractor, fill_in_trvs
 
-# They limit the standard deviation of a TRV to 7.4 and that of an action to 55.
+# These limits allow standard deviations of up to 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
 
@@ -328,7 +328,7 @@ class TRVPolicy(BasePolicy):
         return self._action_distribution(self.action_head.at_times(trv, t))
 
     def update_statistics(self, batch: EpisodeBatch) -> None:
-        """Update the statistics that standardise observations and changes, if there are any, with an epoch."""
+        """Update the statistics of observations and changes, if there are any, with an epoch."""
         if self.norm is not None:
             self.norm.update(batch.observations, batch.alive)
         if self.changes is not None:

@@ -58,9 +58,9 @@ VECTOR = Defaults(
     gae_lambda=0.3,  # with 0.95, policies on Lava remain bad open-loop policies
 )
 
-# Images are expensive. An epoch therefore has few episodes and several passes as in PPO, and the gradient is the one
-# with the least variance. An untrained policy costs a hundred times as much as a trained one, so a policy with 95 % of
-# the improvement would be bad.
+# Images are expensive. An epoch therefore has few episodes and several passes, as in PPO, with the pathwise gradient,
+# which has the least variance. An untrained policy costs a hundred times as much as a trained one, so a policy with 95
+# % of the improvement would be bad.
 IMAGE = Defaults(
     beta="auto",
     share="99.8%",

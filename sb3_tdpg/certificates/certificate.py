@@ -68,7 +68,7 @@ def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | No
     Compute the entropic risk (Equation 4), :math:`\frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
 
     :param costs: ``(N,)``
-    :param beta: At least 0; 0 gives the limit, the mean.
+    :param beta: At least 0; 0 gives the mean, which is the limit.
     :param probabilities: Probabilities of the costs, ``(N,)``; default: 1 / N each.
     """
     costs = _checked_costs(costs)
@@ -98,10 +98,10 @@ def cost_distribution(
     Bound the distribution of the cost from above by a confidence band around a sample of costs.
 
     For the i-th lowest of N costs, :math:`F(c_{(i)})` is stochastically above a Beta(i, N + 1 - i) variable. The lower
-    quantiles at ``1 - confidence``, divided by the number of ranks i that are used, hold simultaneously (Bonferroni).
-    The step function through these quantiles is a lower bound on F. The remaining probability above the highest cost,
-    about ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. The band bounds the mean of every increasing
-    function simultaneously, so the entropic risk may be optimised over beta.
+    quantiles at ``1 - confidence`` divided by the number of used ranks hold simultaneously (Bonferroni). The step
+    function through these quantiles is a lower bound on F. The remaining probability above the highest cost, about
+    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. The band bounds the mean of every increasing function
+    simultaneously, so the entropic risk may be optimised over beta.
 
     :param costs: Independent and identically distributed, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.

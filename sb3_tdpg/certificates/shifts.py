@@ -45,7 +45,7 @@ from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
 INFORMATION_EPISODES = 4_000  # number of episodes for the bound on the information
-EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of the episodes with a capped divergence to try
+EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of episodes with a capped divergence that are tried
 
 _START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
 
@@ -133,7 +133,7 @@ def lava_shift(
     start_beta: Sequence[float] | None = None,
     training_noise_std: float = 0.01,
 ) -> Shift:
-    """Declare a shift of the lava problem from a uniform start, no bias and the sensor noise of the training."""
+    """Declare a shift of the lava problem; training has a uniform start, no bias and its own sensor noise."""
     noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
     bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
     given = dict(sensor_noise_std=sensor_noise_std, sensor_bias=sensor_bias, start_beta=start_beta)
@@ -168,7 +168,7 @@ def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.0
 
 class TrainingEpisodes:
     """
-    Record training episodes of a policy, whose states the sensors of shifted environments observe.
+    Record training episodes of a policy; a shifted sensor then observes the recorded states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
     :param scenario: The training environment, one of this package.

@@ -17,7 +17,7 @@ from torch import nn
 
 # Above this horizon the steps share their weights: one set per step would be slow and would get too few samples.
 MAX_TIME_VARYING_HORIZON = 50
-VECTOR = 64  # a multiple of the vector length of any processor, in numbers
+VECTOR = 64  # a multiple of the vector length of any processor, in floats
 
 
 class BatchedLinear(nn.Module):

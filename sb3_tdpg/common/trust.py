@@ -21,7 +21,7 @@ _PLAIN_NODES = (
 
 
 def say_what_is_trusted(*paths: str | os.PathLike[str]) -> None:
-    """Warn that loading the models in these files or folders can run code; to be called before they are loaded."""
+    """Warn that loading the models in these files or folders can run code; call it before they are loaded."""
     if not paths:
         return
     names = ", ".join(os.fspath(path) for path in paths[:3]) + f" and {len(paths) - 3} more" * (len(paths) > 3)

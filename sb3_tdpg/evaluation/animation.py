@@ -190,7 +190,7 @@ def _write_gif(video: _Video, path: Path, fps: float) -> None:
     images, durations = [], []
     for is_last in video.frames():
         images.append(video.image())
-        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; shorter ones are slowed
+        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; viewers slow shorter frames
     save_gif(path, images, durations)
 
 

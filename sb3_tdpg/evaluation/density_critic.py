@@ -208,8 +208,7 @@ def _choose_ridge(
     """
     n = len(targets)
     projections, leverages = basis.T @ targets, np.square(basis)
-    # The part outside the basis. The computation uses complements, since 1 - h loses digits where a kernel
-    # interpolates.
+    # This is the part outside the basis. It uses complements, since 1 - h loses digits where a kernel interpolates.
     beyond, spare = targets - basis @ projections, np.maximum(1 - leverage - leverages.sum(axis=1), 1e-12)
     choices, residuals = [np.zeros_like(values)], [otherwise]
     for ridge in RIDGES:

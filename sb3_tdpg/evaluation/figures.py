@@ -61,7 +61,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     figure, ((axes,),) = new_panels(WIDTH * 0.75, 3.4)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
     axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
-    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # visible also with one step
+    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # so that a single step is visible, too
     axes.plot(t, frame[["lower", "upper"]], color=PALETTE[1], linewidth=0.8)
     for limit, markers in BOUNDS.items():
         for name, (marker, label) in markers.items():
@@ -125,7 +125,7 @@ def short_name(row: str) -> str:
 def legend_above(figure: Figure, axes: Axes, most: int = 3) -> None:
     """Draw the legend of the axes above the figure, in at most ``most`` columns."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = -(-len(labels) // -(-len(labels) // most))  # as few rows as possible, evenly filled
+    columns = -(-len(labels) // -(-len(labels) // most))  # use as few rows as possible, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 

@@ -21,9 +21,9 @@ class InformationCallback(TDPGCallback):
     time steps at which the component varies. Components are named as in the environment's ``state_names``, without the
     unit, or ``x0``, ``x1``, ...; long keys are left out on the console.
 
-    If the time steps share their weights, the samples are one random step of each episode, since the steps of an
-    episode are not independent. Every episode then counts the same. An epoch with too few episodes is skipped with a
-    warning.
+    If the time steps share their weights, the interval uses one random step of each episode, since the steps of an
+    episode are not independent. Every episode then has the same weight. An epoch with too few episodes is skipped with
+    a warning.
 
     :param eval_freq: Number of epochs from one interval to the next, beginning with the first epoch.
     :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.

@@ -104,8 +104,8 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     Hunter's inequality (1976, Journal of Applied Probability 13(3)) bounds this probability by the sum of the single
     probabilities minus the joint probabilities of the first Gaussian with each other one. With Owen's function T, the
     bound for c standard errors is :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully
-    correlated Gaussians give the quantile of a single Gaussian, independent ones about that of Bonferroni. ``miss``
-    must be below 0.5.
+    correlated Gaussians give the quantile of a single Gaussian, and independent ones about Bonferroni's quantile.
+    ``miss`` must be below 0.5.
     """
     from scipy.optimize import brentq
 
@@ -189,10 +189,11 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
 
     Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of the
     error probability, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
-    contributions of episodes, where means that are too low come with standard errors that are too small. The spent
-    probabilities also depend on the gap between the estimates (``miss_of_each_limit``). Each limit is valid for all
-    bounds of its side together, because the tightest bound is chosen (``joint_quantile``). The confidence holds for
-    each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot exceed about ``ln(N^2 / 10)``.
+    contributions of episodes, where means that are too low come with standard errors that are too small. The
+    probabilities of the two limits also depend on the gap between the estimates (``miss_of_each_limit``). Each limit is
+    valid for all bounds of its side together, because the tightest bound is chosen (``joint_quantile``). The confidence
+    holds for each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot exceed about
+    ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
     :param confidence: Minimum probability that the interval of a step contains the true value.

@@ -50,7 +50,7 @@ class Estimate(NamedTuple):
 
 
 def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
-    """Draw the encoder's noise again at one time step, ``(1, n, ...)``; the first draw is the one of the rollout."""
+    """Draw the encoder's noise again at one time step, ``(1, n, ...)``; the first draw is that of the rollout."""
     states, trvs, means, stds = (x[0].detach().cpu().numpy().astype(np.float64) for x in batch[:4])
     n, dim = means.shape
     # Each noise is used with both signs, which cancels linear terms.
@@ -81,7 +81,7 @@ def noise_controls(step: Encoded) -> np.ndarray:
 
 class FreshPairs:
     """
-    Collect scores F of frozen critics on fresh episodes, among n, and on all pairs of fresh episodes.
+    Collect the scores F of frozen critics on fresh episodes and on all their pairs, for n episodes.
 
     Scores are clipped from above so that single pairs do not dominate the mean of e^F. A clipped critic is a valid
     critic, too.

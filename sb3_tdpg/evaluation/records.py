@@ -46,9 +46,9 @@ def evaluate_scenarios(
     environment reports ``info["is_success"]``, there is also a column ``failure``.
 
     The same seed gives the same frame. In a scenario all models start from the same initial states, and they meet the
-    same noise if the number of random numbers that the environment draws does not depend on the actions. All scenarios
-    of one environment also share their initial states and noise in this way. The global random generators are restored
-    at the end.
+    same noise if the number of random numbers that the environment draws does not depend on the actions. Under the same
+    condition, all scenarios of one environment share their initial states and noise. The global random generators are
+    restored at the end.
 
     :param model: One SB3 model, or a mapping from labels to models.
     :param scenarios: The scenarios to run, in the order of the rows.
@@ -100,7 +100,7 @@ def run_episodes(
     n_episodes = scenario.n_episodes or n_episodes
     env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES))
     returns, monitored = np.zeros(env.num_envs), is_monitored(env)
-    ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and environment
+    ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and the environment
     with contextlib.closing(env):
         for step in rollout(model, env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic):
             returns += step.rewards

@@ -1,7 +1,7 @@
 """
 Compute statistics over a few training seeds with rliable.
 
-They follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
+The statistics follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
 """
 
 from collections.abc import Callable, Sequence

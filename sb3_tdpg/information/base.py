@@ -102,4 +102,4 @@ class InformationEstimator(nn.Module):
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        """Estimate all steps (None: ``(T, N, ...) -> (T,)``) or step t (``(1, n, ...) -> (1,)``), if all are alive."""
+        """Estimate all steps (None: ``(T, N, ...) -> (T,)``) or step t (``(1, n, ...) -> (1,)``) of living episodes."""

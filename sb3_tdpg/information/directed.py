@@ -26,8 +26,8 @@ class DirectedLogDet(LogDet):
         \le \sum_t \tfrac12 \log\det \mathrm{Cov}(\tilde x_t - A_t \tilde x_{t-1})
         - E[\textstyle\sum_i \log \sigma_i(e_t)]
 
-    with the matrix A_t of a linear regression. The last step holds because a Gaussian has the largest entropy, and
-    because the best linear prediction leaves at least the variance of the best prediction. A bit that is kept for T
+    with the matrix A_t of a linear regression. The last inequality holds because a Gaussian has the largest entropy,
+    and because the best linear prediction leaves at least the variance of the best prediction. A bit that is kept for T
     steps costs one bit here, and T bits in the sum over time of I[x_t; x~_t]. This estimate is no bound on that sum.
     """
 

@@ -9,7 +9,7 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 class LogDet(InformationEstimator):
     r"""
-    Bound the information by the entropy of a Gaussian, the largest of all densities with the same covariance.
+    Bound the information by the entropy of a Gaussian, which is the largest for a given covariance.
 
     With the encoder's input e_t = (x~_{t-1}, y_t),
 

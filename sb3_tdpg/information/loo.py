@@ -47,7 +47,7 @@ def own_sample_bound(batch: InformationBatch) -> th.Tensor:
         \frac{q(\tilde x_i | e_i)}{\frac1N \sum_j q(\tilde x_i | e_j)}\right], \qquad e_t = (\tilde x_{t-1}, y_t).
 
     The bound is InfoNCE with the optimal critic, and is at most ln N. If the encoder's input is a function of the state
-    (no memory, T = 1, and no sensor noise), it is also a bound on :math:`I[x_t; \tilde x_t]`.
+    (no memory, T = 1, and no sensor noise), it is also a lower bound on :math:`I[x_t; \tilde x_t]`.
 
     :return: ``(T,)``, nats
     """

@@ -40,7 +40,7 @@ class VariationalBottleneck(InformationEstimator):
     too low for d TRVs, per component.
 
     :param n_components: Number of Gaussians K in the prior of a time step.
-    :raises ValueError: if it is not an integer of at least 1.
+    :raises ValueError: if ``n_components`` is not an integer of at least 1.
     """
 
     bound = "upper"

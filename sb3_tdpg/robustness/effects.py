@@ -148,7 +148,7 @@ def texture_overlay(images: np.ndarray, opacity: float, episode: Episode, rng: n
 
 
 def draw_shift(rng: np.random.Generator, n: int, distance: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw the direction in which the camera of each episode turns, and shift by whole pixels."""
+    """Draw the shift of each episode's images, in a random direction and in whole pixels."""
     _, *lengths = sensor.shape
     angle = rng.uniform(0, 2 * np.pi, n)
     shift = max(1.0, distance * lengths[0]) * np.stack([np.sin(angle), np.cos(angle)])

@@ -37,8 +37,8 @@ class Family:
       :func:`~sb3_tdpg.robustness.training.noise_range`; and ``"env_kwargs"`` with a list of keywords for other scenes
       of the environment, whose sensors observe the same state (with ``"redraw"``: names of components of the state that
       the scenes draw anew for each episode);
-    - a list of entries: ``(name, value)``, with a value as in a dict, ``(name, value, factor)``, with a factor for the
-      scale, or ``None`` for no perturbation;
+    - a list of entries, each ``(name, value)`` with a value as in a dict, ``(name, value, factor)`` with a factor for
+      the scale, or ``None`` for no perturbation;
     - a function ``(observations (n, *obs), rng) -> changed observations``, called at each step.
 
     :param declared: The declaration, see above.
@@ -128,7 +128,7 @@ class Family:
         if found.kind == "action":
             space, scale = env.action_space, np.ones(env.action_space.shape or ())
         elif not found.timing and (found.kind != "image" or self._given_scale is not None):
-            of_parts = self._measured_scale  # not used for images alone, since it takes steps of the environment
+            of_parts = self._measured_scale  # not needed for images alone; measuring takes steps of the environment
             scale = None if of_parts is None else each_part(lambda part: factor * part, of_parts)
         sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, attribute_of(env, "observation_groups"))
         return [partial(Perturber, found, severity, sensor) for severity in range(low, high + 1)]
@@ -186,7 +186,7 @@ class OneOf(Members):
 
 
 class FunctionMembers(Members):
-    """Replace the observations by the result of a function of them and a random generator."""
+    """Replace the observations by the result of a user's function of observations and random generator."""
 
     def __init__(
         self, function: Callable[[Any, np.random.Generator], Any], n: int, *, seed: int | None = None, part: str = ""

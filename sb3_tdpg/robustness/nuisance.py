@@ -25,7 +25,7 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
 
     :param declared: ``None``: no nuisance. ``"auto"``: see :func:`automatic`. Otherwise a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`; a name alone stands for all its severities.
-    :raises ValueError: if nothing of this name exists or applies.
+    :raises ValueError: if a perturbation does not exist or does not apply.
     """
     while isinstance(env, NuisanceVecEnv):
         env = env.venv

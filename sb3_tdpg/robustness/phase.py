@@ -61,7 +61,7 @@ class NuisancePhase(TDPGCallback):
     :param nuisance: ``"auto"``: random changes of images of bytes, which an episode keeps; otherwise a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`.
     :param n_steps: Gradient steps of a phase.
-    :raises ValueError: if nothing of this name exists or applies, or the rollouts are perturbed.
+    :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed.
     """
 
     optimizer: th.optim.Optimizer
@@ -114,7 +114,7 @@ class NuisancePhase(TDPGCallback):
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
     def _cut(self, batch: Any, observations: Any) -> Any:
-        """Cut whole episodes with these observations into the segments that the policy learns from, if any."""
+        """Replace the observations of whole episodes, and cut them into segments if the policy learns from segments."""
         model: Any = self.tdpg
         batch = batch._replace(observations=observations)
         return batch if model.policy.time_varying else batch.segments(model.bptt_steps or len(batch.costs))

@@ -168,7 +168,7 @@ Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each severity
 # The true state, and with it the task, must not change, so no row moves a mug.
 SCENES: dict[str, dict[str, Severities]] = {
     "BallCatch-v0": {
-        # Another texture, blended into the training texture.
+        # A higher severity blends more of another texture into the training texture.
         "texture": tuple(dict(texture=f"{share}%-turquoise_waves") for share in (20, 40, 60, 80, 100)),
         # By default the camera is 2 m high and looks up by 30 degrees.
         "camera_pose": tuple(

@@ -85,7 +85,7 @@ def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None)
     Return the scale of a vector's components, or of the vectors in a ``Dict`` by key; ``None`` if there is no vector.
 
     A component with finite bounds has the standard deviation of a uniform distribution between them,
-    :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The others are measured by :func:`observation_scale`.
+    :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The other components are measured by :func:`observation_scale`.
 
     :param scale: The user's scale, which is used instead: a number, or one for each component; for a ``Dict`` also by
         key.

@@ -60,7 +60,7 @@ def images(
             raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
 
     def changes(rng: np.random.Generator, n: int, shape: Sequence[int]) -> dict[str, np.ndarray]:
-        """Draw n changes of images ``(C, H, W)``: everything but the noise at each pixel."""
+        """Draw n changes of images ``(C, H, W)``, except the noise at each pixel."""
         channels, height, width = shape
 
         def uniform() -> np.ndarray:
