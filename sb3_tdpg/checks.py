@@ -22,7 +22,7 @@ from sb3_tdpg.information import get_estimator_class
 
 ENCODER_GRADIENTS = ("score", "pathwise")
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-VAST = 1e6  # bounds of this size count as missing
+LARGEST = 1e18  # the square of a larger number is not finite in float32
 MIN_BATCH_STEPS = 32  # the information is estimated from the steps of a minibatch
 
 # Arguments of PPO and RecurrentPPO, and their equivalents in TDPG.
@@ -246,9 +246,9 @@ def check_action_space(space: spaces.Space) -> None:
         names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
         raise ValueError(f"the action space {space} is not supported: use one of {names}")
     check_start("action", space)
-    if isinstance(space, spaces.Box) and not (np.abs([space.low, space.high]) < VAST).all():
+    if isinstance(space, spaces.Box) and not (np.abs([space.low, space.high]) <= LARGEST).all():
         raise ValueError(
-            f"the action space {space} has infinite bounds, or of {VAST:g} and more: give it finite ones, for instance "
+            f"the action space {space} has infinite bounds, or above {LARGEST:g}: give it finite ones, for instance "
             "with gymnasium.wrappers.RescaleAction or in the environment itself; actions beyond them are clipped"
         )
 

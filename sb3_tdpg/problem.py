@@ -18,16 +18,13 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, VecEnvWrapper, VecMonitor
 
-from sb3_tdpg.checks import check_start
+from sb3_tdpg.checks import LARGEST, check_start
 from sb3_tdpg.features import observation_kind
 
 BRING_THE_STATE = (
     "give the environment an attribute `state_space` (a Box) and put a copy of the true state into "
     'info["state"] in both reset() and step()'
 )
-
-# The square of a larger number is not finite in float32.
-LARGEST = 1e18
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ ARGUMENTS = {
     "batch_size of one episode": (dict(batch_size=5), "batch_size=5", "between 10 and 100", "two episodes at least"),
     "bptt_steps none": (dict(bptt_steps=0), "bptt_steps=0", "integer of at least 1"),
     "actions without bounds but in name": (
-        dict(env=toy_vec_env(action_space=spaces.Box(-1e30, 1e30, (1,)))), "infinite bounds, or of 1e.06 and more"
+        dict(env=toy_vec_env(action_space=spaces.Box(-1e30, 1e30, (1,)))), "infinite bounds, or above 1e.18"
     ),
     "actions that begin with 1": (
         dict(env=toy_vec_env(action_space=spaces.MultiDiscrete([2, 3], start=[1, 1]))), "must begin with 0"

@@ -225,8 +225,8 @@ def test_the_statistics_that_lie_beside_a_model_are_used(name, statistics, tmp_p
     env = VecNormalize(make_vec_env("Lava-v0", 2, seed=0), norm_reward=False)
     model = PPO("MlpPolicy", env, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu").learn(100)
     folder = tmp_path / "Lava-v0_1"
+    (folder / "Lava-v0").mkdir(parents=True)
     model.save(folder / name)
-    (folder / "Lava-v0").mkdir()
     env.save(folder / statistics)
     loaded = load_model(folder / f"{name}.zip", "Lava-v0", {}).get_vec_normalize_env()
     np.testing.assert_array_equal(loaded.obs_rms.mean, env.obs_rms.mean)

@@ -180,6 +180,7 @@ def test_enjoy_without_the_ending_of_the_file_says_what_it_takes(here, capsys):
     assert "give the .zip file" in error_line(capsys, "enjoy", "logs/tdpg_lava", "--env", "Lava-v0")
 
 
+@pytest.mark.filterwarnings("ignore:No artists with labels")
 def test_plot_and_video_of_a_training(here, capsys):
     main(["train", *SHORT])
     assert main(["plot", "-e", "Lava-v0", "--save", "curve.png"]) == 0
