@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-# In a checkout envs/ and hyperparams/ lie beside this folder, in a wheel inside it. When the checkout itself is on
-# sys.path (as the working directory, or by PYTHONPATH), no finder knows that they are part of this package.
+# In a checkout, envs/ and hyperparams/ lie beside this folder; in a wheel, they lie inside it. If the checkout itself
+# is on sys.path (as the working directory, or by PYTHONPATH), Python does not find them as parts of this package.
 _package = Path(__file__).resolve().parent
 for _name in ("envs", "hyperparams"):
     _init = _package.parent / _name / "__init__.py"
@@ -59,7 +59,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    # torch takes seconds: it is imported with the first class that needs it, not to print a help text.
+    # Importing torch takes seconds, so it happens only when a class that needs torch is used.
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

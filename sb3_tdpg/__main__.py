@@ -1,4 +1,4 @@
-"""``python -m sb3_tdpg``."""
+"""Run the command line: ``python -m sb3_tdpg``."""
 
 import sys
 

@@ -1,5 +1,5 @@
 """
-Advantages: costs minus a baseline, which weight the log-probabilities in the policy gradient.
+Compute advantages (costs minus a baseline), which weight the log-probabilities in the policy gradient.
 
 Dimension key: T horizon, N episodes, X state, F features.
 """
@@ -18,21 +18,21 @@ from sb3_tdpg.common.running_norms import Changes, RunningNorm
 from sb3_tdpg.losses import cost_to_go
 
 N_CENTRES = 20
-# For a regression that all time steps share: it has more samples, and they are further apart.
+# Number of centres of a regression that all time steps share. It has more samples, which lie further apart.
 N_SHARED_CENTRES = 100
-N_PASSES, BATCH_SIZE = 10, 64  # of a value network, over the steps of an epoch
+N_PASSES, BATCH_SIZE = 10, 64  # passes over an epoch's steps, and minibatch size, of the value network
 
 AdvantageFunction = Callable[..., th.Tensor]
-"""``(costs, states, alive, gamma, gae_lambda) -> advantages``, see the functions below."""
+"""``(costs, states, alive, gamma, gae_lambda) -> advantages``; see the functions below."""
 
 
 def episode_mean_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Subtract the batch mean from the cost of the whole episode, as in the paper: ``(T, N)``.
+    Return the cost of each episode minus the mean over the batch, as in the paper: ``(T, N)``.
 
-    The arguments are those of :func:`regression_advantages`; states and ``gae_lambda`` are unused.
+    The arguments are those of :func:`regression_advantages`; ``states``, ``alive`` and ``gae_lambda`` are unused.
     """
     episode_cost = cost_to_go(costs, gamma)[0]
     return (episode_cost - episode_cost.mean()).expand_as(costs)
@@ -42,22 +42,22 @@ def regression_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Estimate advantages (GAE, Schulman et al., 2016) with a value V_t(x_t) of the true state, one regression per step.
+    Estimate advantages (GAE, Schulman et al., 2016) with one regression V_t(x_t) on the true state per time step.
 
-    Beyond a horizon of 50 all time steps share one regression on the state and the remaining horizon: a few long
-    episodes have many samples, but few at each step.
+    Above a horizon of 50, all time steps share one regression on the state and the remaining horizon, because a few
+    long episodes have many samples in total but few at each step.
 
-    With ``gae_lambda=1`` this is the cost-to-go minus its regression on the state. Only the baseline uses the true
-    state, and x_t precedes the noise of step t, so that the gradient stays unbiased. Each half of the episodes is
-    predicted from the other half: no episode's own cost enters its baseline. A smaller ``gae_lambda`` replaces later
-    costs by V, which has less noise but ignores the policy's memory: it credits the TRVs too little for what they carry
-    from step to step.
+    With ``gae_lambda=1`` an advantage is the cost-to-go minus its regression on the state. The gradient stays unbiased,
+    because only the baseline uses the true state, and x_t precedes the noise of step t. Each half of the episodes is
+    predicted from the other half, so no episode's own cost enters its baseline. A smaller ``gae_lambda`` replaces later
+    costs by V. This value has less noise but ignores the policy's memory, so the TRVs (task-relevant variables) get too
+    little credit for the information that they carry from step to step.
 
     :param costs: ``(T, N)``
     :param states: x_t, ``(T, N, X)``
     :param alive: ``(T, N)``
-    :param gamma: discount
-    :param gae_lambda: 1: the observed costs; 0: the value of the next state instead of all later costs
+    :param gamma: discount factor
+    :param gae_lambda: 1 uses the observed costs; 0 uses the value of the next state instead of all later costs
     :return: ``(T, N)``
     """
     targets = cost_to_go(costs, gamma)
@@ -83,16 +83,16 @@ def generalised_advantages(costs: th.Tensor, values: th.Tensor, gamma: float, ga
 
 class ValueFunction(nn.Module):
     """
-    A network V_t(x_t) of the true state and the time left, fitted to each epoch's rollouts.
+    A network for the cost-to-go V_t(x_t), given the true state and the remaining time, fitted to each epoch's rollouts.
 
-    Unlike the regressions above it keeps what it has learnt in earlier epochs, so that a few long episodes suffice.
-    Only the baseline uses it, not the policy, so the true state may be unknown to the robot (an asymmetric critic,
+    Unlike the regressions, the network keeps what it has learnt in earlier epochs, so a few long episodes per epoch
+    suffice. Only the baseline uses the network. The robot therefore need not know the true state (asymmetric critic,
     Pinto et al., 2018).
 
     :param state_dim: X
     :param horizon: T
-    :param with_changes: Whether the network also sees the changes of the state since the last step, as far as they add
-        information (:class:`~sb3_tdpg.common.running_norms.Changes`): for observations that stand in for the state.
+    :param with_changes: Whether the network also gets the informative part of the state's change since the last step
+        (:class:`~sb3_tdpg.common.running_norms.Changes`). It is meant for observations that stand in for the state.
     """
 
     def __init__(self, state_dim: int, horizon: int, with_changes: bool = False) -> None:
@@ -115,11 +115,11 @@ class ValueFunction(nn.Module):
         self, costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
     ) -> th.Tensor:
         """
-        Fit the network to an epoch, and estimate its advantages (GAE) with the new values.
+        Fit the network to an epoch, then estimate the epoch's advantages (GAE) with the new values.
 
-        The values of the last epoch would be those of another policy. The new ones have seen the costs that they are
-        compared with: a bias that is small where an epoch has many episodes. The arguments are those of
-        :func:`regression_advantages`.
+        The values from before the fit belong to an older policy. The new values were fitted to the same costs that they
+        are compared with, which causes a bias. This bias is small if an epoch has many episodes. The arguments are
+        those of :func:`regression_advantages`.
 
         :return: ``(T, N)``
         """
@@ -141,7 +141,7 @@ class ValueFunction(nn.Module):
 
     def _inputs(self, states: th.Tensor, gamma: float) -> th.Tensor:
         left = self.horizon - th.arange(len(states), device=states.device)
-        # The discounted number of steps that are left, as a share of that at the start.
+        # The discounted number of remaining steps, relative to its value at the start.
         share = left / self.horizon if gamma == 1 else (1 - gamma**left) / (1 - gamma**self.horizon)
         states = self.norm(states)
         inputs = [states, share[:, None, None].expand(*states.shape[:2], 1)]
@@ -151,7 +151,7 @@ class ValueFunction(nn.Module):
 
     def fit(self, states: th.Tensor, targets: th.Tensor, alive: th.Tensor, gamma: float) -> float:
         """
-        Fit to the costs of an epoch.
+        Fit the network to the targets of an epoch.
 
         :param states: ``(T, N, X)``
         :param targets: ``(T, N)``
@@ -178,8 +178,8 @@ class ValueFunction(nn.Module):
 
     @th.no_grad()
     def _rescale(self, targets: th.Tensor) -> None:
-        """Let the network predict standardised targets, without a change of its values (van Hasselt et al., 2016)."""
-        # Slowly, because the last layer has to follow.
+        """Standardise the targets anew without changing the predicted values (van Hasselt et al., 2016)."""
+        # After the first fit the change is slow, because the last layer has to adapt.
         rate = 1.0 if self.norm.count < 1.5 * len(targets) else 0.1
         offset = self.offset + rate * (targets.mean() - self.offset)
         scale = self.scale + rate * (targets.std().clamp(min=1e-6) - self.scale)
@@ -192,11 +192,11 @@ class ValueFunction(nn.Module):
 
 
 def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold: th.Tensor, gamma: float) -> th.Tensor:
-    """Regress on the state and the remaining horizon, for all time steps at once: ``(T, N)``."""
-    # With a discount this distinguishes only the last steps.
+    """Predict the targets by one regression on the state and the remaining horizon: ``(T, N)``."""
+    # With a discount, to_go differs only between the last steps.
     to_go = cost_to_go(th.ones_like(targets), gamma) / len(targets)
     living = alive.flatten().nonzero()[:, 0]
-    # An order without a period, because the centres are taken at regular intervals.
+    # The order of the samples must not be periodic, because the centres are taken at regular intervals.
     golden = (math.sqrt(5) - 1) / 2
     order = living[th.argsort(th.arange(len(living), dtype=th.float64, device=living.device) * golden % 1)]
     inputs = th.cat([states, to_go[..., None]], dim=-1)
@@ -217,7 +217,7 @@ def _held_out_predictions(features: th.Tensor, targets: th.Tensor, weight: th.Te
 
 
 def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: float = 0.5) -> th.Tensor:
-    """Predict by a weighted ridge regression with an intercept at each time step: ``(T, N)``."""
+    """Predict the targets by a weighted ridge regression with an intercept at each time step: ``(T, N)``."""
     total = weight.sum(1, keepdim=True).clamp(min=1.0)  # (T, 1)
     mean = (weight * targets).sum(1, keepdim=True) / total
     feature_mean = (weight[..., None] * features).sum(1, keepdim=True) / total[..., None]
@@ -226,7 +226,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
     gram = weighted.mT @ x + penalty * th.eye(x.shape[-1], dtype=x.dtype, device=x.device)
     coefficients = th.linalg.solve(gram, weighted.mT @ (targets - mean)[..., None])
     prediction = mean + (x @ coefficients)[..., 0]
-    # Do not extrapolate to outliers (the only robot outside the lava, say).
+    # Do not extrapolate to outliers, for instance to the only robot outside the lava.
     seen = weight > 0
     low = targets.masked_fill(~seen, math.inf).amin(dim=1, keepdim=True)
     high = targets.masked_fill(~seen, -math.inf).amax(dim=1, keepdim=True)
@@ -234,7 +234,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
 
 
 def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENTRES) -> th.Tensor:
-    """Compute features of each time step: standardised state, its squares, Gaussian bumps at states of the batch."""
+    """Compute features per time step: the standardised state, its squares, and Gaussian bumps at some of the states."""
     weight = alive[..., None]
     total = weight.sum(1, keepdim=True).clamp(min=1.0)
     mean = (weight * states).sum(1, keepdim=True) / total
@@ -249,15 +249,15 @@ def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENT
 BASELINES: dict[str, AdvantageFunction | None] = {
     "mean": episode_mean_advantages,
     "regression": regression_advantages,
-    "value": None,  # that of a ValueFunction, which the algorithm keeps
+    "value": None,  # the algorithm uses the method of its own ValueFunction
 }
 
 
 def get_baseline(name: str) -> AdvantageFunction | None:
     """
-    Look up a baseline; ``None`` for the network (:class:`ValueFunction`).
+    Return the function of a baseline; ``None`` for the network ``"value"`` (:class:`ValueFunction`).
 
-    :raises ValueError: if there is none of this name.
+    :raises ValueError: if no baseline has this name.
     """
     if name not in BASELINES:
         raise ValueError(f"baseline={name!r} is unknown: use one of {sorted(BASELINES)}")

@@ -1,22 +1,22 @@
-"""Dual ascent on the weight of the information: ``beta="auto"``."""
+"""Adapt the weight of the information by dual ascent, for ``beta="auto"``."""
 
 from __future__ import annotations
 
 import math
 import warnings
 
-LEAST_SLACK = 0.01  # of the limit, or of the improvement: costs of an epoch scatter
-NO_SCALE = 1e-9  # costs that are all zero
+LEAST_SLACK = 0.01  # smallest slack as a share of the limit or the improvement, since costs scatter
+NO_SCALE = 1e-9  # of costs that are all zero
 RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
-MAX_GROWTH = 1000.0  # of the starting weight; else it would grow forever where the task needs no information
-# Of a limit that is a share of the improvement.
-WINDOW = 5  # epochs that a cost is averaged over
-LEVEL_EPOCHS = 10  # in so many epochs a cost that has levelled off falls by less than the slack
-LATEST_START = 0.5  # of the training: the weight then starts, whether or not the cost has levelled off
+MAX_GROWTH = 1000.0  # largest ratio of w to its start; without it, w grows forever if no information is needed
+# The following constants are for a limit that is a share of the improvement.
+WINDOW = 5  # number of epochs over which a cost is averaged
+LEVEL_EPOCHS = 10  # a cost has levelled off if it falls by less than the slack in this many epochs
+LATEST_START = 0.5  # share of the training after which the weight starts in any case
 
 
 def share_of(cost_limit: object) -> float | None:
-    """Return the share that a text such as ``"95%"`` stands for, or ``None`` if it is none between 0 and 100 %."""
+    """Convert a text such as ``"95%"`` to a share, or return ``None`` if it is not a share between 0 and 100 %."""
     if not (isinstance(cost_limit, str) and cost_limit.endswith("%")):
         return None
     try:
@@ -28,28 +28,30 @@ def share_of(cost_limit: object) -> float | None:
 
 class AutoWeight:
     """
-    Adapt the weight w of "minimise the information subject to E[cost] <= C" by dual ascent.
+    Adapt the weight w of the information by dual ascent, to minimise the information subject to E[cost] <= C.
 
-    The weight is 0 until the cost first meets the limit. It then starts where the penalty equals the scale (below 1 nat
-    it is smaller), grows while the cost is below the limit and shrinks while it is above, as SAC's ``ent_coef="auto"``
-    does for the entropy:
+    The weight is 0 until the cost first meets the limit. It starts at the value for which the penalty equals the scale
+    (the penalty is smaller if the information is below 1 nat). From then on it grows while the cost is below the limit
+    and shrinks while the cost is above it, like SAC's ``ent_coef="auto"`` for the entropy:
 
         log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
-    The scale is abs(C). With ``by_slack`` it is how far the lowest cost so far is below the limit: a limit of 95 % of
-    the attainable return then has as strong an effect as one of 50 %. The aim is then the middle of this slack instead
-    of C, since the few episodes of an epoch say little about the cost, and the weight grows more slowly than it
-    shrinks, ``clip(., -3, 0.3)``: a policy loses the return within a few epochs, and takes many to find it again.
+    The scale is abs(C). With ``by_slack`` the scale is the slack, that is the distance of the lowest cost so far below
+    the limit. A limit of 95 % of the attainable return then has as strong an effect as a limit of 50 %. The aim is then
+    the middle of the slack instead of C, because the few episodes of an epoch say little about the expected cost. The
+    weight also grows more slowly than it shrinks, ``clip(., -3, 0.3)``, because a policy loses its return within a few
+    epochs and takes many epochs to recover it.
 
-    **A share of the improvement** s needs no number: C = first - s * (first - best), with the cost of the first epoch
-    and the lowest mean cost of five successive epochs so far. The weight starts once this mean has levelled off (it
-    falls by less than C - best in ten epochs), and at the latest in the middle of the training: before that it would
-    change what is attainable. In the second half of the training it grows more and more slowly, so that the last policy
-    has settled. Costs may have either sign. ``by_slack`` applies.
+    If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
+    best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs
+    so far. The weight starts when this mean cost has levelled off (it falls by less than C - best in ten epochs), and
+    at the latest in the middle of the training. An earlier start would change the attainable cost. In the second half
+    of the training the weight grows more and more slowly, so that the last policy has settled. Costs may have either
+    sign. A share implies ``by_slack``.
 
     :param cost_limit: C, or a share such as ``"95%"``.
     :param by_slack: See above.
-    :param first_cost: Cost of the first epoch, where the training has begun without the weight.
+    :param first_cost: Cost of the first epoch, if the training has begun without the weight.
     """
 
     def __init__(
@@ -63,15 +65,15 @@ class AutoWeight:
         self.by_slack = by_slack or self.share is not None
         self.first_cost = first_cost
         self.limit = math.nan if isinstance(cost_limit, str) else cost_limit
-        """C; NaN where it is a share and less than five epochs have been run."""
+        """C; NaN if a share is given and fewer than five epochs have been run."""
         self.value = 0.0
         """w = 1 / beta, in units of cost per nat."""
         self.information_before: float | None = None
         """Information in nats of the epoch in which the weight started."""
-        self._last = (math.nan, math.nan)  # cost and information
+        self._last = (math.nan, math.nan)  # cost and information of the last epoch
         self._start = 0.0
         self._lowest = math.inf
-        self._costs: list[float] = []  # of the last WINDOW + LEVEL_EPOCHS epochs
+        self._costs: list[float] = []  # costs of the last WINDOW + LEVEL_EPOCHS epochs
 
     def update(self, cost: float, information: float, progress_remaining: float = 1.0) -> None:
         """
@@ -93,7 +95,8 @@ class AutoWeight:
         if self.by_slack:
             slack = max(self.limit - self._lowest, 0.0)
             if self.first_cost is not None and self.first_cost != self._lowest:
-                scale = min(scale, abs(self.first_cost - self._lowest))  # wherever costs have their zero
+                # The scale of a share must not depend on the zero point of the costs.
+                scale = min(scale, abs(self.first_cost - self._lowest))
             scale = max(slack, LEAST_SLACK * scale, NO_SCALE)
             aim, low, high = self.limit - slack / 2, -3.0, 0.3
         if self.share is not None:
@@ -106,7 +109,7 @@ class AutoWeight:
             self.information_before = information
 
     def _update_limit(self, cost: float, share: float) -> bool:
-        """Move the limit that is a share, and return whether the cost has levelled off."""
+        """Update the limit of a share, and return whether the cost has levelled off."""
         if self.first_cost is None:
             self.first_cost = cost
         self._costs = [*self._costs, cost][-WINDOW - LEVEL_EPOCHS :]
@@ -120,7 +123,7 @@ class AutoWeight:
         return len(self._costs) == WINDOW + LEVEL_EPOCHS and before - smoothed < slack
 
     def kept(self) -> str | None:
-        """Say how much of the information the last epoch has, as in ``"12.1 of 20.3 nats kept, ..."``, if it can."""
+        """Describe how much information the last epoch kept, as in ``"12.1 of 20.3 nats kept, ..."``, or ``None``."""
         if self.information_before is None:
             return None
         cost, information = self._last

@@ -1,5 +1,5 @@
 """
-The rollouts of one policy epoch, episode by episode, and what the policy makes of them.
+Containers for the rollouts of one policy epoch, by episode, and for the policy's outputs.
 
 Dimension key: T horizon, N episodes, E environments, X state, Z TRVs.
 """
@@ -25,7 +25,7 @@ Observations = th.Tensor | dict[str, th.Tensor]
 
 
 def each_part(function: Callable[..., Any], *arrays: Any) -> Any:
-    """Apply a function to arrays, or to the parts of dicts with the same keys."""
+    """Apply a function to arrays, or key by key to dicts of arrays with the same keys."""
     first, *_ = arrays
     return {key: function(*(x[key] for x in arrays)) for key in first} if isinstance(first, dict) else function(*arrays)
 
@@ -34,37 +34,37 @@ class EpisodeBatch(NamedTuple):
     """
     An epoch's rollouts as tensors on the training device: whole episodes, or segments of them.
 
-    In segments, T is their length and N their number.
+    For segments, T is the length of a segment and N the number of segments.
     """
 
-    observations: Observations  #: ``(T, N, *obs)``, y_t, or a dict of such
+    observations: Observations  #: ``(T, N, *obs)``, y_t, or a dict of such tensors
     states: th.Tensor  #: ``(T, N, X)``, x_t
     noise: th.Tensor  #: ``(T, N, Z)``, eps_t
     trvs: th.Tensor  #: ``(T, N, Z)``, x~_t
     means: th.Tensor  #: ``(T, N, Z)`` of q(x~_t | x~_{t-1}, y_t)
     stds: th.Tensor  #: ``(T, N, Z)``
     actions: th.Tensor  #: ``(T, N, U)``, u_t before clipping
-    costs: th.Tensor  #: ``(T, N)``, zero after the end
+    costs: th.Tensor  #: ``(T, N)``, zero after the end of the episode
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
     advantages: th.Tensor  #: ``(T, N)``, zero until they are computed
     prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at t = 0
-    episode: th.Tensor  #: ``(T, N)``, number of the episode, also of a segment
+    episode: th.Tensor  #: ``(T, N)``, index of the episode, also for segments
 
     def select(self, columns: th.Tensor | slice) -> EpisodeBatch:
         """Select episodes or segments by their columns."""
         return EpisodeBatch(*(each_part(lambda v: v[:, columns], x) for x in self))
 
     def partition(self, n_parts: int) -> Sequence[th.Tensor | slice]:
-        """Divide the columns at random into nearly equal parts; a single part is all of them, in their order."""
+        """Divide the columns at random into nearly equal parts; a single part has all columns in order."""
         if n_parts == 1:
             return [slice(None)]
         return th.randperm(self.costs.shape[1], device=self.costs.device).tensor_split(n_parts)
 
     def segments(self, n_steps: int) -> EpisodeBatch:
         """
-        Cut the episodes into segments, and drop those after the end of an episode.
+        Cut the episodes into segments, and drop segments that begin after the end of their episode.
 
-        :param n_steps: Length of a segment; the last one of an episode is filled up with dead steps.
+        :param n_steps: Length of a segment; the last segment of an episode is padded with steps that are not alive.
         """
         n_parts = math.ceil(self.alive.shape[0] / n_steps)
         padding = n_parts * n_steps - self.alive.shape[0]
@@ -78,11 +78,11 @@ class EpisodeBatch(NamedTuple):
 
     def information_batch(self, pooled: bool = False) -> InformationBatch:
         """
-        Return what the mutual-information estimators use, detached.
+        Return the samples that the mutual-information estimators use.
 
-        :param pooled: Pool the steps that are alive over all times as samples of one variable: ``(1, n, ...)``.
+        :param pooled: Whether to pool the living steps of all times as samples of one variable: ``(1, n, ...)``.
         """
-        # Of rebuilt TRVs, too, so that gradients reach both sides of the recurrence.
+        # Rebuilt TRVs are used here, too, so that gradients reach both sides of the recurrence.
         prev_trvs = th.cat([self.prev_trvs[:1], self.trvs[:-1]])
         alive = None if bool(self.alive.all()) else self.alive.bool()
         batch = InformationBatch(self.states, self.trvs, self.means, self.stds, alive, prev_trvs)
@@ -100,7 +100,7 @@ class PolicyStep(NamedTuple):
 
 
 class RebuiltTRVs(NamedTuple):
-    """The TRVs of whole episodes, rebuilt from the stored noise so that gradients flow through the recurrence."""
+    """The TRVs of episodes, rebuilt from the stored noise so that gradients flow through the recurrence."""
 
     trvs: th.Tensor  # (T, N, Z)
     means: th.Tensor  # (T, N, Z)
@@ -109,11 +109,11 @@ class RebuiltTRVs(NamedTuple):
 
 class EpisodeBuffer(RolloutBuffer):
     """
-    A rollout buffer of ``(T, N, ...)`` arrays: time step by episode instead of SB3's time step by environment.
+    A rollout buffer of ``(T, N, ...)`` arrays, indexed by time step and episode (in SB3: time step and environment).
 
-    ``buffer_size`` is the horizon T and ``n_envs`` the number of episodes N, whatever the number of environments; N
-    grows if an epoch has more of them. After the end of a short episode the arrays hold zeros, and ``alive`` is 0
-    there.
+    ``buffer_size`` is the horizon T, and ``n_envs`` is the number of episodes N, independent of the number of
+    environments. N grows if an epoch has more episodes. After the end of a short episode the arrays hold zeros
+    (``stds``: ones), and ``alive`` is 0 there.
 
     :param state_dim: X
     :param trv_dim: Z
@@ -138,7 +138,7 @@ class EpisodeBuffer(RolloutBuffer):
         """Clear the buffer."""
 
         def zeros(space: spaces.Space) -> np.ndarray:
-            # Pages of np.zeros that are never written to take no memory.
+            # The array of np.zeros takes memory only for the pages that are written to.
             return np.zeros((self.buffer_size, self.n_envs, *get_obs_shape(space)), space.dtype)
 
         def vectors(*dim: int) -> np.ndarray:
@@ -157,8 +157,8 @@ class EpisodeBuffer(RolloutBuffer):
         """
         Store one step of some episodes.
 
-        :param t: time step of each, ``(n,)``, or of all
-        :param episode: column of each, ``(n,)``, or a slice of them
+        :param t: time step of each episode, ``(n,)``, or one for all episodes
+        :param episode: column of each episode, ``(n,)``, or a slice of columns
         :param values: ``observations``, ``states``, ``noise``, ``trvs``, ``means``, ``stds``, ``actions``, ``costs``,
             each ``(n, ...)``
         """
@@ -172,14 +172,14 @@ class EpisodeBuffer(RolloutBuffer):
         self.alive[t, episode] = 1.0
 
     def _double(self) -> None:
-        """Make room for as many episodes again."""
+        """Double the number of columns for episodes."""
         for name in STORED:
             setattr(self, name, each_part(lambda x: np.concatenate([x, np.zeros_like(x)], axis=1), getattr(self, name)))
         self.stds[:, self.stds.shape[1] // 2 :] = 1.0
 
     def clear_episodes(self, episodes: np.ndarray) -> None:
         """
-        Forget some episodes.
+        Clear the columns of some episodes.
 
         :param episodes: their columns, ``(n,)``
         """
@@ -188,9 +188,9 @@ class EpisodeBuffer(RolloutBuffer):
 
     def episode_batch(self, whole_horizon: bool = True) -> EpisodeBatch:
         """
-        Return the epoch as tensors.
+        Return the rollouts of the epoch as tensors.
 
-        :param whole_horizon: Also the time steps after the end of the longest episode.
+        :param whole_horizon: Whether to include the time steps after the end of the longest episode.
         """
         assert self.full, "the epoch's rollouts are not complete"
         n_episodes = int(self.alive[0].sum())
@@ -219,35 +219,34 @@ class EpisodeBuffer(RolloutBuffer):
 
 class RunningEpisodes:
     """
-    The time of each environment, the column of the buffer that its episode fills, and the end of an epoch.
+    Track the time step and the buffer column of each environment's episode, and the end of an epoch.
 
     :param n_envs: E.
-    :param n_episodes: Each environment runs its share of these; ``None``: it begins another episode as long as fewer
-        than ``n_steps`` steps are stored.
+    :param n_episodes: Number of episodes, divided equally among the environments. ``None``: an environment begins
+        another episode while fewer than ``n_steps`` steps are stored.
     :param horizon: T.
     """
 
     def __init__(self, n_envs: int, n_episodes: int | None, n_steps: int, horizon: int) -> None:
         self.n_episodes, self.n_steps, self.horizon = n_episodes, n_steps, horizon
         self.t = np.zeros(n_envs, np.int64)
-        """``(E,)``, t of its current episode."""
+        """``(E,)``: time step of each environment's episode."""
         self.column = np.arange(n_envs)
-        """``(E,)``; -1: the environment has run its last episode."""
+        """``(E,)``: buffer column of each environment; -1 after its last episode."""
         self._n_columns, self._n_stored = n_envs, 0
 
     @property
     def running(self) -> np.ndarray:
-        """The environments whose steps are stored, in order."""
+        """Indices of the environments whose steps are stored, in order."""
         return np.flatnonzero(self.column >= 0)
 
     def advance(self, dones: np.ndarray, infos: Sequence[dict[str, Any]] = ()) -> np.ndarray:
         """
-        Count a step of the running environments, and give those whose episode is over the next column.
+        Count a step of the running environments, and assign new columns where episodes have ended.
 
         :param dones: ``(E,)``
-        :param infos: Of the step.
-        :return: the columns of episodes that were lost: RayVecEnv has restarted these environments, and they run them
-            again
+        :param infos: The infos of the step.
+        :return: the columns of lost episodes, which run again: RayVecEnv has restarted their environments
         :raises ValueError: if an episode is longer than the horizon.
         """
         running = self.running

@@ -27,7 +27,7 @@ class TDPGCallback(BaseCallback):
     """A callback for :class:`~sb3_tdpg.TDPG`."""
 
     def init_callback(self, model: BaseAlgorithm) -> None:
-        """Refuse other algorithms before they start."""
+        """Raise a ``ValueError`` if the algorithm is not TDPG, before the training starts."""
         if not isinstance(model.policy, TRVPolicy):
             raise ValueError(f"{type(self).__name__} is for TDPG, but the model is a {type(model).__name__}")
         super().init_callback(model)
@@ -45,9 +45,9 @@ class MINECallback(TDPGCallback):
     """
     Fit the mutual-information critics to the rollouts of each epoch (lines 3 to 5 of Algorithm 2).
 
-    :class:`~sb3_tdpg.TDPG` adds this callback before the user's callbacks, so that they see the current
-    ``model.information``; a MINECallback in the user's list replaces it. Without a penalty (``beta = inf``) it does
-    nothing: plain policy gradient trains no critic.
+    :class:`~sb3_tdpg.TDPG` adds this callback before the user's callbacks, so that they can read the current
+    ``model.information``. A MINECallback in the user's list replaces the added one. Without a penalty (``beta=inf``) no
+    critic is trained, as in plain policy gradient.
     """
 
     def _on_training_start(self) -> None:
@@ -77,14 +77,14 @@ class Candidate(NamedTuple):
         return f"epoch {self.epoch}: cost {self.cost:.4g}, {known}"
 
     def to_json(self) -> str:
-        """Return it as JSON, which has no infinite numbers: ``null`` stands for unknown information."""
+        """Return the candidate as JSON, with ``null`` for unknown (infinite) information."""
         return json.dumps(
             {**self._asdict(), "information": self.information if np.isfinite(self.information) else None}
         )
 
     @classmethod
     def from_json(cls, text: str) -> Candidate:
-        """Read what :meth:`to_json` wrote."""
+        """Create a candidate from the text that :meth:`to_json` returned."""
         record = json.loads(text)
         return cls(**{**record, "information": math.inf if record["information"] is None else record["information"]})
 
@@ -93,20 +93,22 @@ class SelectionCallback(TDPGCallback):
     """
     Keep the policy of the best epoch.
 
-    With ``cost_limit`` alone this is the paper's rule: the lowest information among the epochs whose mean cost is below
-    the limit. With ``mi_limit`` it is the lowest cost among the epochs whose information is below ``mi_limit`` (and
-    whose cost is below ``cost_limit``, if given). Where many epochs reach about 0 nats, the paper's rule picks one of
-    them arbitrarily, and the second rule picks the cheapest.
+    With ``cost_limit`` alone, the best epoch follows the paper's rule: it has the lowest information among the epochs
+    whose mean cost is below the limit. With ``mi_limit``, the best epoch has the lowest cost among the epochs whose
+    information is below ``mi_limit`` (and whose cost is below ``cost_limit``, if given). If many epochs reach about 0
+    nats, the paper's rule picks one of them arbitrarily, whereas the second rule picks the one with the lowest cost.
 
     The policy is kept in memory; :meth:`restore` puts it back into the model. With ``save_path`` each better policy is
-    also saved, so that it survives an interrupted training and a resumed training starts from it.
+    also saved. It then survives an interrupted training, and the selection of a resumed training starts from it.
 
     :param cost_limit: Upper limit on the expected cost.
     :param mi_limit: Upper limit on the information in nats, summed over time.
-    :param save_path: File of the selected model (``.zip``); a ``.json`` beside it has its epoch, cost and information.
+    :param save_path: File of the selected model (``.zip``); a ``.json`` file beside it holds the epoch, cost and
+        information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; in training, if a
-        ``VecNormalize`` normalises the observations: the policy can do so itself (``normalize_observations``).
+    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; at the start of a training,
+        also if a ``VecNormalize`` normalises the observations. The policy can normalise them itself
+        (``normalize_observations``).
     """
 
     def __init__(
@@ -146,7 +148,7 @@ class SelectionCallback(TDPGCallback):
                 "changing: give norm_obs=False and policy_kwargs=dict(normalize_observations=True)"
             )
         resumes = self.model.num_timesteps > 0
-        # The record is written last; if it is missing, that epoch is run again.
+        # The record is written last. If it is missing, that epoch runs again.
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
@@ -159,13 +161,13 @@ class SelectionCallback(TDPGCallback):
             self._best_policy = cast("dict[str, th.Tensor]", parameters["policy"])
         elif not resumes:
             self.best, self._best_policy = None, None
-            if self.save_path is not None:  # the selection of an earlier training is not one of this training
+            if self.save_path is not None:  # the selection of an earlier training does not count for this one
                 _record_path(self.save_path).unlink(missing_ok=True)
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
         cost = float(model.rollout_buffer.episode_costs.mean())
-        # Unknown is no better than anything that is known.
+        # Unknown information must not win against known information.
         information = math.inf if model.information is None else float(model.information.clip(min=0).sum())
         candidate = Candidate(model.epoch, cost, information)
         if not self._is_eligible(candidate) or (self.best is not None and not self._is_better(candidate, self.best)):
@@ -212,17 +214,17 @@ class TrainingCheckpointCallback(TDPGCallback):
     """
     Write a file from which a killed training continues exactly as if it had not been killed.
 
-    Every ``save_freq`` epochs, before the rollouts, the model is saved with the state of all random number generators,
-    and the environments are reset, so that the generators are their whole state. An older file is replaced only when
-    the new one is complete. To continue::
+    Every ``save_freq`` epochs, before the rollouts, this callback saves the model with the state of all random number
+    generators. It also resets the environments, so that their generators are their whole state. An older file is
+    replaced only when the new one is complete. To continue::
 
         model = TDPG.load("checkpoint.zip", env=env)
         model.learn(model.remaining_timesteps, reset_num_timesteps=False, callback=TrainingCheckpointCallback(...))
 
     Environments must take their randomness from ``np_random``, as Gymnasium requires.
 
-    :param save_path: The file.
-    :param save_freq: Epochs between checkpoints.
+    :param save_path: The file (``.zip``).
+    :param save_freq: Number of epochs between checkpoints.
     :param verbose: 1: print each checkpoint.
     """
 
@@ -242,9 +244,10 @@ class TrainingCheckpointCallback(TDPGCallback):
 
 class TDPGProgressBar(ProgressBarCallback):
     """
-    SB3's progress bar with the epoch's cost and information, and the failures where episodes report success.
+    SB3's progress bar with the epoch's cost and information, and the failure rate if episodes report success.
 
-    Where the output is no terminal a bar shows nothing before its end: then a line is printed every half minute.
+    If the output is not a terminal, a bar would appear only at the end. Then a line is printed every 30 seconds
+    instead.
     """
 
     SECONDS = 30.0
@@ -262,7 +265,7 @@ class TDPGProgressBar(ProgressBarCallback):
 
     @classmethod
     def close(cls) -> None:
-        """Close the bar of a training that has ended or was interrupted, or the terminal's cursor stays hidden."""
+        """Close the bar after the end or an interruption; otherwise the terminal's cursor stays hidden."""
         while cls._open:
             cls._open.pop().pbar.close()
 

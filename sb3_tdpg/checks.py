@@ -1,4 +1,4 @@
-"""Checks of TDPG's arguments, with errors that say how to mend a bad value."""
+"""Check TDPG's arguments; the error messages say how to correct a bad value."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from sb3_tdpg.information import get_estimator_class
 ENCODER_GRADIENTS = ("score", "pathwise")
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 LARGEST = 1e18  # the square of a larger number is not finite in float32
-MIN_BATCH_STEPS = 32  # the information of a minibatch is that of as many samples
+MIN_BATCH_STEPS = 32  # the information is estimated from the steps of a minibatch
 
-# What users of PPO and RecurrentPPO look for, and what it is here.
+# Arguments of PPO and RecurrentPPO, and their equivalents in TDPG.
 OF_PPO = dict(
     n_steps="epoch_steps, which counts the steps of all environments together",
     ent_coef="the noise at the start, policy_kwargs=dict(action_log_var_init=...); there is no entropy bonus",
@@ -39,17 +39,17 @@ OF_PPO = dict(
 
 
 def nearest_name(name: str, names: Iterable[str]) -> str:
-    """Return a question after the name that was probably meant, ``": did you mean ...?"``, or nothing."""
+    """Suggest the name that was probably meant, as ``": did you mean ...?"``, or return an empty text."""
     found = get_close_matches(name, list(names), n=1)
     return f": did you mean {found[0]!r}?" if found else ""
 
 
 def refuse_others(others: Mapping[str, Any], names: Iterable[str]) -> None:
     """
-    Raise a ``TypeError`` for arguments that TDPG does not have; it names the equivalent of PPO's, or the nearest name.
+    Raise a ``TypeError`` for unknown arguments; it names the equivalent of a PPO argument, or the nearest name.
 
-    :param others: The arguments.
-    :param names: Those that TDPG has.
+    :param others: The unknown arguments.
+    :param names: The names of TDPG's arguments.
     """
     for name in others:
         of_ppo = next(iter(get_close_matches(name, OF_PPO, n=1, cutoff=0.85)), None)
@@ -61,8 +61,8 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     """
     Check all arguments that do not depend on the environment.
 
-    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name; others are ignored.
-    :raises ValueError: for the first one that is out of range.
+    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name; other keys are ignored.
+    :raises ValueError: for the first argument that is out of range.
     """
     check_beta_argument(settings["beta"], settings["cost_limit"])
     for rate in _values(schedule_of("learning_rate", settings["learning_rate"])):
@@ -84,7 +84,7 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
             f"n_episodes={n_episodes} must be at least 2: the baseline and the information are estimated from a batch"
         )
     clip_ranges = _values(settings["clip_range"])
-    # A schedule may fall to 0; rl-zoo3 loads models for evaluation with one that is always 0.
+    # A schedule may fall to 0, and rl-zoo3 loads models for evaluation with a schedule that is always 0.
     lowest_is_allowed = callable(settings["clip_range"])
     for clip_range in clip_ranges:
         is_number = isinstance(clip_range, (int, float, np.number))
@@ -116,10 +116,10 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
 
 def check_batch_size(settings: Mapping[str, Any], epoch_size: int, *, time_varying: bool) -> None:
     """
-    Check the size of a minibatch, and that several updates on the same rollouts are clipped.
+    Check the minibatch size, and that several updates on the same rollouts use clipping.
 
     :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name, and ``horizon``.
-    :param epoch_size: Steps of an epoch.
+    :param epoch_size: Number of steps of an epoch.
     :param time_varying: Whether each time step has weights of its own.
     """
     batch_size, n_epochs, clip_range = settings["batch_size"], settings["n_epochs"], settings["clip_range"]
@@ -145,7 +145,7 @@ def check_batch_size(settings: Mapping[str, Any], epoch_size: int, *, time_varyi
 
 
 def check_segments(bptt_steps: int | None, horizon: int) -> None:
-    """Raise a ``ValueError`` if a policy with weights for each time step is to learn from parts of its episodes."""
+    """Raise a ``ValueError`` if ``bptt_steps`` is below the horizon of a policy with separate weights for each step."""
     if bptt_steps is not None and bptt_steps < horizon:
         raise ValueError(
             f"bptt_steps={bptt_steps} cuts the horizon of {horizon} steps into parts, and all steps must share their "
@@ -154,7 +154,7 @@ def check_segments(bptt_steps: int | None, horizon: int) -> None:
 
 
 def check_n_envs(env: Any, n_envs: int) -> None:
-    """Raise a ``ValueError`` if an environment that was given has another number of them."""
+    """Raise a ``ValueError`` if the number of environments in ``env`` differs from ``n_envs``."""
     if (given := getattr(env, "num_envs", 1)) != n_envs:
         raise ValueError(
             f"n_envs={n_envs} applies to an environment given by its id, but the environment given has {given}: leave "
@@ -163,7 +163,7 @@ def check_n_envs(env: Any, n_envs: int) -> None:
 
 
 def warn_if_short(total_timesteps: int, epoch_size: int) -> None:
-    """Warn about a training that is shorter than one policy epoch, and say which number to change."""
+    """Warn if a training is shorter than one policy epoch, and say which argument to change."""
     if total_timesteps < epoch_size:
         warnings.warn(
             f"learn({total_timesteps}) makes a single update, since a policy epoch has {epoch_size} steps: give "
@@ -174,9 +174,9 @@ def warn_if_short(total_timesteps: int, epoch_size: int) -> None:
 
 def schedule_of(name: str, value: Any) -> Schedule | Any:
     """
-    Return the schedule that a text such as ``"lin_1e-3"`` (to 0) or ``"lin_1e-3_1e-5"`` stands for, or the value.
+    Convert a text such as ``"lin_1e-3"`` (falls to 0) or ``"lin_1e-3_1e-5"`` to a schedule; keep other values.
 
-    :param name: The argument, for the error message.
+    :param name: Name of the argument, for the error message.
     """
     if not isinstance(value, str):
         return value
@@ -202,7 +202,7 @@ def _values(number_or_schedule: Any) -> list[Any]:
 
 
 def check_beta_argument(beta: Any, cost_limit: Any) -> None:
-    """Raise a ``ValueError`` unless beta is positive, a schedule of such numbers, or "auto" with a fitting limit."""
+    """Raise a ``ValueError`` unless beta is positive, a schedule of positive numbers, or "auto" with a valid limit."""
     if beta != "auto":
         for value in _values(schedule_of("beta", beta)):
             check_beta(value)
@@ -254,34 +254,34 @@ def check_action_space(space: spaces.Space) -> None:
 
 
 def check_start(what: str, space: spaces.Space) -> None:
-    """Raise a ``ValueError`` if a discrete space, or a part of one, does not begin with 0."""
+    """Raise a ``ValueError`` if a discrete space, or a discrete part of a ``Dict``, does not begin with 0."""
     for part in space.values() if isinstance(space, spaces.Dict) else [space]:
         if isinstance(part, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(part.start != 0):
             raise ValueError(f"the {what} space {part} must begin with 0: SB3 takes and returns 0 to n - 1")
 
 
 def nearest_multiples(n: int, divisor: int) -> str:
-    """Name the multiples of ``divisor`` next to ``n``."""
+    """Return the multiples of ``divisor`` nearest to ``n`` as text."""
     below = n // divisor * divisor
     return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"
 
 
 def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
-    """Call with keywords of the user, or raise a ``ValueError`` that names their argument and the nearest keyword."""
+    """Call ``make`` with the user's keywords, or raise a ``ValueError`` that names a similar keyword."""
     what = f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}"
     if not isinstance(kwargs, dict):
         raise ValueError(what)
     try:
         return make(**kwargs)
     except TypeError as e:
-        # An estimator hands the keywords that it does not have to its base class.
+        # An estimator passes keywords that it does not know on to its base class.
         known = {key for cls in make.func.__mro__[:-1] for key in signature(cls).parameters}  # type: ignore[attr-defined]
         hints = (nearest_name(key, known) for key in kwargs if key not in known)
         raise ValueError(f"{what}: {e}{next(filter(None, hints), '')}") from e
 
 
 def check_single(observation: Any, space: spaces.Space) -> None:
-    """Raise a ``ValueError`` for what ``predict`` cannot take: a dict for another space, or what ``reset`` returns."""
+    """Raise a ``ValueError`` if an observation is a dict for another space, or the tuple that ``reset`` returns."""
     if isinstance(observation, dict) and not isinstance(space, spaces.Dict):
         raise ValueError(f"the observation is a dict, but the policy was made for {space}")
     if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
@@ -301,7 +301,7 @@ def check_memory(memory: np.ndarray, expected: tuple[int, ...]) -> None:
 
 
 def check_time(t: np.ndarray, horizon: int) -> None:
-    """Raise a ``ValueError`` if an episode runs beyond the steps that a policy has weights for."""
+    """Raise a ``ValueError`` if an episode has more steps than the policy has weights for."""
     if (t >= horizon).any():
         raise ValueError(
             f"predict() was called for step {int(t.max()) + 1} of an episode, but the policy has weights for "
@@ -318,7 +318,7 @@ def check_floors(**floors: float | None) -> None:
 
 
 def check_action_mean(means: Sequence[float], space: spaces.Space) -> np.ndarray:
-    """Return the first means of the actions, ``(U,)``, or raise a ``ValueError`` if they are not those of a Box."""
+    """Return the initial mean actions as an array, ``(U,)``, or raise a ``ValueError`` if they do not fit the space."""
     array = np.asarray(means, dtype=np.float32).ravel()
     size = math.prod(space.shape) if isinstance(space, spaces.Box) else 0
     if len(array) != size or not np.isfinite(array).all():
@@ -327,7 +327,7 @@ def check_action_mean(means: Sequence[float], space: spaces.Space) -> np.ndarray
 
 
 def check_net_arch(given: dict[str, Sequence[int]] | None, default: dict[str, list[int]]) -> dict[str, list[int]]:
-    """Fill in the missing layers, or raise a ``ValueError`` for other keys than the default's."""
+    """Fill in missing layer sizes, or raise a ``ValueError`` for keys that the default does not have."""
     given = {} if given is None else given
     if not isinstance(given, dict) or not set(given) <= set(default):
         raise ValueError(

@@ -17,7 +17,7 @@ from sb3_tdpg.common.trust import refuse_links, say_what_is_trusted
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command (default: that of ``sys.argv``); return the exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Run a command (default: from ``sys.argv``); return its exit code: 0 success, 2 bad input, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if _is_for_the_zoo(arguments):
         command: Callable[..., None] = _zoo
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-# Commands import their modules when they run: importing torch takes seconds, and --help should not.
+# Commands import their modules when they run, because importing torch takes seconds and --help must be fast.
 
 
 def _demo(out: Path, **options: Any) -> None:
@@ -48,19 +48,19 @@ def _demo(out: Path, **options: Any) -> None:
 
 
 def _print_results(out: Path, make: Callable[[], str], *, is_shared: bool = False) -> None:
-    """Print the summary that a function writes to a folder, which other processes do not use meanwhile."""
+    """Print the summary that a function writes to a folder; unless it is shared, the folder is locked meanwhile."""
     with contextlib.nullcontext() if is_shared else kept_by_this_process(out):
         text = make()
     print(f"\n{text}\n\nresults are in {out}")
 
 
 class Experiment(NamedTuple):
-    """A command ``reproduce``."""
+    """An experiment of the command ``reproduce``."""
 
-    function: str  # below sb3_tdpg
-    folder: str  # the default one, in results/
+    function: str  # module and function in the package
+    folder: str  # default folder in results/
     arguments: dict[str, Any] = {}  # fixed arguments of the function
-    flags: tuple[str, ...] = ()  # those that not all experiments have
+    flags: tuple[str, ...] = ()  # flags that only some experiments have
 
 
 EXPERIMENTS = {
@@ -122,7 +122,7 @@ def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> Non
 
     out = options.pop("out") or Path("results", f"sweep-{options['block'] or env.rpartition(':')[2]}")
     options["settings"] = parse_keywords(settings)
-    # With a storage, several workers share the folder.
+    # If a storage is given, several workers share the folder.
     is_shared = options["storage"] is not None
     _print_results(out, lambda: sweep(env, n_seeds=seeds, out=out, **options), is_shared=is_shared)
 
@@ -208,7 +208,8 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
     """
     Parse keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
 
-    :param texts: ``key=value`` each, with a YAML value: a number, a text, true, false, null or a list of these.
+    :param texts: Texts of the form ``key=value``. The value is YAML: a number, a text, true, false, null or a list of
+        these.
     :raises ValueError: if a text has another form, or a key occurs twice.
     """
     keywords: dict[str, Any] = {}
@@ -230,7 +231,7 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
 
 
 class _Loader(yaml.SafeLoader):
-    """Also reads 1e-3 and inf as numbers, which YAML 1.1 reads as text; text in quotes stays text."""
+    """A YAML loader that reads 1e-3 and inf as numbers, unlike YAML 1.1; text in quotes stays text."""
 
 
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)$")
@@ -238,7 +239,7 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.01234
 
 
 def _plain(value: Any) -> Any:
-    """Refuse anything but scalars and lists."""
+    """Return a scalar or a list of scalars; raise a ``TypeError`` for anything else."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     if not isinstance(value, (str, bool, int, float, type(None))):
@@ -256,7 +257,7 @@ ZOO_PROGRAMS = {
 
 
 def _is_for_the_zoo(arguments: Sequence[str]) -> bool:
-    """Whether to call a program of rl-zoo3; its ``enjoy`` takes no file."""
+    """Return whether the arguments call a program of rl-zoo3, whose ``enjoy`` takes no file."""
     program = arguments[0] if arguments else None
     return program in ZOO_PROGRAMS or (
         program == "enjoy"
@@ -273,7 +274,7 @@ def _positive(text: str) -> int:
 
 
 KEYWORDS: dict[str, Any] = dict(nargs="+", action="extend", default=[], metavar="KEY=VALUE")
-# Flags of several commands.
+# Flags that several commands share.
 FLAGS: dict[str, dict[str, Any]] = {
     "--env": dict(required=True, help="id of the environment, for instance Lava-v0"),
     "--env-kwargs": dict(

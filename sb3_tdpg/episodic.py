@@ -1,7 +1,7 @@
 """
 On-policy learning from whole episodes: environments, ``learn``, saving, resuming and exporting.
 
-This is what :class:`~sb3_tdpg.TDPG` needs beside its own method, which is in :mod:`sb3_tdpg.tdpg`.
+The method of :class:`~sb3_tdpg.TDPG` is in :mod:`sb3_tdpg.tdpg`; its base class here holds everything else.
 
 Dimension key: T horizon, N episodes of an epoch, E environments, X state, Z task-relevant variables (TRVs).
 """
@@ -41,31 +41,31 @@ from sb3_tdpg.problem import Problem, named_shapes, read_problem
 
 SelfEpisodic = TypeVar("SelfEpisodic", bound="EpisodicAlgorithm")
 
-HARDLY_ANY = 0.1  # nats an episode: a seventh of a bit
+HARDLY_ANY = 0.1  # nats per episode, a seventh of a bit
 
 
 class TrainingDivergedError(ValueError):
-    """A loss is NaN or infinite. The model keeps the last good parameters."""
+    """Raised if a loss is NaN or infinite. The model keeps the last good parameters."""
 
 
 class EpisodicAlgorithm(OnPolicyAlgorithm):
     """
     An on-policy algorithm that rolls out N whole episodes of a :class:`~sb3_tdpg.TRVPolicy` per epoch.
 
-    The subclass sets the attributes below, and implements ``collect_rollouts``, ``fit_critics`` and ``train``.
+    A subclass sets the attributes below, and implements ``collect_rollouts``, ``fit_critics`` and ``train``.
     """
 
     policy: TRVPolicy  # type: ignore[assignment]
     rollout_buffer: EpisodeBuffer
     estimator: InformationEstimator
     value_function: ValueFunction | None = None
-    """With ``baseline="value"``."""
+    """The value network, with ``baseline="value"``."""
     nuisance: Any = None
-    """What the rollouts show beside the state, see :func:`~sb3_tdpg.robustness.nuisance.with_nuisance`."""
+    """Declared perturbations of the rollouts, see :func:`~sb3_tdpg.robustness.nuisance.with_nuisance`."""
     n_episodes: int | None
-    """Episodes of an epoch."""
+    """Number of episodes of an epoch."""
     epoch_steps: int | None = None
-    """Instead: an epoch ends when its episodes have that many steps."""
+    """Number of steps of an epoch, instead of ``n_episodes``: no episode begins after that many steps."""
     n_threads: int | None
     preset: str | None
     cost_limit: float | str | None
@@ -73,15 +73,15 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     """The weight of the information with ``beta="auto"``."""
     first_cost: float | None = None
     """Mean episode cost of the first epoch."""
-    # Plain numbers, so that a model that is loaded without an environment can rebuild its networks.
+    # These are plain numbers, so that a model loaded without an environment can rebuild its networks.
     horizon: int = 0
     state_dim: int = 0
     epoch: int = 0
-    """Policy epochs completed."""
+    """Number of completed policy epochs."""
     information: np.ndarray | None = None
-    """I[x_t; x~_t] of the last rollouts in nats, ``(T,)``; None without a penalty."""
+    """Estimate of I[x_t; x~_t] for the last rollouts in nats, ``(T,)``; None without a penalty."""
     normalizes: bool = False
-    """Whether the environment of the training normalised observations (``VecNormalize``)."""
+    """Whether the training environment normalised observations (``VecNormalize``)."""
     _random_state: RandomState | None = None
     _problem: Problem | None = None
 
@@ -92,7 +92,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
             raise ValueError(f"device={device!r} is unknown: use 'cpu', 'cuda', 'cuda:1' or 'auto'") from e
         if is_cuda and not th.cuda.is_available():
             warnings.warn(f"device={str(device)!r}, but torch finds no GPU: the model is on the CPU", stacklevel=3)
-        # Unused: the length of a rollout is set once the horizon is known, the others belong to other algorithms.
+        # Unused here: n_steps is set once the horizon is known, and the others belong to other algorithms.
         unused: dict[str, Any] = dict(n_steps=0, ent_coef=0.0, vf_coef=0.0, use_sde=False, sde_sample_freq=-1)
         super().__init__(*args, device=device, **unused, _init_setup_model=False, **kwargs)  # type: ignore[misc]
 
@@ -100,9 +100,10 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     def _check_problem(self, env: VecEnv) -> Problem:
         """
-        Read horizon and state from the environment.
+        Read the horizon and the state's dimension from the environment.
 
-        :raises ValueError: if it does not fit the algorithm or what the model was made for.
+        :raises ValueError: if the environment does not fit the algorithm, or differs in shape from the one that the
+            model was made for.
         """
         normalize = unwrap_vec_normalize(env)
         if normalize is not None and normalize.norm_reward:
@@ -130,22 +131,22 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     @property
     def epoch_size(self) -> int:
-        """Environment steps of an epoch whose episodes last to the horizon."""
+        """Number of environment steps of an epoch whose episodes all last to the horizon."""
         if self.n_episodes is not None:
             return self.horizon * self.n_episodes
         assert self.epoch_steps is not None
         return self.epoch_steps
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """See :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
+        """Set the environment; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.set_env`."""
         wrapped = self._with_nuisance(self._wrap_env(env, self.verbose))
         problem = self._check_problem(wrapped)  # before the model's own environment is replaced
         super().set_env(wrapped, force_reset)
         self._set_problem(problem, wrapped)
 
     def _with_nuisance(self, env: VecEnv) -> VecEnv:
-        """Put the declared nuisance around an environment, which may come from another model."""
-        from sb3_tdpg.robustness.nuisance import with_nuisance  # the algorithm itself knows nothing of perturbations
+        """Wrap an environment, which may come from another model, in the declared nuisance."""
+        from sb3_tdpg.robustness.nuisance import with_nuisance  # the algorithm itself needs no perturbations
 
         return with_nuisance(env, self.nuisance)
 
@@ -166,23 +167,23 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self._last_obs
 
     def _steps_of_this_epoch(self) -> int:
-        """Return its steps: with ``epoch_steps``, no more than are left, but for a tenth of an epoch."""
+        """Return the steps of this epoch: with ``epoch_steps`` those left, but at least a tenth of an epoch."""
         size = self.epoch_size
         if self.epoch == 0:
             return size
-        least = size // 10  # fewer would make an update of noise
+        least = size // 10  # fewer steps would give a noisy update
         if self.policy.time_varying:  # an estimate at each time step needs two episodes
             least = max(least, self.horizon + 1)
         return min(size, max(self.remaining_timesteps, least))
 
     def dump_logs(self, iteration: int = 0) -> None:
-        """Write the log; the mean cost comes from all episodes of the epoch."""
+        """Write the log, with the mean cost over all episodes of the epoch."""
         if self.rollout_buffer.full:  # a callback may ask for the log at any step
             self.logger.record("rollout/ep_cost_mean", float(self.rollout_buffer.episode_costs.mean()))
         super().dump_logs(iteration)
 
     def _check_finite(self, name: str, value: th.Tensor) -> None:
-        """Stop while the parameters are still good."""
+        """Raise a ``TrainingDivergedError`` if the value is not finite, before the parameters change."""
         if bool(th.isfinite(value).all()):
             return
         self._last_obs = None
@@ -205,14 +206,15 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfEpisodic:
         """
-        Train; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
+        Train the model; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
 
-        After Ctrl-C the model keeps the parameters of the last finished update: it can be used, saved or trained on.
+        After Ctrl-C the model has the parameters of the last finished update, and can be used, saved or trained
+        further.
 
-        :param total_timesteps: Environment steps; default: 400 policy epochs for vectors of a short horizon (a million
-            steps on Lava), 75 for images, 100 for depth images and from a horizon of 50 on. Epochs are made of whole
-            episodes: with ``n_episodes`` there are up to an epoch more steps, with ``epoch_steps`` up to an episode of
-            each environment or a tenth of an epoch.
+        :param total_timesteps: Number of environment steps. Default: 400 policy epochs for vectors over a short horizon
+            (a million steps on Lava), 75 for images, and 100 for depth images and for vectors over a horizon of 50 or
+            more. Epochs consist of whole episodes, so the training can take more steps: with ``n_episodes`` up to one
+            epoch more, with ``epoch_steps`` up to one episode of each environment or a tenth of an epoch more.
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:
@@ -230,7 +232,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self
 
     def _information_kept(self) -> str | None:
-        """Say what the last epoch has of the information, if it was penalised, and whether that is hardly any."""
+        """Describe the information of the last epoch if it was penalised, and say if there is hardly any."""
         if self.auto_weight is not None:
             return self.auto_weight.kept()
         if self.information is None or not self.rollout_buffer.full:  # a callback has stopped within an epoch
@@ -246,7 +248,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         callbacks = [c if isinstance(c, BaseCallback) else ConvertCallback(c) for c in given]
         callbacks = [c for each in callbacks for c in (each.callbacks if type(each) is CallbackList else [each])]
         first = [c for c in callbacks if _has_mine(c)] or [MINECallback()]
-        callbacks = [*first, *(c for c in callbacks if c not in first)]  # the others see the information
+        callbacks = [*first, *(c for c in callbacks if c not in first)]  # so that the others can read the information
         if progress_bar:
             callbacks.append(TDPGProgressBar())
         return super()._init_callback(callbacks)
@@ -262,7 +264,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         if self.env is None:
             raise ValueError("the model has no environment to learn in: set_env(...) first, or load(path, env=...)")
         self.normalizes = (normalize := unwrap_vec_normalize(self.env)) is not None and normalize.norm_obs
-        self._last_obs = None  # somebody may have stepped the environments since the last epoch
+        self._last_obs = None  # a user may have stepped the environments since the last epoch
         if reset_num_timesteps:
             self.epoch = 0
             self._current_progress_remaining = 1.0
@@ -270,7 +272,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         with named_shapes(self.env):
             result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if random_state is not None and not reset_num_timesteps:
-            # Last, since the set-up draws, too. The first rollout then resets the environments once more.
+            # This comes last, because the set-up also draws random numbers. The first rollout then resets the
+            # environments again.
             random_state.restore(self.env)
             self._last_obs = None
         return result
@@ -281,14 +284,14 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     @property
     def remaining_timesteps(self) -> int:
-        """Timesteps that the last call of ``learn`` was asked for and did not reach."""
+        """Number of timesteps that the last call of ``learn`` has not run yet."""
         return max(0, self._total_timesteps - self.num_timesteps)
 
     def save_checkpoint(self, path: str | os.PathLike[str]) -> None:
         """
-        Save the model with the state of all random number generators, between two epochs.
+        Save the model between two epochs, with the state of all random number generators.
 
-        The environments are reset, here and after loading, so that their generators are their whole state. See
+        The environments are reset here and after loading, so that their generators are their whole state. See
         :class:`~sb3_tdpg.TrainingCheckpointCallback`.
         """
         assert self.env is not None
@@ -305,7 +308,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        """Save to a zip file; an older file is replaced only when the new one is complete."""
+        """Save the model to a zip file; an older file is replaced only when the new one is complete."""
         if isinstance(path, io.IOBase):
             super().save(path, exclude, include)
             return
@@ -341,7 +344,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except Exception as e:
-            # Damaged bytes lead to any error, but the arguments of this call to none while the file is read.
+            # A damaged file can raise any error, but this call's arguments raise none while the file is read.
             names = [frame.f_code.co_name for frame, _ in traceback.walk_tb(e.__traceback__)]
             is_read = "load_from_zip_file" in names or ("set_parameters" in names and not kwargs)
             changed = [
@@ -352,7 +355,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
                     f"{path} has no networks for {', '.join(changed)}: load it with what it was trained with, or make "
                     "a new model, and model.policy.load_state_dict(TDPG.load(path).policy.state_dict())"
                 ) from e
-            # What SB3 itself finds missing: "No data found in the saved file", and keys of the data.
+            # SB3 itself reports missing contents: "No data found in the saved file", or a missing key.
             is_lacking = names[-1] == "load" and isinstance(e, (AssertionError, KeyError))
             if isinstance(e, OSError) or not (is_read or is_lacking):
                 raise
@@ -366,12 +369,12 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         Write one step of the policy to a file that runs without this package; see
         :func:`~sb3_tdpg.deployment.export.export_policy`.
 
-        What ``VecNormalize`` does to the observations of the model's environment is part of the file.
+        If the model's environment has a ``VecNormalize``, the file includes its normalisation of the observations.
 
         :param path: The file, ``.onnx`` or ``.pt``.
-        :param format: ``"onnx"`` or ``"torchscript"``; default: by the suffix.
+        :param format: ``"onnx"`` or ``"torchscript"``; default: from the file's suffix.
         :return: the file
-        :raises ValueError: if the training had a ``VecNormalize``, and the model has none.
+        :raises ValueError: if the training used a ``VecNormalize``, and the model has none.
         """
         from sb3_tdpg.deployment.export import export_trained
 
@@ -381,7 +384,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return [*super()._excluded_save_params(), "_problem", "_has_default_device"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        # The estimator's state dict holds its optimiser, too.
+        # The estimator's state dict also holds its optimiser.
         value = [] if self.value_function is None else ["value_function", "value_function.optimizer"]
         return ["policy", "policy.optimizer", "estimator", *value], []
 
@@ -395,7 +398,7 @@ def _has_mine(callback: BaseCallback) -> bool:
 
 
 def check_policy(policy: Any, aliases: Collection[str]) -> None:
-    """Raise a ``ValueError`` unless the policy is TDPG's."""
+    """Raise a ``ValueError`` unless the policy is one of TDPG's aliases or a subclass of ``TRVPolicy``."""
     if isinstance(policy, str) and policy not in aliases:
         hint = "" if not policy.endswith("Policy") else "; TRVPolicy takes vectors, images and dicts of them"
         raise ValueError(f"policy={policy!r} is unknown: use one of {list(aliases)}{hint}")

@@ -1,4 +1,4 @@
-"""The kinds of observations and actions, and what stands in front of the encoder: the CNN, running norms."""
+"""Classify observations, and extract features for the encoder: the CNN and the running norms."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from torch.nn.functional import avg_pool2d
 from sb3_tdpg.common.running_norms import RunningNorm
 
 MIN_SIDE = 12  # pixels, the minimum for the paper's two convolutions
-LEAST_MAP = 3  # side of the smallest map in which a position means something
+LEAST_MAP = 3  # side of the smallest map in which a position is meaningful
 
 
 def observation_kind(space: spaces.Space | None, *, normalize_images: bool = True) -> str:
     """
-    Classify the observation; the defaults depend on it.
+    Return the kind of an observation, on which the defaults depend.
 
     :param space: The observation space.
     :param normalize_images: Whether bytes are divided by 255; if not, images of floats in [0, 1] are accepted, too.
     :return: ``"image"``: uint8, channels first or last; ``"depth"``: a ``Box`` of floats, ``(1, H, W)`` with at least
-        12 pixels a side; ``"vector"``: anything else. A ``Dict`` is of the kind of its images, if it has any.
+        12 pixels a side; ``"vector"``: anything else. A ``Dict`` with images has the kind of its images.
     """
     if isinstance(space, spaces.Dict):
         kinds = {observation_kind(part, normalize_images=normalize_images) for part in space.values()}
@@ -42,13 +42,13 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
 
 
 def of_images(policy_kwargs: Any) -> dict[str, bool]:
-    """Return the keywords of the policy that decide the kind of an observation."""
+    """Return those keywords of the policy that affect the kind of an observation."""
     given = policy_kwargs if isinstance(policy_kwargs, dict) else {}
     return {name: value for name, value in given.items() if name == "normalize_images"}
 
 
 def flat_action_space(space: spaces.Space) -> spaces.Space:
-    """Flatten a ``MultiDiscrete`` or ``MultiBinary`` space of several dimensions; SB3 takes only one."""
+    """Flatten a ``MultiDiscrete`` or ``MultiBinary`` space of several dimensions; SB3 supports only one dimension."""
     if isinstance(space, spaces.MultiDiscrete):
         return spaces.MultiDiscrete(space.nvec.flatten())
     if isinstance(space, spaces.MultiBinary):
@@ -57,7 +57,7 @@ def flat_action_space(space: spaces.Space) -> spaces.Space:
 
 
 def least_side(layers: Sequence[tuple[int, int, int]], keypoints: bool = False) -> int:
-    """Return the smallest side of an image, in pixels, for convolutions given as in :class:`TRVCnn`."""
+    """Return the smallest side of an image, in pixels, that the layers of a :class:`TRVCnn` can process."""
     side = LEAST_MAP if keypoints else 1
     for _, kernel_size, stride in reversed(layers):
         side = stride * (side - 1) + kernel_size
@@ -66,15 +66,15 @@ def least_side(layers: Sequence[tuple[int, int, int]], keypoints: bool = False) 
 
 class SpatialSoftmax(nn.Module):
     r"""
-    Where each channel is active: the mean position of its pixels under a softmax, a *keypoint*.
+    Compute a *keypoint* for each channel: the mean position of its pixels, weighted by a softmax of their activations.
 
     .. math::
         p_c = \sum_i \mathrm{softmax}_i(\alpha_c z_{ci}) \, (x_i, y_i)
 
-    over the pixels i, with positions from -1 to 1, the activations :math:`z_{ci}` standardised over the image, and a
-    learned factor :math:`\alpha_c`. An object that moves in the image moves its keypoint in proportion, also to places
-    that training never showed. From Levine et al. (2016), End-to-end training of deep visuomotor policies, who do not
-    standardise the activations.
+    The sum is over the pixels i, with positions from -1 to 1. The activations :math:`z_{ci}` are standardised over the
+    image, and the factor :math:`\alpha_c` is learned. A keypoint moves in proportion to its object in the image, also
+    to places that were not seen in training. The layer follows Levine et al. (2016), End-to-end training of deep
+    visuomotor policies, who do not standardise the activations.
 
     :param channels: C
     :param height: H
@@ -90,33 +90,36 @@ class SpatialSoftmax(nn.Module):
         self.register_buffer("positions", th.stack([x.flatten(), y.flatten()], dim=1), persistent=False)
 
     def forward(self, maps: th.Tensor) -> th.Tensor:
-        """``(N, C, H, W) -> (N, 2 C)``: x and y of the first channel, of the second, ..."""
+        """Return x and y of the first channel's keypoint, then of the second, ...: ``(N, C, H, W) -> (N, 2 C)``."""
         weights = th.softmax(self.norm(maps.flatten(2)) * self.log_factor.exp(), dim=2)
         return (weights @ self.positions).flatten(1)
 
 
 class TRVCnn(BaseFeaturesExtractor):
     """
-    Convolutions in front of the encoder; by default the paper's two, 6 channels and stride 2, ELU, then flattened.
+    Convolutions in front of the encoder; default: the paper's two layers of 6 channels with stride 2 and ELU,
+    flattened.
 
-    With ``pool`` every square of ``pool x pool`` pixels is replaced by its mean before: a layer of stride 2 would
-    otherwise turn fine textures, finer than its own step, into coarse ones (aliasing), and textures that were never
-    seen then move the features most.
+    With ``pool``, every square of ``pool x pool`` pixels is first replaced by its mean. Otherwise a layer of stride 2
+    would turn textures that are finer than its step into coarse ones (aliasing), and unseen textures would then change
+    the features most.
 
-    With ``keypoints`` the last layer's maps are replaced by the positions at which they are active
-    (:class:`~sb3_tdpg.features.SpatialSoftmax`), without its nonlinearity: where a thing is, and not how it looks.
+    With ``keypoints``, the features are the positions at which the last layer's maps are active
+    (:class:`~sb3_tdpg.features.SpatialSoftmax`), without that layer's nonlinearity. They describe where an object is
+    and not how it looks.
 
-    Images of floats (depth in m, say) are first scaled from the bounds of their space to [-1, 1], if these are finite.
+    Images of floats, such as depth in m, are first scaled from the bounds of their space to [-1, 1] if the bounds are
+    finite.
 
     :param observation_space: An image space with channels first.
     :param layers: Output channels, kernel size and stride of each layer, in pixels.
     :param activation_fn: Nonlinearity after each layer.
-    :param features_dim: Outputs of a last linear layer, as in SB3's ``NatureCNN``; None: the flattened convolutions.
-    :param layer_norm: Whether the outputs of that layer are standardised for each image before the nonlinearity, which
-        makes them less sensitive to the contrast.
-    :param pool: Side of the squares in pixels; 1: no pooling, as in the paper. Images that would be too small for the
-        layers are not pooled.
-    :param keypoints: Whether the features are positions: two for each channel of the last layer.
+    :param features_dim: Number of outputs of a last linear layer, as in SB3's ``NatureCNN``; None: no such layer.
+    :param layer_norm: Whether the outputs of the linear layer are standardised for each image before the nonlinearity.
+        The features are then less sensitive to the contrast.
+    :param pool: Side of the squares in pixels; 1: no pooling, as in the paper. Images that would become too small for
+        the layers are not pooled.
+    :param keypoints: Whether the features are positions, with two coordinates for each channel of the last layer.
     :raises ValueError: if the images are too small for the layers.
     """
 
@@ -156,18 +159,18 @@ class TRVCnn(BaseFeaturesExtractor):
             self._features_dim = features_dim
 
     def pooled(self, images: th.Tensor) -> th.Tensor:
-        """Replace squares of pixels by their means, ``(N, C, H, W) -> (N, C, H / pool, W / pool)``, unless done."""
+        """Replace squares of pixels by their means, unless pooled: ``(N, C, H, W) -> (N, C, H / pool, W / pool)``."""
         if self.pool == 1 or images.shape[2:] != self.image_size:
             return images
         if self.pool == 2 and images.dtype == th.uint8 and images.is_contiguous() and images.shape[3] % 2 == 0:
-            # Sums of neighbouring bytes as integers: a fifth of the time of avg_pool2d, which needs floats.
+            # Summing neighbouring bytes as integers takes a fifth of the time of avg_pool2d, which needs floats.
             pairs = images[:, :, : images.shape[2] // 2 * 2].contiguous().view(th.int16)
             sums = (pairs & 255) + ((pairs >> 8) & 255)
             return (sums[:, :, ::2] + sums[:, :, 1::2]).float() / 4
         return avg_pool2d(images.float(), self.pool)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """``(N, C, H, W) -> (N, features_dim)``; the images may be pooled already."""
+        """Extract the features: ``(N, C, H, W) -> (N, features_dim)``; the images may be pooled already."""
         # With so few channels, convolutions are faster in this layout.
         images = self.pooled(observations).contiguous(memory_format=th.channels_last)
         is_scaled = (self.offset, self.scale) != (0.0, 1.0)
@@ -175,7 +178,7 @@ class TRVCnn(BaseFeaturesExtractor):
 
 
 def pooled_steps(extractor: nn.Module, observations: th.Tensor | dict[str, th.Tensor]) -> Any:
-    """Pool images once for all passes over an epoch: ``(T, N, *obs)``, or a dict of such, which stays as it is."""
+    """Pool the images of an epoch, ``(T, N, *obs)``, once for all passes; a dict of observations stays unchanged."""
     if not isinstance(extractor, TRVCnn) or extractor.pool == 1 or isinstance(observations, dict):
         return observations
     return extractor.pooled(observations.flatten(0, 1)).unflatten(0, observations.shape[:2])
@@ -184,14 +187,15 @@ def pooled_steps(extractor: nn.Module, observations: th.Tensor | dict[str, th.Te
 def flat_steps(extractor: nn.Module, x: th.Tensor) -> th.Tensor:
     """Flatten the steps of episodes for a feature extractor: ``(T, N, *obs) -> (T * N, *obs)``."""
     x = x.flatten(0, 1)
-    # Change the layout while the pixels are still bytes: it is cheaper. Others may rely on the usual one (``view``).
+    # Change the layout while the pixels are still bytes, which is faster. Other extractors may need the usual layout
+    # (``view``).
     is_faster = isinstance(extractor, NatureCNN) or (isinstance(extractor, TRVCnn) and extractor.pool == 1)
     return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and is_faster else x
 
 
 class ObservationNorm(nn.Module):
     """
-    A :class:`RunningNorm` for each vector of an observation; images and one-hot inputs pass through.
+    Standardise each vector of an observation by a :class:`RunningNorm`; images and one-hot inputs stay unchanged.
 
     :param space: The observation space, which may be a ``Dict``.
     """
@@ -203,7 +207,7 @@ class ObservationNorm(nn.Module):
         self.norms = nn.ModuleDict({key: RunningNorm(math.prod(x.shape)) for key, x in vectors.items()})
 
     def forward(self, observation: Any) -> Any:
-        """``(n, *obs) -> (n, *obs)``, or a dict of such."""
+        """Standardise the vectors: ``(n, *obs) -> (n, *obs)``, or a dict of such tensors."""
         if isinstance(observation, dict):
             return {key: self._standardized(x, key) for key, x in observation.items()}
         return self._standardized(observation, "observation")
@@ -213,9 +217,9 @@ class ObservationNorm(nn.Module):
 
     def update(self, observations: Any, alive: th.Tensor) -> None:
         """
-        Include an epoch's observations.
+        Update the statistics with an epoch's observations.
 
-        :param observations: ``(T, N, *obs)``, or a dict of such
+        :param observations: ``(T, N, *obs)``, or a dict of such tensors
         :param alive: ``(T, N)``
         """
         for key, norm in self.norms.items():

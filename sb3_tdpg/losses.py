@@ -11,13 +11,13 @@ import torch as th
 
 def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor) -> th.Tensor:
     """
-    Return a surrogate whose gradient is that of the expected cost (Equations 12 and 13).
+    Return a surrogate loss whose gradient is that of the expected cost (Equations 12 and 13).
 
-    The paper multiplies every log-probability with the cost of the whole episode. Subtracting anything that does not
-    depend on the sample at t (past costs, a baseline of the state) leaves the expected gradient unchanged.
+    The paper multiplies every log-probability with the cost of the whole episode. Subtracting a term that does not
+    depend on the sample at t, such as past costs or a baseline of the state, leaves the expected gradient unchanged.
 
     :param log_prob: log-probabilities at the *stored* samples, ``(T, N)``
-    :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
+    :param advantages: of costs, not rewards: positive values are worse than expected, ``(T, N)``
     :param alive: ``(T, N)``
     :return: scalar
     """
@@ -29,15 +29,15 @@ def clipped_policy_loss(
     log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor, clip_range: float
 ) -> th.Tensor:
     """
-    Return PPO's surrogate (Schulman et al., 2017) for costs: the maximum of the plain and the clipped one.
+    Return PPO's surrogate loss (Schulman et al., 2017) for costs: the maximum of its plain and its clipped term.
 
     At ``log_prob == old_log_prob`` its gradient is that of :func:`policy_gradient_loss`. It allows several updates on
-    the same rollouts: a sample has no gradient once its ratio has left ``[1 - clip_range, 1 + clip_range]`` in the
-    direction of its advantage.
+    the same rollouts, because a sample has no gradient once its ratio has left ``[1 - clip_range, 1 + clip_range]`` in
+    the direction that lowers the loss.
 
-    :param log_prob: of the current policy, ``(T, N)``
-    :param old_log_prob: of the rollout policy, ``(T, N)``
-    :param advantages: costs (not rewards), positive is worse than expected, ``(T, N)``
+    :param log_prob: log-probabilities under the current policy, ``(T, N)``
+    :param old_log_prob: log-probabilities under the policy of the rollouts, ``(T, N)``
+    :param advantages: of costs, not rewards: positive values are worse than expected, ``(T, N)``
     :param alive: ``(T, N)``
     :param clip_range: Largest change of the probability ratio.
     :return: scalar
@@ -55,7 +55,7 @@ def policy_distance(
     log_prob: th.Tensor, old_log_prob: th.Tensor, alive: th.Tensor, clip_range: float
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    Measure how far the policy has moved from that of the rollouts, as SB3's PPO does.
+    Measure the distance of the policy from that of the rollouts, as SB3's PPO does.
 
     :param log_prob: ``(T, N)``
     :param old_log_prob: ``(T, N)``
@@ -78,9 +78,10 @@ def normalized(
 
     :param advantages: ``(T, N)``
     :param alive: ``(T, N)``
-    :param negligible: Do not divide by a standard deviation up to this: it is rounding.
-    :return: the advantages ``(T, N)`` and the standard deviation that they were divided by; divide other terms of the
-        loss by it, too, to keep their weight
+    :param negligible: Standard deviations up to this value count as rounding errors; the advantages are not divided by
+        them.
+    :return: the advantages, ``(T, N)``, and the standard deviation that they were divided by; divide the other terms of
+        the loss by it, too, to keep their weight
     """
     n = alive.sum()
     mean = (alive * advantages).sum() / n
@@ -91,10 +92,10 @@ def normalized(
 
 def information_loss(information: th.Tensor) -> th.Tensor:
     """
-    Return the penalty of Equation 3: the sum over time of I[x_t; x~_t], each clamped at zero.
+    Return the penalty of Equation 3: the sum over time of I[x_t; x~_t], with each term clamped at zero.
 
-    Mutual information is never negative, but the bound of a frozen critic is unbounded below, and the policy would
-    exploit that.
+    Mutual information is never negative. The bound of a frozen critic, however, has no lower limit. Without the clamp,
+    the policy would exploit this.
 
     :param information: estimates in nats, ``(T,)``
     :return: scalar

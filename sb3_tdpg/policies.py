@@ -39,56 +39,60 @@ from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, PolicyDefaults, default, fill_in_extractor, fill_in_trvs
 
-# Standard deviations of at most 7.4 for a TRV and 55 for an action.
+# These limits allow standard deviations of up to 7.4 for a TRV and 55 for an action.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
 
 
 class TRVPolicy(BasePolicy):
     r"""
-    Encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head :math:`\pi^\psi(u_t | \tilde x_t)`.
+    Policy with encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head
+    :math:`\pi^\psi(u_t | \tilde x_t)`.
 
-    Both are diagonal Gaussians; for a discrete action space the head is SB3's distribution. The action head sees only
-    the TRVs. At the first step of an episode the previous TRVs are zero.
+    Encoder and action head are diagonal Gaussians; for a discrete action space the head is SB3's distribution. The
+    action head gets only the TRVs. At the first step of an episode the previous TRVs are zero.
 
     ``predict`` takes and returns the memory as ``state=(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the index of the
     next time step, ``(n_envs,)``.
 
     The defaults depend on the preset: "vector", "image" (uint8), "depth" (images of floats) or "long" (vectors over a
-    long horizon), see the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The network sizes
-    of "vector" and "depth" are the paper's; the preset "paper" has those of its ball catching.
+    long horizon). See the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The network sizes
+    of "vector" and "depth" are the paper's. The preset "paper" has the network sizes of the paper's ball catching.
 
     :param observation_space: Vectors, images with channels first, ``Discrete``, or a ``Dict`` of these.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
-    :param horizon: Number of time steps T; the algorithm passes the environment's.
-    :param preset: Which defaults to use; the algorithm passes that of the problem. ``None``: by the observation alone.
+    :param horizon: Number of time steps T; the algorithm passes the environment's horizon.
+    :param preset: Name of the defaults; the algorithm passes the problem's preset. ``None``: chosen by the observation
+        alone.
     :param trv_dim: Number of TRVs Z.
     :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``.
     :param activation_fn: Nonlinearity of the hidden layers.
     :param time_varying: Whether each time step has its own weights. The feature extractor is always shared.
     :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
         store an observation before the action head can use it.
-    :param skip_changes: Whether the next TRVs get the change of the features since the last step, as far as it says
-        what the features do not (:class:`~sb3_tdpg.common.running_norms.Changes`): hidden velocities.
-    :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all that
-        were seen in training, as by SB3's ``VecNormalize``.
-    :param scale_actions: Whether the head's outputs are in units of the bounds of the action space: 0 is their middle,
-        1 the upper one, and a standard deviation of 1 half of their distance.
+    :param skip_changes: Whether the change of the features since the last step is added to the means of the following
+        TRVs, in proportion to the information that it adds to the features
+        (:class:`~sb3_tdpg.common.running_norms.Changes`). Such changes reveal hidden velocities.
+    :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all
+        vectors seen in training, as in SB3's ``VecNormalize``.
+    :param scale_actions: Whether the head's outputs are relative to the bounds of the action space: 0 is the middle, 1
+        is the upper bound, and a standard deviation of 1 is half of the distance between the bounds.
     :param shared_action_noise: Whether the variance of each action is one parameter, as in SB3's PPO, instead of an
         output of the head, which depends on the TRVs (Box actions).
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
         Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen.
-    :param gate: Whether a gate g in [0, 1] for each TRV, another output of the encoder, decides how much of the last
-        TRVs is kept, as the update gate of a GRU: ``mean = g * candidate + (1 - g) * last TRVs``, where the candidate
-        is the mean without a gate. The policy then remembers over many steps. Not with ``skip``.
+    :param gate: Whether the encoder also outputs a gate g in [0, 1] for each TRV, like the update gate of a GRU. The
+        gate decides how much of the last TRVs is kept: ``mean = g * candidate + (1 - g) * last TRVs``, where the
+        candidate is the mean without a gate. The policy can then remember over many steps. It cannot be combined with
+        ``skip``.
     :param action_mean_init: Mean action before training, ``(U,)``, in the units of the head's outputs; default: near 0
         (Box actions).
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0.
-    :param action_log_var_init: The same for the action head (Box actions).
+    :param action_log_var_init: Constant added to the action head's log-variance (Box actions).
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
-    :param action_var_floor: Smallest variance of an action, likewise.
-    :param features_extractor_class: Network in front of the encoder; default: flatten for vectors,
+    :param action_var_floor: Smallest variance of an action, applied in the same way.
+    :param features_extractor_class: Network in front of the encoder; default: ``FlattenExtractor`` for vectors,
         :class:`~sb3_tdpg.features.TRVCnn` for images.
     :param features_extractor_kwargs: Keywords of the feature extractor.
     :param normalize_images: Whether to divide uint8 images by 255.
@@ -97,7 +101,7 @@ class TRVPolicy(BasePolicy):
     :param use_sde: Must be False.
     """
 
-    _has_warned = False  # of deterministic=True
+    _has_warned = False  # about deterministic=True
     action_middle: th.Tensor
     action_range: th.Tensor
 
@@ -184,7 +188,7 @@ class TRVPolicy(BasePolicy):
         sizes = [self.trv_dim, *self.net_arch["action_head"], self._n_action_parameters()]
         activation = self.activation_fn or defaults.action_head_activation_fn
         self.action_head = TimeMLP(self.horizon, sizes, activation, time_varying=self.time_varying)
-        if defaults.is_long:  # begin near the middle of the actions, and with little else than the features in the TRVs
+        if defaults.is_long:  # start near the middle of the actions, with little more than the features in the TRVs
             self.encoder.scale_output(0.1)
             self.action_head.scale_output(0.1)
         if self.action_mean_init is not None:
@@ -196,7 +200,7 @@ class TRVPolicy(BasePolicy):
             bounds = th.as_tensor(np.stack([action_space.low, action_space.high]).reshape(2, -1), dtype=th.float32)
             self.register_buffer("action_middle", bounds.mean(0), persistent=False)
             half = (bounds[1] - bounds[0]) / 2
-            half = th.where(half > 0, half, 1.0)  # of an action that has one value only
+            half = th.where(half > 0, half, 1.0)  # for an action with only one value
             self.register_buffer("action_range", half, persistent=False)
         self.optimizer = self.optimizer_class(
             self.parameters(),
@@ -207,7 +211,7 @@ class TRVPolicy(BasePolicy):
     @property
     def device(self) -> th.device:
         """The device of the parameters."""
-        # SB3 looks for the first parameter among all modules, in each step.
+        # SB3's own property searches all modules for the first parameter, at each step.
         return cast(BatchedLinear, self.action_head.mlp.layers[0]).bias.device
 
     def _n_action_parameters(self) -> int:
@@ -237,7 +241,7 @@ class TRVPolicy(BasePolicy):
         if self.skip:
             skipped = [features]
             if self.changes is not None:
-                # A memory of zeros is the start of an episode: nothing has changed yet.
+                # Previous TRVs of zero mark the start of an episode, where nothing has changed yet.
                 is_start = (prev_trv == 0).all(dim=-1, keepdim=True)
                 before = th.where(is_start, features, prev_trv[..., : self.features_dim])
                 skipped.append(self.changes(features, before))
@@ -284,7 +288,7 @@ class TRVPolicy(BasePolicy):
         noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
         trv = mean + std * noise
         parameters = self.action_head.at_times(trv, t)
-        if isinstance(self.action_dist, DiagGaussianDistribution):  # in a fifth of the time of a distribution
+        if isinstance(self.action_dist, DiagGaussianDistribution):  # takes a fifth of the time of a distribution
             actions, log_std = self.action_gaussian(parameters)
             if not deterministic:
                 actions = actions + log_std.exp() * th.randn_like(actions)
@@ -307,11 +311,11 @@ class TRVPolicy(BasePolicy):
         return self._encoder_density(parameters, features, prev_trv)
 
     def _features(self, observation: PyTorchObs) -> th.Tensor:
-        """Standardise vectors, if asked for, and extract the features: ``(n, *obs) -> (n, F)``."""
+        """Extract the features, after standardising vectors if configured: ``(n, *obs) -> (n, F)``."""
         if self.norm is not None:
             observation = self.norm(observation)
         if isinstance(self.features_extractor, TRVCnn) and isinstance(observation, th.Tensor):
-            observation = self.features_extractor.pooled(observation)  # as bytes, which is faster
+            observation = self.features_extractor.pooled(observation)  # pooling bytes is faster
         return self.extract_features(observation, self.features_extractor)
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
@@ -324,7 +328,7 @@ class TRVPolicy(BasePolicy):
         return self._action_distribution(self.action_head.at_times(trv, t))
 
     def update_statistics(self, batch: EpisodeBatch) -> None:
-        """Include an epoch in the statistics that standardise observations and changes, if there are any."""
+        """Update the statistics of observations and changes, if there are any, with an epoch."""
         if self.norm is not None:
             self.norm.update(batch.observations, batch.alive)
         if self.changes is not None:
@@ -358,7 +362,7 @@ class TRVPolicy(BasePolicy):
         """
         Compute log pi(u_t | x~_t) at the stored actions (Equation 12).
 
-        :param trvs: ``(T, N, Z)``: the stored ones for the score path, rebuilt ones for the pathwise gradient.
+        :param trvs: ``(T, N, Z)``: the stored TRVs for the score path, or the rebuilt TRVs for the pathwise gradient.
         :return: ``(T, N)``
         """
         actions = batch.actions.flatten(0, 1)
@@ -368,7 +372,7 @@ class TRVPolicy(BasePolicy):
 
     def stored_log_prob(self, batch: EpisodeBatch, encoder_gradient: str) -> th.Tensor:
         """
-        Compute what :meth:`evaluate_episodes` does, for the policy that made the rollouts, from their densities.
+        Compute the log-probability of :meth:`evaluate_episodes` for the policy of the rollouts, from stored densities.
 
         :return: ``(T, N)``
         """
@@ -388,7 +392,7 @@ class TRVPolicy(BasePolicy):
         """
         trv, noise = batch.prev_trvs[0], batch.noise
         steps = []
-        # unbind, not features[t]: the gradient of each features[t] would be as large as all features.
+        # unbind instead of features[t], because the gradient of each features[t] would be as large as all features.
         for t, (features_t, noise_t) in enumerate(zip(features.unbind(), noise.unbind(), strict=True)):
             parameters = self.encoder.at(th.cat([trv, features_t], dim=-1), t)
             mean, std = self._encoder_density(parameters, features_t, trv)
@@ -404,8 +408,8 @@ class TRVPolicy(BasePolicy):
 
         :param batch: whole episodes, or segments of them
         :param encoder_gradient: ``"score"`` or ``"pathwise"``, see :class:`~sb3_tdpg.TDPG`.
-        :param rebuild: Also rebuild the TRVs from the noise when the gradient does not need them.
-        :return: ``(T, N)``, and the rebuilt TRVs
+        :param rebuild: Whether to rebuild the TRVs from the noise even if the gradient does not need them.
+        :return: the log-probability, ``(T, N)``, and the rebuilt TRVs, if any
         """
         features = self.episode_features(batch)
         if encoder_gradient == "pathwise":
@@ -429,13 +433,13 @@ class TRVPolicy(BasePolicy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Choose actions, one step at a time.
+        Choose the actions of one step.
 
         :param observation: one observation, or one per environment
         :param state: the memory that the last call returned; ``None`` at the start
         :param episode_start: ``(n_envs,)`` bool; clears the memory where True
-        :param deterministic: Use means instead of samples. This removes the channel noise that the bottleneck acts
-            through, so it is not the policy that was trained (the first such call warns); the paper's tables use
+        :param deterministic: Use means instead of samples. This removes the noise through which the bottleneck acts, so
+            the resulting policy is not the one that was trained (the first such call warns). The paper's tables use
             ``False``.
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.

@@ -13,7 +13,7 @@ from torch import nn
 from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import TRVCnn, least_side, observation_kind
 
-# From this horizon on the problem is an ordinary one of reinforcement learning, and no longer one of the paper's kind.
+# A problem over at least this horizon counts as ordinary reinforcement learning, not as one of the paper's kind.
 LONG_HORIZON = 50
 EPOCH_STEPS = 2000
 
@@ -27,7 +27,7 @@ class Defaults(NamedTuple):
     epoch_steps: int | None = None
     n_epochs: int = 1
     batch_size: int | None = None
-    batch_episodes: int | None = None  # a batch_size of that many episodes, whatever their length
+    batch_episodes: int | None = None  # batch_size as a number of episodes of any length
     clip_range: float = float("inf")
     normalize_advantage: bool = False
     encoder_gradient: str = "pathwise"
@@ -36,11 +36,11 @@ class Defaults(NamedTuple):
     total_epochs: int = 100  # policy epochs
     baseline: str = "regression"
     bptt_steps: int | None = None
-    gamma: float | None = 1.0  # None: by the horizon
+    gamma: float | None = 1.0  # None: depends on the horizon
     gae_lambda: float = 0.95
     max_grad_norm: float = float("inf")
     target_kl: float = float("inf")
-    share: str = "95%"  # the cost_limit of beta="auto"
+    share: str = "95%"  # default of cost_limit with beta="auto"
 
     def minibatch(self, horizon: int, epoch_size: int) -> int | None:
         """Return the default ``batch_size`` for a horizon T, at most the steps of an epoch."""
@@ -48,18 +48,19 @@ class Defaults(NamedTuple):
         return None if size is None else min(size, epoch_size)
 
 
-# One update per epoch, without clipping, as in the paper; the falling learning rate improves the last epochs.
+# As in the paper, an epoch has one update without clipping. The falling learning rate improves the last epochs.
 VECTOR = Defaults(
     beta=1 / 75,
     learning_rate="lin_2e-3_2e-5",
     n_episodes=500,
     encoder_gradient="score",
     total_epochs=400,
-    gae_lambda=0.3,  # with 0.95 lava stays in bad open loops
+    gae_lambda=0.3,  # with 0.95, policies on Lava remain bad open-loop policies
 )
 
-# Images are expensive: PPO's passes over few episodes, and the gradient with the least variance. A policy that has not
-# learnt costs a hundred times as much as one that has, so that 95 % of the improvement would be a bad policy.
+# Images are expensive. An epoch therefore has few episodes and several passes, as in PPO, with the pathwise gradient,
+# which has the least variance. An untrained policy costs a hundred times as much as a trained one, so a policy with 95
+# % of the improvement would be bad.
 IMAGE = Defaults(
     beta="auto",
     share="99.8%",
@@ -74,13 +75,13 @@ IMAGE = Defaults(
     baseline="value",
 )
 
-# Depth images come from environments that simulate each trial: even more expensive. Where nearly all trials succeed,
+# Depth images are even more expensive, because their environments simulate each trial. If nearly all trials succeed,
 # the normalised advantages of the few failures are huge, and without target_kl one epoch can undo the training.
 DEPTH = IMAGE._replace(
     share="95%", n_episodes=400, batch_episodes=200, total_epochs=100, baseline="regression", target_kl=0.05
 )
 
-# Ordinary environments: PPO's update, with minibatches of short segments and a value network.
+# Ordinary environments use PPO's update, with minibatches of short segments and a value network.
 LONG = Defaults(
     beta=float("inf"),
     learning_rate="lin_1e-3_1e-4",
@@ -113,27 +114,27 @@ class PolicyDefaults(NamedTuple):
     encoder_var_floor: float = 1e-3
     is_long: bool = False
     gate: bool = False
-    time_varying: bool | None = None  # None: by the horizon
+    time_varying: bool | None = None  # None: depends on the horizon
 
 
-# SB3's NatureCNN with half the channels and a layer norm, behind means of 2 x 2 pixels. Three layers and a linear one
-# generalise better to walls that were never seen than the paper's two (docs/results/ball_catch.md).
+# This is SB3's NatureCNN with half the channels and a layer norm, after pooling 2 x 2 pixels. Its three convolutions
+# and a linear layer generalise better to unseen walls than the paper's two convolutions (docs/results/ball_catch.md).
 IMAGE_ENCODER = dict(
     pool=2, layers=((16, 4, 2), (32, 4, 2), (32, 3, 1)), activation_fn=nn.ReLU, features_dim=256, layer_norm=True
 )
 
-# Keypoints instead of the paper's flattened convolutions: a thing is grasped where it never was in training
-# (docs/results/panda_grasp.md).
+# Keypoints replace the paper's flattened convolutions. The robot then also grasps objects at places that were not seen
+# in training (docs/results/panda_grasp.md).
 DEPTH_ENCODER = dict(layers=((16, 6, 2), (16, 4, 2)), keypoints=True)
 
-# Images start with narrow TRVs: training with wide ones takes twice as long.
+# With images, the TRVs start with little noise; with more noise, training takes twice as long.
 POLICY_DEFAULTS = dict(
     vector=PolicyDefaults(2, (64, 64), (64, 64), nn.ELU, nn.ELU, 0.0, 0.0, FlattenExtractor, {}),
     image=PolicyDefaults(
         32, (32,), (), nn.Tanh, nn.Tanh, -3.0, -1.0, TRVCnn, IMAGE_ENCODER, gate=True, time_varying=False
     ),
-    # The number of TRVs beside those that keep the observation. These are nearly free of noise at the start: a velocity
-    # is a small difference of them.
+    # 16 TRVs are added to those that keep the observation. The TRVs are nearly free of noise at the start, because a
+    # velocity is a small difference between them.
     long=PolicyDefaults(
         16,
         (64, 64),
@@ -155,10 +156,10 @@ POLICY_DEFAULTS = dict(
 
 def preset_of(observation_space: spaces.Space | None, horizon: int | None, **keywords: bool) -> str:
     """
-    Name the defaults for a problem: ``"vector"``, ``"image"``, ``"depth"`` or ``"long"``.
+    Return the name of the defaults for a problem: ``"vector"``, ``"image"``, ``"depth"`` or ``"long"``.
 
-    :param observation_space: The environment's.
-    :param horizon: Its time limit T, if it is known.
+    :param observation_space: The environment's observation space.
+    :param horizon: The environment's horizon T, if it is known.
     :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """
     kind = observation_kind(observation_space, **keywords)
@@ -166,17 +167,18 @@ def preset_of(observation_space: spaces.Space | None, horizon: int | None, **key
 
 
 def discount_of(horizon: int) -> float:
-    """Return the default discount of a long horizon T: it looks ahead for an eighth of it, and 10 to 200 steps."""
+    """Return the default discount for a long horizon T: it looks T / 8 steps ahead, but at least 10 and at most 200."""
     return min(max(1 - 8 / horizon, 0.9), 0.995)
 
 
 def implied(given: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return what some arguments say of others, unless these are given, too.
+    Return the arguments that given arguments imply, unless they are given, too.
 
-    A limit means ``beta="auto"``, another beta no limit, and a number of episodes no number of steps.
+    A ``cost_limit`` implies ``beta="auto"``, and any other ``beta`` implies no ``cost_limit``. Each of ``n_episodes``
+    and ``epoch_steps`` implies that the other is ``None``.
 
-    :param given: Arguments by name; those that are None say nothing.
+    :param given: Arguments by name; those that are None imply nothing.
     """
     given = {name: value for name, value in given.items() if value is not None}
     others: dict[str, Any] = {}
@@ -195,13 +197,13 @@ def fill_in(
     given: Mapping[str, Any], preset: str, cost_limit: float | str | None, n_envs: int, horizon: int
 ) -> dict[str, Any]:
     """
-    Replace ``None`` by the defaults.
+    Replace arguments that are ``None`` by their defaults.
 
     :param given: Arguments by name.
     :param preset: See :func:`preset_of`.
     :param cost_limit: See :func:`implied`.
-    :param n_envs: Number of environments, whose multiple the default of ``n_episodes`` is.
-    :param horizon: T, which the default of ``gamma`` depends on.
+    :param n_envs: Number of environments; the default of ``n_episodes`` is a multiple of it.
+    :param horizon: Horizon T; the default of ``gamma`` depends on it.
     """
     defaults = DEFAULTS[preset]
     settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
@@ -229,7 +231,7 @@ def fill_in_extractor(
         return given or CombinedExtractor, kwargs
     by_default = defaults.features_extractor_kwargs
     if by_default and min((space.shape or ())[1:]) < least_side(by_default["layers"], "keypoints" in by_default):
-        by_default = {}  # the paper's layers, for smaller images
+        by_default = {}  # smaller images use the paper's layers
     return defaults.features_extractor_class, {**by_default, **(kwargs or {})}
 
 
@@ -239,9 +241,9 @@ def fill_in_trvs(
     """
     Return ``trv_dim``, ``skip`` and ``skip_changes`` with their defaults.
 
-    :param defaults: Those of the preset.
+    :param defaults: Defaults of the preset.
     :param n_features: Number of features of an observation.
-    :raises ValueError: if there are too few TRVs for what is to be added to them.
+    :raises ValueError: if there are fewer TRVs than features and changes to add to them.
     """
     if trv_dim is not None:
         check_count("policy_kwargs: trv_dim", trv_dim)

@@ -34,7 +34,7 @@ class Problem:
 
     :param horizon: Number of controls T in an episode.
     :param state_dim: Dimension X of the state.
-    :param state_is_observation: The environment does not report its state, and the observation is used instead.
+    :param state_is_observation: Whether the observation stands in for the state, which the environment does not report.
     :param state_names: Names of the X components: the environment's ``state_names``, or ``x0``, ``x1``, ...
     """
 
@@ -45,7 +45,7 @@ class Problem:
 
     def initial_states(self, env: VecEnv, obs: np.ndarray) -> np.ndarray:
         """Return x_0 after a reset or an automatic reset of all environments: ``(E, X)``."""
-        # The wrappers' own reset_infos stay empty.
+        # Only the innermost environment has reset_infos; those of its wrappers stay empty.
         return self._states(env, env.unwrapped.reset_infos, obs)
 
     def next_states(self, env: VecEnv, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
@@ -74,7 +74,7 @@ class Problem:
 
 
 def unperturbed(env: VecEnv, obs: Any) -> Any:
-    """Return the observations as they were before every ``PerturbedVecEnv``, also of one inside another."""
+    """Return the observations from before all perturbations, also if several ``PerturbedVecEnv`` are nested."""
     while isinstance(env, VecEnvWrapper) and ("unperturbed" in vars(env) or type(env) in (VecMonitor, VecCheckNan)):
         obs, env = vars(env).get("unperturbed", obs), env.venv
     return obs
@@ -82,7 +82,7 @@ def unperturbed(env: VecEnv, obs: Any) -> Any:
 
 def read_problem(env: VecEnv, **keywords: bool) -> Problem:
     """
-    Read the horizon and the state of an environment without a step; a ``ValueError`` says what it lacks.
+    Read the horizon and the state's dimension from an environment; a ``ValueError`` says what is missing.
 
     :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """
@@ -98,7 +98,7 @@ def read_problem(env: VecEnv, **keywords: bool) -> Problem:
             "attribute `horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
     state_space = attribute_of(env, "state_space")
-    # POPGym's environments, which have this attribute, describe their state, too, but do not report it.
+    # POPGym's environments, which have this attribute, declare the space of their state but do not report the state.
     is_observation = state_space is None or env.has_attr("observability_level")
     if is_observation and observation_kind(env.observation_space, **keywords) != "vector":
         raise ValueError(
@@ -117,7 +117,7 @@ def horizon_of(env: VecEnv | gym.Env) -> Any:
     if horizon is None:
         spec = attribute_of(env, "spec")
         horizon = None if spec is None else spec.max_episode_steps
-    # A TimeLimit that the user, or the function behind the id, has wrapped around it is not in the spec.
+    # The spec does not contain a TimeLimit that was added by the user or by the function behind the id.
     return attribute_of(env, "_max_episode_steps") if horizon is None else horizon
 
 
@@ -134,7 +134,7 @@ def _state_names(env: VecEnv, state_dim: int) -> tuple[str, ...]:
 
 
 def attribute_of(env: VecEnv | gym.Env, name: str) -> Any:
-    """Return an attribute of the first environment, or None."""
+    """Return an attribute of the first environment, or ``None`` if there is none."""
     if isinstance(env, gym.Env):
         return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
     return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
@@ -142,13 +142,13 @@ def attribute_of(env: VecEnv | gym.Env, name: str) -> Any:
 
 def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, t: np.ndarray) -> None:
     """
-    Check what the environments returned, before it reaches a network.
+    Check the values that environments returned, before they reach a network.
 
     :param what: "observation", "state" or "reward".
     :param values: ``(E, *shape)``
-    :param shape: Expected shape of one.
+    :param shape: Expected shape for one environment.
     :param t: time step of each environment, ``(E,)``
-    :raises ValueError: if the shape is another one, or a number is NaN, infinite or larger than 1e18.
+    :raises ValueError: if the shape differs, or a number is NaN, infinite or larger than 1e18.
     """
     if values.shape[1:] != shape:
         raise ValueError(
@@ -175,7 +175,7 @@ def check_observations(space: spaces.Space, observations: Any, t: np.ndarray) ->
 
 @contextmanager
 def named_shapes(env: VecEnv) -> Iterator[None]:
-    """Turn NumPy's error for an observation of a wrong shape, raised in an SB3 ``VecEnv``, into one that names it."""
+    """Replace NumPy's error for an observation of a wrong shape in an SB3 ``VecEnv`` by one that names the shape."""
     try:
         yield
     except ValueError as e:

@@ -55,25 +55,27 @@ class TDPG(EpisodicAlgorithm):
     (:class:`~sb3_tdpg.MINECallback`), and updates the policy: once, as in the paper, or with several clipped passes, as
     PPO does. ``beta=inf`` is plain policy gradient with the same policy.
 
-    The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). It gives
-    the true state as ``info["state"]`` in ``reset`` and ``step`` and describes it by an attribute ``state_space``.
-    Without these, a vector observation stands in for the state.
+    The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). It reports
+    the true state as ``info["state"]`` in ``reset`` and ``step``, and declares its space in an attribute
+    ``state_space``. Without a reported state, a vector observation stands in for it.
 
-    Most defaults depend on the problem: a vector, an image, a depth image (floats), or a vector over a horizon of 50 or
-    more. See the table in "TDPG: Defaults" of the documentation, made from :mod:`sb3_tdpg.presets`.
+    Most defaults depend on the kind of observation: a vector, an image, a depth image (floats), or a vector over a
+    horizon of 50 or more steps. See the table in "TDPG: Defaults" of the documentation; the values come from
+    :mod:`sb3_tdpg.presets`.
 
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``.
-    :param beta: Weight of the cost against the information: a positive number, a function of the remaining progress
-        (1 to 0), or a text, ``"lin_0.5_0.02"``, which falls linearly. ``inf``: no penalty. ``"auto"``: minimise the
+    :param beta: Weight of the cost against the information: a positive number, a function of the remaining progress (1
+        to 0), or a text such as ``"lin_0.5_0.02"``, which falls linearly. ``inf``: no penalty. ``"auto"``: minimise the
         information subject to E[cost] <= ``cost_limit`` (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default with a
         ``cost_limit``: ``"auto"``.
-    :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training to keep,
-        ``"90%"``.
-    :param learning_rate: Learning rate of the policy: a number, a schedule, or a text, ``"lin_1e-3_1e-5"``, which falls
-        linearly.
-    :param n_episodes: Episodes N of a policy epoch.
-    :param epoch_steps: Steps of a policy epoch instead: no episode begins after that many.
+    :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training that is to be
+        kept, such as ``"90%"``.
+    :param learning_rate: Learning rate of the policy: a number, a schedule, or a text such as ``"lin_1e-3_1e-5"``,
+        which falls linearly.
+    :param n_episodes: Number of episodes N of a policy epoch.
+    :param epoch_steps: Number of steps of a policy epoch, instead of ``n_episodes``: no episode begins after that many
+        steps.
     :param n_envs: Number of environments to make from an id; default: see :func:`~sb3_tdpg.make_episodes_env`.
     :param mi_estimator: A name in :data:`sb3_tdpg.information.ESTIMATORS` or a subclass of
         :class:`~sb3_tdpg.information.InformationEstimator`.
@@ -82,27 +84,27 @@ class TDPG(EpisodicAlgorithm):
         the true state at each step; ``"value"``: a network of the true state and the time left
         (:class:`~sb3_tdpg.advantages.ValueFunction`); ``"mean"``: the batch mean of the episode cost, as in the paper.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper;
-        ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both are unbiased; the second
-        has less variance.
+        ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both gradients are unbiased; the
+        pathwise gradient has less variance.
     :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons; the time
-        steps must share their weights (``time_varying=False``). Default: 5 for vectors with a horizon of 50 or more
-        (the horizon gives whole episodes), otherwise whole episodes.
+        steps must share their weights (``time_varying=False``). Default: 5 for vectors over a horizon of 50 or more
+        steps, otherwise whole episodes. A value of T gives whole episodes.
     :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO.
     :param batch_size: Minibatch size in steps, as in PPO. Minibatches are made of whole episodes, or of segments of
         them with ``bptt_steps``.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
-    :param target_kl: As in PPO: the passes of an epoch end when the policy has moved by 1.5 times this divergence, in
-        nats a step; ``inf``: no limit.
+    :param target_kl: Limit on the Kullback-Leibler divergence in nats per step, as in PPO: the passes of an epoch end
+        when the policy has moved by 1.5 times this value; ``inf``: no limit.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning.
     :param gamma: Discount factor; the paper has none.
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
         the next state; unused with ``baseline="mean"``.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping.
-    :param nuisance: Changes of the sensor in the rollouts, that the policy is to ignore. ``"auto"``: random colours,
-        patterns, contrasts and noise for images, noise and dropped pixels for depth images, nothing for vectors.
-        ``None``: nothing. A dict of perturbations and severities, a function, ...: see
-        :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is wrapped in it.
+    :param nuisance: Changes of the sensor in the rollouts that the policy should ignore. ``"auto"``: random colours,
+        patterns, contrasts and noise for images, noise and dropped pixels for depth images, no changes for vectors.
+        ``None``: no changes. For a dict of perturbations and severities, a function and other declarations see
+        :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is wrapped accordingly.
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.
@@ -110,16 +112,15 @@ class TDPG(EpisodicAlgorithm):
     :param seed: Seed of all random number generators. The episodes also depend on the number of environments.
     :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``: a GPU, if there is one, for images; for vectors the CPU, which
         is faster.
-    :param n_threads: Threads of torch and of NumPy's linear algebra during ``learn``; default: 1, which is fastest for
-        small networks and gives the same numbers on any machine; for images torch's setting.
+    :param n_threads: Number of threads of torch and of NumPy's linear algebra during ``learn``. Default: torch's
+        setting for images, otherwise 1, which is fastest for small networks and gives the same numbers on any machine.
     :param _init_setup_model: Whether to build the networks in the constructor.
-    :raises ValueError: if an argument is out of range or does not fit the environment. Nothing has been
-        trained by then.
+    :raises ValueError: if an argument is out of range or does not fit the environment. Nothing has been trained then.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TRVPolicy": TRVPolicy}
     values_see_changes = False
-    # The arguments with which an update is made, with their defaults filled in.
+    # The arguments that an update uses, with their defaults filled in.
     beta: float | Schedule | str
     mi_estimator: str | type[InformationEstimator]
     mi_kwargs: dict[str, Any]
@@ -171,7 +172,7 @@ class TDPG(EpisodicAlgorithm):
         refuse_others(others, signature(TDPG).parameters)
         env = made_env(env, n_envs, n_episodes=n_episodes, epoch_steps=epoch_steps)
         horizon = None if env is None else horizon_of(env)
-        # A model that is being loaded has its preset from the file.
+        # A model that is being loaded gets its preset from the file.
         self.preset = None
         if env is not None and _init_setup_model:
             self.preset = preset_of(env.observation_space, horizon, **of_images(policy_kwargs))
@@ -198,7 +199,7 @@ class TDPG(EpisodicAlgorithm):
     # -- construction -----------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
-        # load() sets attributes without the constructor: check them again.
+        # load() sets attributes without the constructor, so they are checked again here.
         self.max_grad_norm = math.inf if self.max_grad_norm is None else self.max_grad_norm
         check_policy(self.policy_class, self.policy_aliases)
         check_arguments(vars(self))
@@ -229,7 +230,7 @@ class TDPG(EpisodicAlgorithm):
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
             value_function = ValueFunction(self.state_dim, self.horizon, with_changes=self.values_see_changes)
             self.value_function = value_function.to(self.device)
-        # Also at beta = inf: a policy-gradient model can then warm-start TDPG.
+        # The estimator is made also for beta = inf, so that a policy-gradient model can warm-start TDPG.
         estimator_class = get_estimator_class(self.mi_estimator)
         n_critics = 1 if self.pools_information else self.horizon
         estimator = partial(estimator_class, n_critics, self.state_dim, self.policy.trv_dim)
@@ -242,11 +243,11 @@ class TDPG(EpisodicAlgorithm):
 
     @property
     def pools_information(self) -> bool:
-        """Whether one estimate pools the steps of all times, which is so if they share the policy's weights."""
+        """Whether one estimate pools the steps of all times; true if they share the policy's weights."""
         return not self.policy.time_varying
 
     def _setup_beta(self) -> None:
-        """Make the schedule of beta, or the weight that is adapted to the cost limit."""
+        """Create the schedule of beta, or the weight that adapts to the cost limit."""
         if self.beta != "auto":
             self.auto_weight = None
             self.beta_schedule = FloatSchedule(schedule_of("beta", self.beta))
@@ -265,7 +266,7 @@ class TDPG(EpisodicAlgorithm):
 
     @property
     def needs_information(self) -> bool:
-        """Whether the information of this epoch's rollouts is used: by the penalty, or to find its weight."""
+        """Whether this epoch needs the information, for the penalty or to adapt its weight."""
         return self.auto_weight is not None or self.mi_coef > 0.0
 
     # -- an epoch ---------------------------------------------------------------------------------------------
@@ -281,14 +282,14 @@ class TDPG(EpisodicAlgorithm):
         Roll out N whole episodes with the current policy (line 2 of Algorithm 2).
 
         Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
-        would favour short ones. With ``epoch_steps`` an environment begins another episode as long as there are fewer
-        steps; the last epoch of ``learn`` takes those that are left, but a tenth of an epoch at least. All environments
-        begin an epoch at t = 0.
+        would favour short episodes. With ``epoch_steps`` an environment begins another episode while fewer than that
+        many steps are stored. The last epoch of ``learn`` takes only the remaining steps, but at least a tenth of an
+        epoch. All environments begin an epoch at t = 0.
 
         :param env: The training environments.
         :param callback: Called at each step, and at the beginning and the end of the rollout.
         :param rollout_buffer: Receives the episodes.
-        :param n_rollout_steps: Unused: an epoch is a number of episodes.
+        :param n_rollout_steps: Unused: the length of an epoch is ``n_episodes`` or ``epoch_steps``.
         :return: False if a callback asked to stop.
         """
         assert self._problem is not None, "the model has no environment: set_env() first"
@@ -299,7 +300,7 @@ class TDPG(EpisodicAlgorithm):
         states = self._problem.initial_states(env, obs)  # (E, X)
         trvs = th.zeros(env.num_envs, self.policy.trv_dim, device=self.device)
         episodes = RunningEpisodes(env.num_envs, self.n_episodes, self._steps_of_this_epoch(), self.horizon)
-        # An epoch that ends early cannot be continued: leave the environments to be reset.
+        # An epoch that ends early cannot be continued; None makes the next epoch reset the environments.
         self._last_obs = None
 
         while (running := episodes.running).size > 0:
@@ -310,12 +311,12 @@ class TDPG(EpisodicAlgorithm):
             actions = step.actions.cpu().numpy()
             with named_shapes(env):
                 new_obs, rewards, dones, infos = cast(Any, env.step(self._clipped(actions)))
-            check_numbers("reward", np.nan_to_num(rewards), (), episodes.t)  # train() tells of NaN
+            check_numbers("reward", np.nan_to_num(rewards), (), episodes.t)  # train() reports NaN
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
-            # Environments that wait for the others go on, and what they do is not stored.
+            # Environments that wait for the others go on, but their steps are not stored.
             self._update_info_buffer([infos[i] for i in running], dones[running])
 
             stored = dict(observations=obs, states=states, actions=actions, costs=-rewards)
@@ -337,9 +338,10 @@ class TDPG(EpisodicAlgorithm):
         """
         Fit the mutual-information critics to the rollouts (lines 3 to 5 of Algorithm 2), and set ``information``.
 
-        :class:`~sb3_tdpg.MINECallback` calls it at the end of the rollouts. Without a penalty no critic is trained.
+        :class:`~sb3_tdpg.MINECallback` calls this method at the end of the rollouts. Without a penalty no critic is
+        trained.
         """
-        # As before train(): a schedule of beta may turn the penalty on with this epoch.
+        # SB3 does this only before train(), but a schedule of beta may turn the penalty on with this epoch.
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         if not self.needs_information:
             self.information = None
@@ -348,7 +350,7 @@ class TDPG(EpisodicAlgorithm):
         diagnostics = self.estimator.fit(batch)
         with th.no_grad():
             information = self.estimator(batch).cpu().numpy()  # (T,), nats
-        if self.pools_information:  # one estimate for a step of any time
+        if self.pools_information:  # there is one estimate for all time steps
             information = information * self.rollout_buffer.mean_length
         self.information = information
         self.logger.record("mi/total", float(information.sum()))
@@ -361,8 +363,8 @@ class TDPG(EpisodicAlgorithm):
         """
         Update encoder and action head from the rollouts (line 6 of Algorithm 2).
 
-        :raises TrainingDivergedError: if a cost, the loss or a gradient is NaN or infinite; the parameters stay as they
-            were before that step.
+        :raises TrainingDivergedError: if a cost, the loss or a gradient is NaN or infinite; the parameters keep their
+            values from before that step.
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -380,14 +382,14 @@ class TDPG(EpisodicAlgorithm):
         clip_range = self.clip_range(self._current_progress_remaining)
 
         advantages = self._advantages(batch)
-        cost_scale = th.ones(())  # what the advantages, and with them the penalty, are divided by
+        cost_scale = th.ones(())  # divisor of the advantages and of the penalty
         if self.normalize_advantage:
             negligible = 1e-5 * batch.costs.abs().max()
             advantages, cost_scale = losses.normalized(advantages, batch.alive, negligible)
         batch = whole = batch._replace(advantages=advantages)
         if in_segments:
             batch = batch.segments(self.bptt_steps or len(batch.costs))
-        # What the passes need of it: images are pooled once.
+        # Images are pooled once for all passes.
         passes = batch._replace(observations=pooled_steps(self.policy.features_extractor, batch.observations))
         old_log_prob = None  # (T, N) of the policy that made the rollouts
         if clip_range < math.inf:
@@ -408,7 +410,7 @@ class TDPG(EpisodicAlgorithm):
                 self.logger.record_mean("train/clip_fraction", clip_fraction.item())
                 if kl > 1.5 * self.target_kl:
                     break
-            if in_segments:  # the loss of a step: segments are of no fixed number
+            if in_segments:  # use the loss per step, since the number of segments varies
                 policy_loss = policy_loss * len(part.costs[0]) / part.alive.sum()
             loss = policy_loss
             if rebuilt is not None and mi_coef > 0.0:
@@ -428,7 +430,7 @@ class TDPG(EpisodicAlgorithm):
             self.logger.record_mean("train/policy_loss", policy_loss.item())
             self.logger.record_mean("train/loss", loss.item())
             self.logger.record_mean("train/grad_norm", grad_norm.item())
-        # Last: the rollouts and all of their gradients saw the same inputs.
+        # The update comes last, so that the rollouts and all of their gradients use the same statistics.
         self.policy.update_statistics(whole)
 
         self.epoch += 1
@@ -451,4 +453,4 @@ class TDPG(EpisodicAlgorithm):
     def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
         n_columns = batch.costs.shape[1]
         n_parts = 1 if self.batch_size is None else math.ceil(batch.alive.sum().item() / self.batch_size)
-        return batch.partition(min(n_parts, max(1, n_columns // 2)))  # the information needs two columns
+        return batch.partition(min(n_parts, max(1, n_columns // 2)))  # the information needs two columns in each part

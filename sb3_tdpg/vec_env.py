@@ -35,9 +35,9 @@ class BatchedVecEnv(VecEnv):
     """
     An SB3 ``VecEnv`` that steps N episodes of one environment in a single NumPy call.
 
-    It calls the methods of the environment from ``gymnasium.make`` with a leading dimension of N instead of 1, so that
-    the dynamics cannot differ. All episodes run in lockstep. As in every SB3 ``VecEnv``, a finished episode is
-    reset at once; like ``Monitor``, it reports ``info["episode"]``.
+    It calls the same methods as the environment from ``gymnasium.make``, with a leading dimension of N instead of 1, so
+    that the dynamics cannot differ. All episodes run in lockstep. As in every SB3 ``VecEnv``, a new episode begins at
+    once when one has finished. As with ``Monitor``, ``info["episode"]`` reports return and length.
 
     :param env: The environment, without wrappers.
     :param n_envs: Number of episodes N.
@@ -55,7 +55,7 @@ class BatchedVecEnv(VecEnv):
         return self._seeds
 
     def reset(self) -> np.ndarray:
-        """Start N episodes: y_0, ``(N, *obs)``. The true states x_0 are in ``reset_infos``."""
+        """Start N episodes and return y_0, ``(N, *obs)``; the true states x_0 are in ``reset_infos``."""
         if any(self._options):
             raise ValueError(
                 f"{type(self.env).__name__} takes no reset options: pass variations to its constructor (env_kwargs)"
@@ -118,7 +118,7 @@ class BatchedVecEnv(VecEnv):
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Report no wrapper but ``Monitor``, whose work this class does."""
+        """Return True for ``Monitor``, whose work this class does, and False for all other wrappers."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
@@ -126,7 +126,7 @@ class BatchedVecEnv(VecEnv):
         return [self._rendered(state) for state in self._state]
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
-        """Tile the pictures of all episodes, as every VecEnv; PyBullet's one window shows the first episode."""
+        """Tile the pictures of all episodes, like every ``VecEnv``; PyBullet's window shows only the first episode."""
         if self.render_mode == "human" and mode in (None, "human"):
             return self._rendered(self._state[0])
         return super().render(mode)
@@ -166,12 +166,12 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
 
 
 def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | None, *, batched: bool) -> int:
-    """Return the number of environments, given the length of an epoch or else TDPG's default for the environment."""
+    """Return the default number of environments for the given length of an epoch, or else for TDPG's default length."""
     horizon = horizon_of(env)
     if not n_episodes and not epoch_steps:
         defaults = DEFAULTS[preset_of(env.observation_space, horizon)]
         n_episodes, epoch_steps = defaults.n_episodes, defaults.epoch_steps
-    if n_episodes is None:  # an epoch of full episodes has no more steps than asked for
+    if n_episodes is None:  # so that an epoch of full episodes has at most epoch_steps
         assert epoch_steps is not None
         return max(1, min(epoch_steps // (horizon or 1), epoch_steps if batched else 10))
     # Each environment runs the same number of episodes.
@@ -179,18 +179,19 @@ def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | Non
 
 
 def largest_divisor(n_episodes: int, limit: int = 50) -> int:
-    """Return the largest divisor up to a limit: so many environments run the same number of episodes each."""
+    """Return the largest divisor up to a limit, so that all environments run the same number of episodes."""
     return max(n for n in range(1, min(n_episodes, limit) + 1) if n_episodes % n == 0)
 
 
 def made_env(env: GymEnv | str | None, n_envs: int | None, **sizes: Any) -> GymEnv | None:
     """
-    Return the environment that a model was given, or that of its id.
+    Return the environment that a model was given, or make it from its id.
 
     :param env: A registered id, an environment or a ``VecEnv``.
     :param n_envs: Number of environments, for an id.
     :param sizes: ``n_episodes`` and ``epoch_steps``.
-    :raises ValueError: if the environment has another number of them, or actions that no policy chooses.
+    :raises ValueError: if a given environment does not have ``n_envs`` environments, or its action space is not
+        supported.
     """
     if isinstance(env, str):
         env = make_episodes_env(env, n_envs, **sizes)
@@ -212,16 +213,17 @@ def make_episodes_env(
     use_processes: bool = True,
 ) -> VecEnv:
     """
-    Vectorise a registered id in the fastest way available.
+    Make a vectorised environment from a registered id, in the fastest way available.
 
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    :param n_envs: Number of environments; default: ``n_episodes`` for a :class:`BatchedVecEnv`, else its largest
-        divisor up to 50; with ``epoch_steps`` as many as run a whole episode each in one epoch.
-    :param n_episodes: Episodes per epoch; default: TDPG's default.
-    :param epoch_steps: Steps per epoch, instead; then at most 10 environments by default.
+    :param n_envs: Number of environments. Default: ``n_episodes`` for a :class:`BatchedVecEnv`, else the largest
+        divisor of ``n_episodes`` up to 50. With ``epoch_steps`` the default is the number of whole episodes that fit
+        into an epoch, but at most 10 unless the result is a :class:`BatchedVecEnv`.
+    :param n_episodes: Number of episodes per epoch; default: TDPG's default.
+    :param epoch_steps: Number of steps per epoch, instead of ``n_episodes``.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether the Panda environments use one process per core, with the same numbers as without.
+    :param use_processes: Whether the Panda environments use one process per core; the numbers are the same either way.
     :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
     :raises ValueError: if a number is not an integer of at least 1.
     :raises gymnasium.error.Error: if the id is not registered.
@@ -245,7 +247,8 @@ def make_episodes_env(
     if n_envs is None:
         with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
             n_envs = _default_n_envs(probe, n_episodes, epoch_steps, batched=False)
-    # make_vec_env requests rendering for an id, which warns where there is none, but not for a function.
+    # For an id, make_vec_env requests rendering, and an environment without rendering then warns. For a function it
+    # does not.
     modes = getattr(_creator(spec), "metadata", {"render_modes": ["rgb_array"]}).get("render_modes", ())
     make = env_id if "rgb_array" in modes else functools.partial(gym.make, env_id)
     return make_vec_env(make, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)

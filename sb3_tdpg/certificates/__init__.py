@@ -1,1 +1,1 @@
-"""Certificates: an upper bound on the expected cost under a declared shift of the sensor or the start."""
+"""Certificates: upper bounds on the expected cost under a declared shift of the sensor or the start."""

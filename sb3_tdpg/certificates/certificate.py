@@ -1,13 +1,14 @@
 r"""
-An upper bound on the expected cost under every distribution close to the training distribution.
+Bound the expected cost from above under every distribution that is close to the training distribution.
 
-The Donsker-Varadhan formula gives, for every :math:`\beta > 0`,
+For the training distribution p, a shifted distribution :math:`\check p` and every :math:`\beta > 0`, the
+Donsker-Varadhan formula gives
 
 .. math::
     \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
     \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c},
 
-and the right side needs costs under p only. It corrects the paper's Theorem II.1; the derivation is in
+The right side needs only costs under p. The bound corrects the paper's Theorem II.1. The derivation is in
 ``docs/guide/certificate.md``.
 
 Dimension key: N episodes, M points of a distribution.
@@ -22,20 +23,20 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import beta as beta_distribution
 
-# All of the highest costs, then ranks that grow by this factor: 400 of a million costs remain.
+# All of the highest costs are kept, then ranks that grow by this factor; 400 of a million costs remain.
 _HIGHEST = 50
 _RANK_FACTOR = 1.04
 
 
 class CostDistribution(NamedTuple):
-    """A distribution on M values that lies, with some confidence, stochastically above that of a cost."""
+    """A distribution on M values that lies, with some confidence, stochastically above the distribution of a cost."""
 
     values: np.ndarray  #: (M,), ascending
     probabilities: np.ndarray  #: (M,)
     confidence: float | None  #: None: without allowance for the sampling error
 
     def with_largest(self, probability: float) -> CostDistribution:
-        """Raise the cost to the largest value in any event of this probability; at worst where the cost is lowest."""
+        """Raise the cost to its largest value in the worst event of this probability, where the cost is lowest."""
         below = np.clip(np.cumsum(self.probabilities) - probability, 0.0, 1.0)
         below[-1] = 1.0
         return self._replace(probabilities=np.diff(below, prepend=0.0))
@@ -56,8 +57,8 @@ class CostDistribution(NamedTuple):
 class Certificate(NamedTuple):
     """An upper bound on an expected cost, and its parts: ``bound = risk + kl / beta``."""
 
-    bound: float  #: on the expected cost
-    beta: float  #: the best or the given one; inf: the bound is the largest cost, 0: it is the mean
+    bound: float  #: upper bound on the expected cost
+    beta: float  #: the best or the given beta; if inf, the bound is the largest cost, and if 0, the mean
     risk: float  #: entropic risk at beta, with the allowance for the sampling error
     kl: float  #: divergence of the shift in nats
 
@@ -67,7 +68,7 @@ def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | No
     Compute the entropic risk (Equation 4), :math:`\frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
 
     :param costs: ``(N,)``
-    :param beta: At least 0; 0 gives the limit, the mean.
+    :param beta: At least 0; 0 gives the mean, which is the limit.
     :param probabilities: Probabilities of the costs, ``(N,)``; default: 1 / N each.
     """
     costs = _checked_costs(costs)
@@ -81,10 +82,11 @@ def _risk(values: np.ndarray, weights: np.ndarray, beta: float) -> float:
     mean = float(weights @ values)
     if beta == 0:
         return mean
-    # Relative to the mean: the difference from it is of the order of beta. scipy's logsumexp takes ten times as long.
+    # Computed relative to the mean, since the difference from it is of the order of beta. scipy's logsumexp takes ten
+    # times as long.
     exponents = beta * (values - mean)
     largest = float(exponents.max())
-    if largest < 1:  # expm1: a small difference from 1 would be rounded away
+    if largest < 1:  # expm1 does not round small differences from 1 away
         return mean + math.log1p(float(weights @ np.expm1(exponents))) / beta
     return mean + (largest + math.log(float(weights @ np.exp(exponents - largest)))) / beta
 
@@ -95,10 +97,10 @@ def cost_distribution(
     r"""
     Bound the distribution of the cost from above by a confidence band around a sample of costs.
 
-    The i-th lowest of N costs has :math:`F(c_{(i)})` above a Beta(i, N + 1 - i) variable. The lower quantiles at
-    ``1 - confidence``, divided by the number of ranks i that are used, hold simultaneously (Bonferroni), and the step
-    function through them is a lower bound on F. The missing probability at the highest cost, about
-    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. This bounds the mean of every increasing function
+    For the i-th lowest of N costs, :math:`F(c_{(i)})` is stochastically above a Beta(i, N + 1 - i) variable. The lower
+    quantiles at ``1 - confidence`` divided by the number of used ranks hold simultaneously (Bonferroni). The step
+    function through these quantiles is a lower bound on F. The remaining probability above the highest cost, about
+    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. The band bounds the mean of every increasing function
     simultaneously, so the entropic risk may be optimised over beta.
 
     :param costs: Independent and identically distributed, ``(N,)``.
@@ -154,7 +156,7 @@ def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = N
     if kl == 0 or width == 0:
         mean = float(weights @ values)
         return Certificate(mean, 0.0, mean, kl)
-    # The divergence of the distribution with all its weight on the largest value.
+    # Compare with the divergence of the distribution that has all its weight on the largest value.
     if kl >= -math.log(max(float(weights[values == largest].sum()), 1e-300)):
         return Certificate(largest, math.inf, largest, kl)
 
@@ -187,7 +189,7 @@ def certificate(
 
 
 def _ranks(n: int) -> np.ndarray:
-    """Choose ranks from 1 to n: all of the highest, then fewer and fewer, and even steps below the middle."""
+    """Choose ranks from 1 to n: all of the highest, then fewer and fewer, and evenly spaced ranks below the middle."""
     from_top: list[np.ndarray] = [np.arange(min(_HIGHEST, n))]
     if n > _HIGHEST:
         n_steps = math.ceil(math.log(n / (2 * _HIGHEST) + 1) / math.log(_RANK_FACTOR))

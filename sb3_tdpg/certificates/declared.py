@@ -1,4 +1,4 @@
-"""Certify saved policies under a declared nuisance: upper bounds on their cost for random members of it."""
+"""Certify saved policies under a declared nuisance: bound their cost for random members of the nuisance."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def certify_nuisance(
     seed: int = 0,
 ) -> str:
     """
-    Certify policies under a declared nuisance, and compare the bounds with the cost that they have under it.
+    Certify policies under a declared nuisance, and compare the bounds with the measured costs.
 
-    The first row of a model is the whole family, a member for each episode; the others are one random member each.
+    The first row of a model is the whole family, with a member for each episode. Each other row is one random member.
 
     :param models: Files that ``model.save()`` wrote.
     :param env_id: The training environment, one of this package.
@@ -49,11 +49,12 @@ def certify_nuisance(
     :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
         the cost of standing at the wall.
     :param env_kwargs: Keywords of the training environment.
-    :param n_episodes: Recorded training episodes; ``n_budget_episodes`` of them are changed by each member.
-    :param n_test_episodes: Episodes under each member, to measure the cost.
+    :param n_episodes: Number of recorded training episodes. Each member perturbs the first ``n_budget_episodes`` of
+        them.
+    :param n_test_episodes: Number of episodes under each member, to measure the cost.
     :param confidence: Confidence of each certificate.
     :return: the summary, as Markdown
-    :raises ValueError: if an argument is wrong; no episode has been run by then.
+    :raises ValueError: if an argument is invalid; no episode has been run then.
     """
     if n_test_episodes < 2 or n_members < 1:
         raise ValueError(f"n_test_episodes={n_test_episodes} must be at least 2, n_members={n_members} at least 1")

@@ -1,4 +1,4 @@
-"""What all certificates share: the policies, the comparison of bound and cost, and the summary."""
+"""Load policies, compare bound and cost, and write the summary, for all certificates."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_tdpg.tdpg import TDPG
 
 
 def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
-    """Load policies by a label, and check that they fit the training environment."""
+    """Load policies, label them, and check that they fit the training environment."""
     models: dict[str, TDPG] = {}
     if twice := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
         raise ValueError(f"{twice[0]} is given twice")
@@ -31,7 +31,7 @@ def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
         except OSError as e:
             raise ValueError(f"{path} cannot be read ({e.strerror}): give .zip files that model.save() wrote") from e
         method = "PG" if model.beta == math.inf else "TDPG"
-        # The shortest label that is free; only the last one contains the whole path.
+        # Choose the shortest label that is free; only the last one contains the whole path.
         labels = (method, f"{method} ({path.parent.name}/{path.stem})", f"{method} ({path})")
         models[next(label for label in labels if label not in models)] = model
     check_models_fit(models, [training])
@@ -52,7 +52,7 @@ def compare(
 
 
 def write_summary(out: Path, sections: Sequence[str], models: Sequence[Path], settings: Mapping[str, Any]) -> str:
-    """Write ``config.json`` and ``summary.md``, and return the latter."""
+    """Write ``config.json`` and ``summary.md``, and return the summary."""
     how = provenance()
     write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
     summary = "\n\n".join([*sections, how_made(how["command"], how)]) + "\n"

@@ -1,9 +1,9 @@
 r"""
-Declared shifts of sensor and start, and how far they move the distribution over episodes, in nats.
+Declare shifts of sensor and start, and compute how far they move the distribution over episodes, in nats.
 
 The actions depend on the observations only through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. A shift of
-the sensor therefore moves states and actions by no more than it moves the TRVs, and the encoder's density is known. The
-derivation is in ``docs/guide/certificate.md``.
+the sensor therefore moves states and actions by no more than it moves the TRVs. The divergence of the TRVs can be
+computed, because the encoder's density is known. The derivation is in ``docs/guide/certificate.md``.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
@@ -44,8 +44,8 @@ from sb3_tdpg.robustness.core import Members
 from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
-INFORMATION_EPISODES = 4_000  # for the bound on the information
-EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of the episodes with a capped divergence to try
+INFORMATION_EPISODES = 4_000  # number of episodes for the bound on the information
+EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of episodes with a capped divergence that are tried
 
 _START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
 
@@ -60,7 +60,7 @@ class Shift:
     :param start_kl: D[shifted start || start in training] in nats.
     :param sensor_kl: Largest D[shifted sensor || sensor in training] of one observation over all states; inf if it is
         not known.
-    :param nuisance: A change of the observations on top of the sensor's: draws what N episodes have of it.
+    :param nuisance: A further change of the observations: a function that draws a member for each of N episodes.
     """
 
     name: str
@@ -71,9 +71,9 @@ class Shift:
 
 
 class Budget(NamedTuple):
-    """How far a shift moves the TRVs; see :meth:`TrainingEpisodes.budgets`."""
+    """Bound on how far a shift moves the TRVs; see :meth:`TrainingEpisodes.budgets`."""
 
-    kl: float  #: in nats
+    kl: float  #: divergence in nats
     exceedance: float  #: probability, in training, of episodes whose divergence is capped
 
 
@@ -99,7 +99,7 @@ class RecordedEpisodes(NamedTuple):
     seed: tuple[int, ...]  # of the sensor
 
     def first(self, n: int | None) -> RecordedEpisodes:
-        """Return the first n of them."""
+        """Return the first n episodes."""
         densities = [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities]
         arrays = (self.costs[:n], self.states[:, :n], self.prev_trvs[:, :n], self.last_trv_noise[:n])
         return RecordedEpisodes(*arrays, densities, self.seed)
@@ -121,7 +121,7 @@ def beta_kl(a: float, b: float) -> float:
 
 
 def wall_cost(horizon: int) -> float:
-    """Return the cost of standing at the wall for a whole episode, the worst place, in both cost definitions."""
+    """Return the cost of a whole episode at the wall, which is the worst place in both cost definitions."""
     return (horizon + 100.0) * float(GOAL[0] - WALL)
 
 
@@ -133,7 +133,7 @@ def lava_shift(
     start_beta: Sequence[float] | None = None,
     training_noise_std: float = 0.01,
 ) -> Shift:
-    """Declare a shift of the lava problem from a uniform start, no bias and the sensor noise of the training."""
+    """Declare a shift of the lava problem; training has a uniform start, no bias and its own sensor noise."""
     noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
     bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
     given = dict(sensor_noise_std=sensor_noise_std, sensor_bias=sensor_bias, start_beta=start_beta)
@@ -147,10 +147,10 @@ def lava_shift(
 
 def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.01) -> list[Shift]:
     """
-    Draw n shifts of the lava problem: noise, bias and start, each changed with probability 1/2, at least one of them.
+    Draw n shifts of the lava problem: noise, bias and start change with probability 1/2 each, at least one of them.
 
-    The noise's variance is log-uniform in [1e-6, 1], the bias has a random direction and a length that is log-uniform
-    in [0.001, 1], the start is Beta(a, b) with a and b log-uniform in [1/2, 2].
+    The noise's variance is log-uniform in [1e-6, 1]. The bias has a random direction and a length that is log-uniform
+    in [0.001, 1]. The start is Beta(a, b), with a and b log-uniform in [1/2, 2].
     """
     random = np.random.default_rng(seed)
     shifts: list[Shift] = []
@@ -168,18 +168,19 @@ def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.0
 
 class TrainingEpisodes:
     """
-    Recorded training episodes of a policy; the sensor of a shifted environment only observes their states.
+    Record training episodes of a policy; a shifted sensor then observes the recorded states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
-    :param scenario: The training environment, one of this plugin.
-    :param cost_bound: Upper bound on the episode cost. The cost is clipped there: with less than the true bound
-        (:attr:`LavaEnv.cost_bound <sb3_tdpg.envs.lava.LavaEnv.cost_bound>`) the clipped cost is certified.
+    :param scenario: The training environment, one of this package.
+    :param cost_bound: Upper bound on the episode cost. The cost is clipped there. If it is below the true bound
+        (:attr:`LavaEnv.cost_bound <sb3_tdpg.envs.lava.LavaEnv.cost_bound>`), the certificate is for the clipped cost.
     :param n_episodes: Number of episodes for the distribution of the cost.
-    :param n_budget_episodes: Number of the first episodes that are used for the divergence of the TRVs.
+    :param n_budget_episodes: Number of the first episodes, which are used for the divergence of the TRVs.
     :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
-        error probability is spent on the distribution of the cost, half on the divergence.
+        error probability is spent on the distribution of the cost, and half on the divergence.
     :param seed: Seed of the episodes.
-    :raises ValueError: before any episode, if the environment or the model's is unsuitable, or a number is invalid.
+    :raises ValueError: if the environment or that of the model is unsuitable, or a number is invalid; no episode has
+        been run then.
     """
 
     def __init__(
@@ -242,8 +243,8 @@ class TrainingEpisodes:
         Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
 
         Under the shifted distribution, the mean divergence of a step is at most the largest mean over all distributions
-        within the divergence of the earlier steps. Where it exceeds a cap, the bound assumes an unshifted step and the
-        largest episode cost.
+        within the divergence of the earlier steps. Where the divergence exceeds a cap, the bound assumes an unshifted
+        step and the largest episode cost.
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
@@ -283,7 +284,7 @@ class TrainingEpisodes:
         kwargs = {**self.scenario.env_kwargs, **shift.env_kwargs}
         env: Any = _pomdp(self.model, Scenario(shift.name, self.scenario.env_id, kwargs))
         if shift.nuisance is not None:
-            # Drawn once: every call sees the same number of episodes.
+            # The members are drawn once, since every call has the same number of episodes.
             plain, members = env.sensor, functools.cache(shift.nuisance)
             env.sensor = lambda state: members(len(state))(plain(state), None, state)
         return env
@@ -349,13 +350,14 @@ def _information(recorded: RecordedEpisodes) -> float:
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
-    # In double precision: a small divergence is a difference of numbers near 1, and must not be rounded down to 0.
+    # Double precision is needed: a small divergence is a difference of numbers near 1, and must not be rounded down to
+    # 0.
     double = [[Normal(d.mean.double(), d.stddev.double()) for d in densities] for densities in (shifted, training)]
     return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in zip(*double, strict=True)])
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
-    """Sum the divergences of the steps; only an action follows the last TRVs, so the lower of the two counts there."""
+    """Sum the divergences of the steps; of the last TRVs and the last action, only the lower divergence counts."""
 
     def add(budget: Budget, step: CostDistribution) -> Budget:
         capped, exceedance = step.capped(level)

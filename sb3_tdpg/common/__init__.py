@@ -1,1 +1,1 @@
-"""What every room uses: networks with weights per step, running norms, files, provenance, threads, processes."""
+"""Shared helpers: networks with weights per time step, running norms, files, provenance, threads and processes."""

@@ -1,4 +1,4 @@
-"""Write files atomically, and keep a folder for one process."""
+"""Write files atomically, and lock a folder for one process."""
 
 import glob
 import os
@@ -14,7 +14,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-SECONDS_UNTIL_LOCKED = 10.0  # a folder is locked a moment after it was made
+SECONDS_UNTIL_LOCKED = 10.0  # a new folder is locked only a moment after it was made
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -26,17 +26,17 @@ def write_atomically(path: Path, text: str) -> None:
 @contextmanager
 def replaced_atomically(path: Path) -> Iterator[Path]:
     """
-    Give a path to write to; it replaces the target when the block ends without an error.
+    Yield a temporary path, which replaces the target when the block ends without an error.
 
-    Folders are made. Several processes may replace a target at once. After a power cut there is the old or the new
-    content, never a part of it; what a killed process has left is removed the next time.
+    Missing folders are created. Several processes may replace the same target at once. After a power cut the target has
+    the old or the new content, never a part of it. Temporary files of a killed process are removed the next time.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
-        with suppress(OSError), _locked(left):  # not there any more, or somebody writes
+        with suppress(OSError), _locked(left):  # the folder is gone, or another process writes to it
             if time.time() - left.stat().st_mtime > SECONDS_UNTIL_LOCKED:
                 shutil.rmtree(left)
-    # In a folder of its own: a compressed file contains its name, which must not vary.
+    # The path is in a separate folder, because a compressed file contains its own name, which must not vary.
     with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder, ExitStack() as stack:
         with suppress(OSError):  # not every system can lock a folder
             stack.enter_context(_locked(Path(folder)))
@@ -55,7 +55,7 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder until the block ends or this process does; an ``OSError`` if another process has locked it."""
+    """Lock a folder until the block or this process ends; an ``OSError`` means that another process has locked it."""
     if fcntl is None:
         raise OSError("this system cannot lock a folder")
     descriptor = os.open(folder, os.O_RDONLY)
@@ -67,7 +67,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file, or the list of files of a folder, is on the disk."""
+    """Wait until a file, or the list of files of a folder, is written to the disk."""
     with suppress(OSError):  # not every system can flush a folder
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -79,11 +79,11 @@ def _flush(path: Path) -> None:
 @contextmanager
 def kept_by_this_process(folder: Path) -> Iterator[None]:
     """
-    Make a folder of results, and keep other processes out of it until the block ends or this process does.
+    Create a folder for results, and keep other processes out of it until the block or this process ends.
 
-    A new folder that is still empty then is removed, with the new folders above it.
+    A new folder that is still empty at the end is removed, together with the new folders above it.
 
-    :raises ValueError: if another process keeps it.
+    :raises ValueError: if another process has locked the folder.
     :raises OSError: if the folder cannot be written to.
     """
     new = [path for path in (folder, *folder.parents) if not path.exists()]

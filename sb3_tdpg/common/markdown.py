@@ -14,12 +14,12 @@ def markdown_table(
     Write a Markdown table.
 
     :param rows: A frame, a list of dicts, or a list of lists together with ``columns``. The index is left out.
-    :param columns: Header of the table; default: the names that the rows have.
+    :param columns: Header of the table; default: the names in ``rows``.
     :param digits: Decimals of floats. ``NaN`` and ``None`` become empty cells.
     :param align: ``"l"``, ``"r"`` or ``"c"`` for each column; the last letter holds for the remaining columns.
         Default: numbers are right-aligned, everything else is left-aligned.
     """
-    # Here, since the import takes most of a second and a training writes no table.
+    # pandas is imported here, since its import takes most of a second and a training writes no table.
     import pandas as pd
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
@@ -40,7 +40,7 @@ def markdown_table(
 
 
 def fill_template(package: str, template: str, **values: Any) -> str:
-    """Fill a template of the folder ``templates/`` of a package; there is never more than one empty line."""
+    """Fill a template from a package's folder ``templates/``; several empty lines become one."""
     try:
         from jinja2 import Environment, PackageLoader
     except ImportError as e:

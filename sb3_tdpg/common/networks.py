@@ -15,16 +15,16 @@ import numpy as np
 import torch as th
 from torch import nn
 
-# Beyond this horizon one set of weights per step would be slow and would starve: the steps share theirs.
+# Above this horizon the steps share their weights: one set per step would be slow and would get too few samples.
 MAX_TIME_VARYING_HORIZON = 50
-VECTOR = 64  # a multiple of the numbers that any processor handles at a time
+VECTOR = 64  # a multiple of the vector length of any processor, in floats
 
 
 class BatchedLinear(nn.Module):
     """
-    M affine maps with weights of their own, applied to M batches in one call.
+    M affine maps, each with its own weights, applied to M batches in one call.
 
-    The initialisation is that of :class:`torch.nn.Linear`, for each map.
+    Each map is initialised like a :class:`torch.nn.Linear`.
 
     :param n_maps: Number of maps M: the horizon for weights that vary in time, 1 for weights shared by all steps.
     :param in_features: I
@@ -38,7 +38,7 @@ class BatchedLinear(nn.Module):
         self.bias = nn.Parameter(th.empty(n_maps, 1, out_features).uniform_(-bound, bound))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """``(M, N, I) -> (M, N, O)``."""
+        """Apply each map to its batch: ``(M, N, I) -> (M, N, O)``."""
         return th.baddbmm(self.bias, x, self.weight)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
@@ -62,7 +62,7 @@ class BatchedMLP(nn.Module):
         self.activation = activation_fn()
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """``(M, N, I) -> (M, N, O)``."""
+        """Evaluate all networks: ``(M, N, I) -> (M, N, O)``."""
         return self.through(x, BatchedLinear.forward)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
@@ -70,7 +70,7 @@ class BatchedMLP(nn.Module):
         return self.through(x, lambda layer, x: layer.at(x, index))
 
     def through(self, x: th.Tensor, apply: Callable[[Any, th.Tensor], th.Tensor]) -> th.Tensor:
-        """Send inputs through all layers by ``apply(layer, x)``, with the nonlinearity in between."""
+        """Pass inputs through all layers by ``apply(layer, x)``, with the nonlinearity between the layers."""
         *hidden, last = self.layers
         for layer in hidden:
             x = self.activation(apply(layer, x))
@@ -79,17 +79,17 @@ class BatchedMLP(nn.Module):
 
 def flatten_parameters(module: nn.Module) -> nn.Parameter:
     """
-    Lay out the parameters of a module, and their gradients, as views of one vector each.
+    Store all parameters of a module in one vector, and all gradients in another; the originals become views.
 
-    An optimiser's step on one vector takes a fraction of the time of a step on many small tensors. Call it again after
-    the parameters may have been moved or replaced (``to``, ``copy.deepcopy``).
+    An optimiser's step on one vector takes a fraction of the time of a step on many small tensors. Call this function
+    again after the parameters may have been moved or replaced (``to``, ``copy.deepcopy``).
 
     :return: the vector, whose ``grad`` is the vector of all gradients
     """
     parameters = list(module.parameters())
     sizes = [parameter.numel() for parameter in parameters]
-    # PyTorch rounds the last few numbers of a vector differently. With the padding a network makes the same steps
-    # alone as in a larger vector.
+    # PyTorch rounds the last few numbers of a vector differently. With padding, a network makes the same optimiser
+    # steps alone and inside a larger vector.
     sizes.append(-sum(sizes) % VECTOR)
     vector = nn.Parameter(th.cat([*(x.detach().flatten() for x in parameters), parameters[0].new_zeros(sizes[-1])]))
     vector.grad = th.zeros_like(vector)
@@ -100,8 +100,8 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
 
 
 def bounded_variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
-    """Return ``exp(log_var) + floor``, bounded above: unfamiliar observations would drive it to inf."""
-    # A clamp would stop the gradient there.
+    """Return ``exp(log_var) + floor``, bounded above so that unfamiliar observations cannot drive it to infinity."""
+    # A clamp would have a zero gradient at the maximum.
     return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
 
@@ -112,7 +112,7 @@ class TimeMLP(nn.Module):
     :param horizon: Number of time steps T.
     :param sizes: Width of every layer, from the input to the output.
     :param activation_fn: Nonlinearity after each layer but the last.
-    :param time_varying: One set of weights per step, or one for all.
+    :param time_varying: Whether each step has its own set of weights, or all steps share one.
     """
 
     def __init__(
@@ -126,23 +126,23 @@ class TimeMLP(nn.Module):
         self.mlp = BatchedMLP(horizon if time_varying else 1, sizes, activation_fn)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """All steps of all episodes: ``(T, N, I) -> (T, N, O)``."""
+        """Evaluate all steps of all episodes: ``(T, N, I) -> (T, N, O)``."""
         if self.time_varying:
             return self.mlp(x)
         return self.mlp(x.flatten(0, 1)[None])[0].unflatten(0, x.shape[:2])
 
     @th.no_grad()
     def scale_output(self, factor: float) -> None:
-        """Scale the weights of the last layer, for a start with small outputs."""
+        """Scale the parameters of the last layer, so that the outputs are small at the start."""
         for parameter in self.mlp.layers[-1].parameters():
             parameter.mul_(factor)
 
     def at(self, x: th.Tensor, t: int) -> th.Tensor:
-        """One step, the same for all episodes: ``(N, I) -> (N, O)``."""
+        """Evaluate one step, the same for all episodes: ``(N, I) -> (N, O)``."""
         return self.mlp.at(x, t if self.time_varying else 0)
 
     def at_times(self, x: th.Tensor, t: np.ndarray) -> th.Tensor:
-        """Each episode at a step of its own: ``(N, I)`` and ``(N,) -> (N, O)``."""
+        """Evaluate each episode at its own step: ``(N, I)`` and ``(N,) -> (N, O)``."""
         if not self.time_varying or (t == t[0]).all():
             return self.at(x, int(t[0]))
         rows = [np.flatnonzero(t == step) for step in np.unique(t)]

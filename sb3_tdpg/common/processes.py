@@ -1,4 +1,4 @@
-"""Pools of worker processes."""
+"""Open pools of worker processes that stop on Ctrl-C or when their parent is killed."""
 
 import multiprocessing as mp
 import os
@@ -23,9 +23,9 @@ def process_pool(
     """
     Open a pool of worker processes, which start tasks in the order in which they are submitted.
 
-    Every worker computes with one thread, in a process that has computed nothing before; it calls the ``initializer``
-    before its first task. Workers ignore Ctrl-C; an exception in the ``with`` block, such as ``KeyboardInterrupt``,
-    stops all of them at once. They also end when this process is killed.
+    Every worker computes with one thread, in a process that has computed nothing before. It calls the ``initializer``
+    before its first task. Workers ignore Ctrl-C. An exception in the ``with`` block, such as ``KeyboardInterrupt``,
+    stops all workers at once. Workers also end when this process is killed.
     """
     # All workers are forked from one process that has imported the package once and computed nothing.
     context: Any = mp.get_context("spawn")
@@ -34,10 +34,10 @@ def process_pool(
 
         context = mp.get_context("forkserver")
         context.set_forkserver_preload(["sb3_tdpg.tdpg", "sb3_tdpg.common.unblock"])
-        resource_tracker.ensure_running()  # it would unblock what follows
-        with _postponing_ctrl_c(), _blocking_ctrl_c():  # the server is not to hear it while it imports
+        resource_tracker.ensure_running()  # comes first, because it unblocks Ctrl-C
+        with _postponing_ctrl_c(), _blocking_ctrl_c():  # the server must not get Ctrl-C while it imports
             forkserver.ensure_running()
-    # Only this process holds the writing end, so the workers see when it is closed, or when this process has died.
+    # Only this process holds the writing end, so the workers notice when it is closed or this process has died.
     reading, writing = context.Pipe(duplex=False)
     with _Pool(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
         try:
@@ -53,7 +53,7 @@ def process_pool(
 
 
 class _Pool(ProcessPoolExecutor):
-    """Hears Ctrl-C only after a worker has started: otherwise nobody waits for it, and it finds its queues gone."""
+    """A pool that postpones Ctrl-C while a worker starts, so that no worker is left behind without its queues."""
 
     def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
         with _postponing_ctrl_c():
@@ -62,7 +62,7 @@ class _Pool(ProcessPoolExecutor):
 
 @contextmanager
 def _postponing_ctrl_c() -> Iterator[None]:
-    """Act on Ctrl-C at the end of the block; in threads do nothing."""
+    """Postpone Ctrl-C to the end of the block; do nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -78,7 +78,7 @@ def _postponing_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _blocking_ctrl_c() -> Iterator[None]:
-    """Start processes that never hear Ctrl-C."""
+    """Block Ctrl-C for processes that are started in the block."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -89,7 +89,7 @@ def _blocking_ctrl_c() -> Iterator[None]:
 def _start_worker(reading: Connection, initializer: Callable[..., Any] | None, initargs: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_at_end_of, args=(reading,), daemon=True).start()
-    # By default it is a semaphore between processes, which a worker that is stopped would leave behind.
+    # The default lock is a semaphore between processes, which a stopped worker would leave behind.
     tqdm.set_lock(threading.RLock())
     set_threads(1)
     if initializer is not None:

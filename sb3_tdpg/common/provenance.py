@@ -1,4 +1,4 @@
-"""Where a result came from: versions, commit, machine and command, and files that are never half-written."""
+"""Record how a result was made (versions, commit, machine and command), and write its files atomically."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "
 
 def provenance() -> dict[str, Any]:
     """
-    Describe the run that is going on, in plain JSON types.
+    Describe the current run in plain JSON types.
 
-    :return: ``versions``, ``git`` (commit and whether it was changed; None outside a checkout), ``platform``,
-        ``cpu_count``, ``torch_threads``, ``cuda_device`` (None without), ``utc_time``, ``command``
+    :return: ``versions``, ``git`` (commit and whether files were changed; None outside a checkout), ``platform``,
+        ``cpu_count``, ``torch_threads``, ``cuda_device`` (None without a GPU), ``utc_time``, ``command``
     """
     from sb3_tdpg import __version__
 
@@ -58,9 +58,9 @@ def provenance() -> dict[str, Any]:
 
 
 def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str] = ()) -> str:
-    """Say how a summary was made: the command that makes it again, its :func:`provenance`, the commits of its runs."""
+    """Describe how a summary was made: the command to remake it, its :func:`provenance` and the commits of its runs."""
     versions = ", ".join(f"{name} {version}" for name, version in how["versions"].items() if version)
-    git: Mapping[str, Any] | None = how["git"]  # none for an installed package: then its version says it
+    git: Mapping[str, Any] | None = how["git"]  # None for an installed package, which the version identifies
     commit = f" at commit {git['commit']}{' with uncommitted changes' * git['dirty']}" if git else ""
     runs = f"runs at {', '.join(commits)}; " if commits else ""
     return f"Made by `{command}`{commit}, {runs}{how['utc_time']}, {versions}. {how['platform']}."
@@ -68,9 +68,9 @@ def how_made(command: str, how: Mapping[str, Any], commits: Sequence[str] = ()) 
 
 def write_run_config(path: Path, config: Mapping[str, Any]) -> None:
     """
-    Write a run's configuration as JSON, atomically, with its :func:`provenance` unless it has one already.
+    Write a run's configuration as JSON, atomically; a missing :func:`provenance` is added.
 
-    :param path: The file; folders are made.
+    :param path: The file; missing folders are created.
     :param config: Settings and seeds; see ``jsonable``.
     """
     content = jsonable({**config, "provenance": config.get("provenance") or provenance()})
@@ -81,8 +81,8 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
     """
     Raise a ``ValueError`` if a file of :func:`write_run_config` holds another configuration; the provenance may differ.
 
-    The file may be missing. A setting that it lacks is a difference. ``what`` names the content of its folder in the
-    message.
+    A missing file is no error. A setting that is missing in the file is a difference. ``what`` names the content of the
+    folder in the message.
     """
     if not path.exists():
         return
@@ -99,7 +99,7 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
 
 def differences(found: Any, wanted: Any) -> str:
     """
-    Name the first few differences of two values of JSON's types in one line; return an empty text if they are equal.
+    Describe the first few differences between two JSON values in one line; return an empty text if they are equal.
 
     :return: for example ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
     """
@@ -138,7 +138,8 @@ def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
     """
     Write a frame as CSV without its index, atomically; the same frame gives the same bytes.
 
-    The path ends in ``.csv``, or in ``.csv.gz`` or ``.csv.xz`` (smaller) to compress it; folders are made.
+    The path ends in ``.csv``, or in ``.csv.gz`` or ``.csv.xz`` (smaller) for a compressed file. Missing folders are
+    created.
     """
     if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
         raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
@@ -149,7 +150,7 @@ def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
 
 
 def _command() -> str:
-    """Return the command line without the folders of this machine: relative to where it was run."""
+    """Return the command line, with paths relative to the working directory."""
     here = Path.cwd()
     program, *arguments = as_typed(sys.orig_argv)
     relative = [str(Path(a).relative_to(here)) if Path(a).is_relative_to(here) else a for a in arguments]
@@ -165,7 +166,7 @@ def as_typed(command: Sequence[str]) -> list[str]:
 
 
 def _git() -> dict[str, Any] | None:
-    """Commit of the checkout that this package lies in, and whether a tracked file was changed since."""
+    """Return the commit of the checkout that contains this package, and whether tracked files were changed since."""
     package = Path(__file__).resolve().parent
 
     def git(*arguments: str) -> str:
@@ -173,7 +174,7 @@ def _git() -> dict[str, Any] | None:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        # An installed package may lie in a checkout of something else (a virtual environment in a project).
+        # An installed package may lie in the checkout of another project (in a virtual environment there).
         git("ls-files", "--error-unmatch", str(package / "__init__.py"))
         return dict(commit=git("rev-parse", "HEAD"), dirty=bool(git("status", "--porcelain", "--untracked-files=no")))
     except (OSError, subprocess.SubprocessError):
@@ -182,9 +183,9 @@ def _git() -> dict[str, Any] | None:
 
 def jsonable(value: Any) -> Any:
     """
-    Turn a value into what JSON can hold: infinite numbers and unknown types become text, as in ``"inf"``.
+    Convert a value to JSON types; infinite numbers and unknown types become text, such as ``"inf"``.
 
-    A function has the same text in every process, unless it is a closure: its name does not tell what it holds.
+    A function has the same text in every process, unless it is a closure, whose name does not identify its content.
     """
     if isinstance(value, partial):
         return jsonable(dict(function=value.func, arguments=value.args, **value.keywords))

@@ -1,4 +1,4 @@
-"""The state of all random number generators, for checkpoints."""
+"""Capture and restore the state of all random number generators, for checkpoints."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class RandomState:
         )
 
     def restore(self, env: VecEnv) -> None:
-        """Put all generators back; raise a ``ValueError`` if the number of environments differs."""
+        """Restore all generators; raise a ``ValueError`` if the number of environments differs."""
         if len(self.env) != env.num_envs:
             raise ValueError(
                 f"the checkpoint was made with {len(self.env)} environments, the model now has {env.num_envs}: "

@@ -1,4 +1,4 @@
-"""Running statistics of what was seen in training, and what they standardise: vectors and their changes."""
+"""Standardise vectors, and their changes from step to step, by running statistics of the training."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import nn
 
 class RunningNorm(nn.Module):
     """
-    Standardise vectors by the mean and the standard deviation of all that were seen, as SB3's ``VecNormalize``.
+    Standardise vectors by the mean and the standard deviation of all vectors seen, like SB3's ``VecNormalize``.
 
     The statistics are saved with the network. They change only in :meth:`update`, so that an epoch's rollouts and its
     gradients see the same inputs.
@@ -28,7 +28,7 @@ class RunningNorm(nn.Module):
 
     @th.no_grad()
     def update(self, x: th.Tensor) -> None:
-        """Include a batch, ``(n, dim)``, with n of at least 1."""
+        """Update the statistics with a batch, ``(n, dim)``, of at least one vector."""
         n, var, mean = len(x), *th.var_mean(x, dim=0, correction=0)
         total, shift = self.count + n, mean - self.mean
         self.var.copy_((self.count * self.var + n * var + shift.square() * self.count * n / total) / total)
@@ -36,18 +36,18 @@ class RunningNorm(nn.Module):
         self.count.copy_(total)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """``(..., dim) -> (..., dim)``, clipped to [-10, 10]."""
+        """Standardise vectors, and clip them to [-10, 10]: ``(..., dim) -> (..., dim)``."""
         return ((x - self.mean) / th.sqrt(self.var + 1e-8)).clamp(-10.0, 10.0)
 
 
 class Changes(nn.Module):
     """
-    The standardised change of each component since the last step, as far as it says what the components do not.
+    Compute the standardised change of each component since the last step, scaled by the information that it adds.
 
-    Where the velocities of a system are hidden, its last change says how it will go on changing; where they are
-    observed, it does not, and would only be noise. Two predictions of the next change measure this: one from the
-    components and their products, one from the last change as well. The change of a component is multiplied by the
-    share of the variance of its next change that the second explains and the first does not.
+    If the velocities of a system are hidden, the last change helps to predict the next one. If they are observed, the
+    last change adds only noise. Two predictions of the next change measure this: the first uses the components and
+    their products, the second also uses the last change. The change of a component is multiplied by the share of the
+    variance of its next change that only the second prediction explains.
 
     :param dim: F
     """
@@ -62,18 +62,18 @@ class Changes(nn.Module):
     n_updates: th.Tensor
 
     def forward(self, x: th.Tensor, before: th.Tensor) -> th.Tensor:
-        """``(..., F)`` of this step and of the one before ``-> (..., F)``, clipped to [-10, 10]."""
+        """Return the scaled changes from ``before`` to ``x``, ``(..., F)`` each, clipped to [-10, 10]."""
         return ((x - before) * self.share / th.sqrt(self.norm.var + 1e-8)).clamp(-10.0, 10.0)
 
     @th.no_grad()
     def update(self, x: th.Tensor, alive: th.Tensor) -> None:
         """
-        Include an epoch: ``share`` becomes the mean over the epochs.
+        Update the statistics with an epoch; ``share`` is the mean over all epochs.
 
         :param x: ``(T, N, F)``
         :param alive: ``(T, N)``
         """
-        # Episode by episode, so that the two halves are of different episodes, or of different parts of one.
+        # Sort the samples by episode, so that the halves come from different episodes, or different parts of one.
         x, alive = x.transpose(0, 1).double(), alive.transpose(0, 1).bool()
         changes = x[:, 1:] - x[:, :-1]
         if not alive[:, 1:].any():
@@ -81,7 +81,7 @@ class Changes(nn.Module):
         self.norm.update(changes[alive[:, 1:]].float())
         now, last, following = (y[alive[:, 2:]] for y in (x[:, 1:-1], changes[:, :-1], changes[:, 1:]))
         half, dim = len(now) // 2, now.shape[1]
-        if half > 4 * (dim + dim * (dim + 1) // 2):  # otherwise a linear prediction has to do
+        if half > 4 * (dim + dim * (dim + 1) // 2):  # with fewer samples, the prediction is linear
             now = th.cat([now, _products(now)], dim=1)
         if half > 4 * dim:
             alone, together = (_unexplained(inputs, following, half) for inputs in (now, th.cat([now, last], dim=1)))
@@ -99,7 +99,7 @@ def _products(x: th.Tensor) -> th.Tensor:
 
 
 def _unexplained(inputs: th.Tensor, targets: th.Tensor, half: int) -> th.Tensor:
-    """Fit a linear prediction to the first samples; return its mean squared error on the others, ``(F,)``."""
+    """Fit a linear prediction to the first ``half`` samples; return its mean squared error on the others, ``(F,)``."""
     inputs = (inputs - inputs.mean(0)) / inputs.std(0).clamp(min=1e-6)
     inputs = th.cat([inputs, th.ones_like(inputs[:, :1])], dim=1)
     fit, test = inputs[:half], inputs[half:]

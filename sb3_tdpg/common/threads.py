@@ -1,4 +1,4 @@
-"""The cores of the machine, and the threads of torch and of NumPy's linear algebra."""
+"""Count the machine's cores, and limit the threads of torch and of NumPy's linear algebra."""
 
 import os
 from collections.abc import Iterator
@@ -22,11 +22,11 @@ def set_threads(n: int) -> None:
 @contextmanager
 def threads(n: int | None) -> Iterator[None]:
     """
-    Run a block of code, or a function (``@threads(1)``), with this many threads of torch and of the linear algebra of
-    NumPy and SciPy; ``None`` changes nothing.
+    Limit torch and the linear algebra of NumPy and SciPy to this many threads in a block, or in a function
+    (``@threads(1)``); ``None`` changes nothing.
 
-    One thread is best for small arrays. A second thread gains 10 % if a core is free. If other programs use the cores,
-    the two threads wait for each other at every step and can take a hundred times as long.
+    One thread is best for small arrays. Two threads are 10 % faster than one if a core is free. If other programs use
+    the cores, the two threads wait for each other at every step and can take a hundred times as long.
     """
     if n is None:
         yield

@@ -1,5 +1,5 @@
 """
-Read the files of others: plain data where a file allows it, and a word of warning where only pickle can read it.
+Read files of other people: as plain data if possible, and with a warning if only pickle can read them.
 
 docs/guide/trust.md says which command trusts which file.
 """
@@ -12,7 +12,8 @@ from typing import Any
 
 import yaml
 
-# Numbers with arithmetic as in 1/75, text, lists, dict(...), float("inf"), and the layers of torch.nn by name.
+# Plain data are numbers with arithmetic as in 1/75, text, lists, dict(...), float("inf"), and the layers of torch.nn by
+# name.
 _PLAIN_NODES = (
     ast.Expression, ast.Constant, ast.Tuple, ast.List, ast.Dict, ast.UnaryOp, ast.USub, ast.BinOp, ast.Add, ast.Sub,
     ast.Mult, ast.Div, ast.Load, ast.keyword,
@@ -20,7 +21,7 @@ _PLAIN_NODES = (
 
 
 def say_what_is_trusted(*paths: str | os.PathLike[str]) -> None:
-    """Say that loading the models in these files or folders can run code, before they are loaded."""
+    """Warn that loading the models in these files or folders can run code; call it before they are loaded."""
     if not paths:
         return
     names = ", ".join(os.fspath(path) for path in paths[:3]) + f" and {len(paths) - 3} more" * (len(paths) > 3)
@@ -28,10 +29,10 @@ def say_what_is_trusted(*paths: str | os.PathLike[str]) -> None:
 
 
 class PlainLoader(yaml.SafeLoader):
-    """Reads plain YAML and the two Python types that rl-zoo3 writes, and runs nothing."""
+    """A loader for plain YAML and the two Python types that rl-zoo3 writes; it runs no code."""
 
     def get_single_data(self) -> Any:
-        """Return the only document, which has to be a mapping."""
+        """Return the only document, which must be a mapping."""
         try:
             data = super().get_single_data()
             if not isinstance(data, dict):
@@ -40,7 +41,7 @@ class PlainLoader(yaml.SafeLoader):
             reason = " ".join(str(e).split())
             raise ValueError(f"{self.name} is not plain data that rl-zoo3 wrote, and is not read: {reason}") from e
         if isinstance(normalize := data.get("normalize"), str):
-            check_plain(normalize, f"{self.name} has normalize:")  # the zoo evaluates it
+            check_plain(normalize, f"{self.name} has normalize:")  # rl-zoo3 evaluates it
         return data
 
 
@@ -53,10 +54,10 @@ for _tag, _construct in (
 
 def check_plain(text: str, where: str) -> None:
     """
-    Refuse text in Python's notation that is more than plain data, before anyone evaluates it.
+    Raise a ``ValueError`` if a text in Python's notation is more than plain data; call it before the text is evaluated.
 
-    :param where: Begins the message: ``"run.json has -params"``.
-    :raises ValueError: if it calls or names anything else.
+    :param where: Beginning of the message, such as ``"run.json has -params"``.
+    :raises ValueError: if the text calls or names anything else.
     """
     try:
         nodes: Iterable[ast.AST] = ast.walk(ast.parse(text.strip(), mode="eval"))
@@ -76,13 +77,13 @@ def _is_plain(node: ast.AST) -> bool:
 
 
 def plain_name(name: Any, where: str) -> str:
-    """Return the name of a file or a folder; a path, which could lead elsewhere, is refused."""
+    """Return the name of a file or a folder; raise a ``ValueError`` for a path, which could lead elsewhere."""
     if not isinstance(name, str) or name in ("", ".", "..") or {"/", "\\", ":", "\0"} & set(name):
         raise ValueError(f"{where} is {name!r}, which must be the name of a folder, without a path")
     return name
 
 
 def refuse_links(folder: Path) -> None:
-    """Raise a ``ValueError`` if there is a symbolic link in a folder, since it could publish any file."""
+    """Raise a ``ValueError`` if a folder contains a symbolic link, which could publish any file."""
     if link := next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None):
         raise ValueError(f"{link} is a symbolic link, which is not followed: put a copy of the file there")

@@ -1,8 +1,8 @@
-"""Hear Ctrl-C again: the last module that the fork server of ``process_pool`` imports, which starts deaf."""
+"""Unblock Ctrl-C in the fork server of ``process_pool``, which starts with it blocked and imports this module last."""
 
 import signal
 
-# Its children inherit the mask. What was pressed during the imports is dropped.
+# The server's children inherit the signal mask. A Ctrl-C that was pressed during the imports is dropped.
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 signal.signal(signal.SIGINT, signal.default_int_handler)

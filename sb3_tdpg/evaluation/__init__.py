@@ -1,4 +1,4 @@
-"""Evaluation: scenario -> per-episode records -> table -> figure."""
+"""Evaluate policies: run scenarios, record each episode, and make tables and figures."""
 
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map, save_figure, training_curves
 from sb3_tdpg.evaluation.information import InformationReport, information_report, interval_frame, state_knowledge

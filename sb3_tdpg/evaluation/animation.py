@@ -1,5 +1,5 @@
 """
-Videos of a policy: the environment's pictures, and below them the task-relevant variables (TRVs) over time.
+Make videos of a policy: the environment's pictures, with the task-relevant variables (TRVs) over time below.
 
 Dimension key: T time steps of an episode, Z TRVs.
 """
@@ -17,19 +17,20 @@ from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.evaluation.figures import INK, PALETTE, import_matplotlib, tidy
 
 MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below
-# Of a video of this width, in pixels; a wider one has larger letters, since a phone shows all widths alike.
+# The next constants are pixels of a video of width MIN_WIDTH. A wider video has larger letters, since a phone shows
+# videos of all widths at the same size.
 DPI = 100
-PANEL_HEIGHT = 180  # of the plot of the TRVs
-LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # around the axes; the legend is at the right
+PANEL_HEIGHT = 180  # height of the plot of the TRVs
+LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # margins around the axes; the legend is at the right
 SYMBOLS = {"TRV": r"$\tilde{x}_t$", "action": "$u_t$"}
-HOLD = 1.0  # s: how long the last frame of an episode stays
-MAX_LINES = 8  # more TRVs are rows of an image
+HOLD = 1.0  # s: duration of the last frame of an episode
+MAX_LINES = 8  # more TRVs than this are drawn as rows of an image
 
 
 class Episode(NamedTuple):
-    """One episode to show."""
+    """An episode to show in a video."""
 
-    pictures: Sequence[np.ndarray]  # T + 1 of (H, W, 3) uint8, of x_0 ... x_T
+    pictures: Sequence[np.ndarray]  # T + 1 pictures (H, W, 3) uint8, of x_0 ... x_T
     signals: np.ndarray  # (T, Z)
     costs: np.ndarray  # (T,), the last one with the terminal cost
     between: Sequence[Sequence[np.ndarray]] = ()  # pictures between x_t and x_{t+1} for each step, or nothing
@@ -54,7 +55,7 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
 
 
 def _ffmpeg() -> str | None:
-    """Find ffmpeg: the one in Matplotlib's settings (by default, on the PATH), or else the one of imageio-ffmpeg."""
+    """Return the path of ffmpeg from Matplotlib's settings (by default, on the PATH) or from imageio-ffmpeg, if any."""
     import matplotlib as mpl
 
     if (found := shutil.which(mpl.rcParams["animation.ffmpeg_path"])) is not None:
@@ -71,7 +72,7 @@ def save_animation(
     episodes: Sequence[Episode], path: str | os.PathLike[str], *, horizon: int, fps: float, signal: str = "TRV"
 ) -> None:
     """
-    Write episodes as a video, one after the other; the last frame of each stays for about a second.
+    Write episodes as a video, one after the other; the last frame of an episode stays for about a second.
 
     :param episodes: Episodes with pictures of the same size.
     :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
@@ -101,10 +102,10 @@ class _Video:
         scale = width / MIN_WIDTH
         panel = round(scale * PANEL_HEIGHT)
         dpi, total = scale * DPI, height + panel
-        # The tenth of a pixel: a quotient that is rounded down would cost a row of the picture.
+        # A tenth of a pixel is added, because a quotient that is rounded down would cut a row off the picture.
         self.figure: Figure = Figure(figsize=((width + 0.1) / dpi, (total + 0.1) / dpi), dpi=dpi)
         self.canvas = FigureCanvasAgg(self.figure)
-        # Pixel by pixel: the picture in axes would be resampled.
+        # The picture is drawn pixel by pixel, because axes would resample it.
         self._picture = self.figure.figimage(self._enlarged(episodes[0].pictures[0]), xo=0, yo=panel)
         left, right, top, bottom = (scale * margin for margin in (LEFT, RIGHT, TOP, BOTTOM))
         self._axes = axes = self.figure.add_axes((
@@ -113,7 +114,7 @@ class _Video:
         axes.set_xlabel("time step $t$", fontsize=9)
         axes.locator_params(axis="x", integer=True)
         tidy(axes)
-        # All frames share the limits.
+        # All frames share the limits of the axes.
         signals = np.concatenate([episode.signals for episode in episodes])
         self._lines: list[Any] = []
         self._rows: Any = None
@@ -149,7 +150,7 @@ class _Video:
             np.full((n_signals, horizon), np.nan), aspect="auto", interpolation="nearest", cmap="RdBu_r",
             vmin=-largest, vmax=largest, extent=(-0.5, horizon - 0.5, n_signals + 0.5, 0.5),
         )  # fmt: skip
-        self._axes.set_xlim(-0.5, horizon + 0.5)  # the last picture is of the end, after the last TRVs
+        self._axes.set_xlim(-0.5, horizon + 0.5)  # the last picture shows the end, after the last TRVs
         self._axes.set_ylabel(self._signal, fontsize=9)
         box = self._axes.get_position()
         bar = self.figure.add_axes((box.x1 + 0.012, box.y0, 0.012, box.height))
@@ -158,7 +159,7 @@ class _Video:
         bar.set_title(SYMBOLS[self._signal], fontsize=9)
 
     def frames(self) -> Iterator[bool]:
-        """Set the figure to one frame after the other; yield whether it is the last one of its episode."""
+        """Set the figure to each frame in turn; yield whether the frame is the last of its episode."""
         for number, episode in enumerate(self.episodes, start=1):
             cost_so_far = np.concatenate([[0.0], episode.costs.cumsum()])
             for time, picture in episode.film():
@@ -177,7 +178,7 @@ class _Video:
                 yield time == len(episode.costs)
 
     def image(self) -> Image.Image:
-        """Draw the present frame."""
+        """Return the present frame as an image."""
         self.canvas.draw()
         return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3])
 
@@ -189,7 +190,7 @@ def _write_gif(video: _Video, path: Path, fps: float) -> None:
     images, durations = [], []
     for is_last in video.frames():
         images.append(video.image())
-        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; less is shown more slowly
+        durations.append(1000 * HOLD if is_last else max(20, 10 * round(100 / fps)))  # ms; viewers slow shorter frames
     save_gif(path, images, durations)
 
 
@@ -200,15 +201,15 @@ def save_gif(
     palette: Image.Image | None = None,
 ) -> None:
     """
-    Write images of equal size as a looping GIF. All share one palette, because separate palettes flicker.
+    Write images of equal size as a looping GIF. All images share one palette, because separate palettes flicker.
 
     :param path: The file; its folder exists.
-    :param images: RGB.
+    :param images: RGB images.
     :param durations: Duration of each image, in ms.
     :param palette: An image whose palette to use; default: 256 colours of eight of the images.
     """
     if palette is None:
-        # MAXCOVERAGE keeps the colours of small objects, k-means serves large ones.
+        # MAXCOVERAGE keeps the colours of small objects, and k-means improves those of large ones.
         sample = np.concatenate([np.asarray(image) for image in images[:: -(-len(images) // 8)]])
         palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)

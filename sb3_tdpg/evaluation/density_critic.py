@@ -1,5 +1,5 @@
 """
-Critics in closed form: the logarithm of a fitted conditional density over a fitted marginal density.
+Critics in closed form: the logarithm of the ratio of a fitted conditional density to a fitted marginal density.
 
 Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode, M points.
 """
@@ -14,8 +14,8 @@ from scipy.special import logsumexp
 
 LOG_FLOOR = math.log(0.01)  # lower bound of the critic, against outliers
 LENGTHS = (0.3, 1.0)  # widths of the kernel, relative to the median distance
-RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # of the regressions, for each episode
-SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 the mixture of the encoder's densities, 1 a Gaussian
+RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # ridge penalties of the regressions, per episode
+SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 is the encoder's mixture, 1 is a Gaussian
 CONSTANT = 1e-9  # a component that varies by less than this, relative to its size, is constant
 CUTOFF = 1e-9  # relative eigenvalue of the states' correlations below which a component is redundant
 LOG_2_PI = math.log(2 * math.pi)
@@ -30,7 +30,7 @@ class Encoded(NamedTuple):
     trvs: np.ndarray  # (n, K, Z): draws from q(x~ | e); the second half has the noise of the first with opposite sign
 
     def select(self, episodes: np.ndarray) -> Encoded:
-        """Only some episodes, given by their indices."""
+        """Select episodes by their indices."""
         return Encoded(*(x[episodes] for x in self))
 
 
@@ -41,10 +41,11 @@ class DensityCritic:
     For a Gaussian channel from the state to the TRVs it has the form of the optimal critic.
 
     - r is a Gaussian around a regression of the encoder's means on the state: a ridge regression plus a kernel ridge
-      regression of its residuals. Its covariance is that of the residuals plus the encoder's variance, whose logarithm
-      is predicted by the same kind of regression.
+      regression of its residuals. The covariance of r is that of the residuals plus the encoder's variance. The
+      logarithm of this variance is predicted by the same kind of regression.
     - a is a smoothed mixture of the encoder's densities: every mean is moved towards the centre, and each density is
-      widened so that the covariance of the mixture stays the same. Smoothing 0 is the mixture itself, 1 a Gaussian.
+      widened so that the covariance of the mixture stays the same. A smoothing of 0 gives the mixture itself, and 1
+      gives a Gaussian.
 
     The ridges and the smoothing minimise the leave-one-out error on the same episodes.
 
@@ -99,7 +100,7 @@ class DensityCritic:
 
 class GaussianCritic:
     r"""
-    The critic :math:`F(x, \tilde x) = \log r(\tilde x \mid x) / a(\tilde x)` of Gaussians with the episodes' moments.
+    The critic :math:`F(x, \tilde x) = \log r(\tilde x \mid x) / a(\tilde x)` with Gaussian densities.
 
     r is a Gaussian around the linear regression of the encoder's means on the state, and a is a Gaussian with the mean
     and covariance of the TRVs. The encoder's variance is known in both. This is the optimal critic for jointly Gaussian
@@ -136,7 +137,7 @@ def varies(inputs: np.ndarray) -> np.ndarray:
 
 class Regression:
     """
-    A ridge regression and a kernel ridge regression of its residuals, for each target, ``(n, Y)``, separately.
+    Fit a ridge regression and a kernel ridge regression of its residuals, separately for each target, ``(n, Y)``.
 
     Constant components of the inputs, ``(n, X)``, are ignored.
     """
@@ -154,7 +155,7 @@ class Regression:
         self._coefficients = vt.T @ (shrinkage * (u.T @ centred) / s[:, None])
 
         linear = centred - self._inputs @ self._coefficients
-        # The residuals of the fit are smaller than those of episodes that it has not seen.
+        # The residuals of fitted episodes are smaller than those of unseen episodes.
         spare = np.maximum(1 - 1 / n - np.square(u) @ shrinkage, 1e-12)  # (n, Y)
         square = self._distances(self._inputs)
         self._widths = np.square(LENGTHS) * (np.median(square) or 1.0)
@@ -182,7 +183,7 @@ class Regression:
         return (inputs - self._centre) / self._scale
 
     def _distances(self, inputs: np.ndarray) -> np.ndarray:
-        """Return the squared distances from the episodes of the fit: ``(M, n)``."""
+        """Return the squared distances to the episodes of the fit: ``(M, n)``."""
         square = (inputs**2).sum(axis=1)[:, None] - 2 * inputs @ self._inputs.T + (self._inputs**2).sum(axis=1)
         return np.maximum(square, 0.0)
 
@@ -200,14 +201,14 @@ def _choose_ridge(
 
     :param basis: Orthonormal columns ``(n, R)``, with their squared singular values ``values``, ``(R,)``.
     :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
-    :param leverage: Leverage of each episode in the fit of the mean that the targets are distances from.
-    :param spare_before: ``1 - h``, ``(n, Y)``, if the targets are residuals of an earlier regression: h is the leverage
-        of each episode in it.
+    :param leverage: Leverage of each episode in the fit of the mean that was subtracted from the targets.
+    :param spare_before: ``1 - h``, ``(n, Y)``, if the targets are residuals of an earlier regression, in which an
+        episode has the leverage h.
     :return: the shrinkage factors of the projections, ``(R, Y)``, and the leave-one-out residuals, ``(n, Y)``
     """
     n = len(targets)
     projections, leverages = basis.T @ targets, np.square(basis)
-    # The part outside the basis. By complements, since 1 - h loses its digits where a kernel interpolates.
+    # This is the part outside the basis. It uses complements, since 1 - h loses digits where a kernel interpolates.
     beyond, spare = targets - basis @ projections, np.maximum(1 - leverage - leverages.sum(axis=1), 1e-12)
     choices, residuals = [np.zeros_like(values)], [otherwise]
     for ridge in RIDGES:
@@ -221,7 +222,7 @@ def _choose_ridge(
 
 
 def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Map noise of these variances to variance 1, and the covariance to a diagonal: map, diagonal, log-determinant."""
+    """Return a map to noise of variance 1 and a diagonal covariance, that diagonal, and the map's log-determinant."""
     scale = 1 / np.sqrt(noise)
     values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
     return vectors.T * scale, np.maximum(values, 0.0), float(np.log(scale).sum())

@@ -1,4 +1,4 @@
-"""Watch a saved policy: run some episodes, print their costs, record them as a video."""
+"""Run some episodes of a saved policy, print their costs, and record them as a video."""
 
 import contextlib
 import os
@@ -39,11 +39,10 @@ def enjoy(
     :param seed: Seed of the environment and of the policy's sampling.
     :param n_episodes: Number of episodes.
     :param deterministic: Act without noise, which changes the policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param record: Write a video there, ``.gif`` or ``.mp4``, with the TRVs below the picture; of other models, the
-        actions. A method ``film`` of the environment returns the pictures
-        between two steps.
+    :param record: File for a video, ``.gif`` or ``.mp4``. The TRVs are drawn below the picture; for other models, the
+        actions are drawn. If the environment has a method ``film``, it returns the pictures between two steps.
     :return: the episodes; without ``record`` they have no pictures
-    :raises ValueError: if there is no model, it does not fit the environment, or a video cannot be made.
+    :raises ValueError: if the model cannot be loaded or does not fit the environment, or if the video cannot be made.
     """
     env_kwargs = dict(env_kwargs or {})
     if record is not None:
@@ -79,7 +78,7 @@ def enjoy(
 
 
 class _Recorder(gym.Wrapper):
-    """Record pictures, and costs in double precision, which a vectorised environment drops at its automatic reset."""
+    """Record pictures, and costs in double precision, which a vectorised environment loses at its automatic reset."""
 
     def __init__(self, env: gym.Env, with_pictures: bool) -> None:
         super().__init__(env)

@@ -1,4 +1,4 @@
-"""The environment of a scenario, wrapped for a model, and the checks that the two fit together."""
+"""Make the environment of a scenario, wrapped for a model, and check that the two fit together."""
 
 import contextlib
 import copy
@@ -20,9 +20,9 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
     """
     Make a new environment of a scenario (see ``make_episodes_env``), wrapped as an SB3 model needs it.
 
-    If the model's own environment normalises observations (``VecNormalize``), the new one does so with the same
-    statistics, frozen. If the model's observations are stacked (``VecFrameStack``), the new ones are, too. The
-    scenario's ``sensor`` is put around the environment, inside the wrappers of the model.
+    If the model's own environment normalises observations (``VecNormalize``), the new environment does so with the
+    same, frozen statistics. If the model's observations are stacked (``VecFrameStack``), the new observations are
+    stacked, too. The scenario's ``sensor`` wraps the environment, inside the wrappers of the model.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False
@@ -59,7 +59,7 @@ def check_statistics(model: Any, normalize: VecNormalize | None) -> None:
 
 
 def stacked_for(model: Any, env: VecEnv) -> VecEnv:
-    """Stack as many observations as a model was trained on at once (``VecFrameStack``)."""
+    """Stack observations (``VecFrameStack``) if the model was trained on stacked observations."""
     if (trained := getattr(model, "env", None)) is not None and not is_vecenv_wrapped(trained, VecFrameStack):
         return env
     own, single = model.observation_space, env.observation_space
@@ -72,9 +72,9 @@ def stacked_for(model: Any, env: VecEnv) -> VecEnv:
 
 def load_statistics(path: Path, env: VecEnv, model: Any = None) -> VecNormalize:
     """
-    Normalise an environment as in a training, with the statistics that ``VecNormalize.save`` wrote.
+    Normalise an environment as in training, with the statistics that ``VecNormalize.save`` wrote.
 
-    :param model: Stack the observations first if the statistics are of all that this model sees at once.
+    :param model: Model whose observations are stacked before the normalisation if the statistics are of stacked ones.
     :raises ValueError: if the file is damaged.
     """
     try:
@@ -83,7 +83,7 @@ def load_statistics(path: Path, env: VecEnv, model: Any = None) -> VecNormalize:
             env = stacked_for(model, env)
         normalize.set_venv(env)
         return normalize
-    except Exception as e:  # damaged bytes lead to any error
+    except Exception as e:  # a damaged file can raise any error
         reason = " ".join(str(e).split())[:200]
         raise ValueError(f"{path} cannot be loaded ({reason}): it must be what VecNormalize.save() wrote") from e
 

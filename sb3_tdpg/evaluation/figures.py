@@ -1,4 +1,4 @@
-"""From records to figures, in Matplotlib's object-oriented interface: no window, no global state."""
+"""Draw figures from records with Matplotlib's object-oriented interface, without windows or global state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # The palette of Okabe and Ito, safe for colour-blind readers: vermillion, blue, green, ...
 PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#999999", "#000000")
 INK = "#333333"
-# Marker and name of the bounds that the limits of an information interval come from.
+# Markers and names of the bounds that give the limits of an information interval.
 BOUNDS = {
     "lower": {"critic": ("^", "frozen critic"), "gaussian": ("o", "Gaussian critic"), "zero": ("_", "never negative")},
     "upper": {"logdet": ("v", "log-det"), "loo": ("s", "leave-one-out"), "marginal": ("D", "fitted marginal")},
@@ -33,7 +33,7 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
     """
     Draw cost and information over the policy epochs; the cost axis is logarithmic if all costs are positive.
 
-    :param progress: Log of SB3's CSV logger by label: ``pandas.read_csv("progress.csv")``.
+    :param progress: Logs of SB3's CSV logger by label, each read with ``pandas.read_csv("progress.csv")``.
     """
     figure, ((cost, information),) = new_panels(WIDTH, 2.8, 1, 2)
     for color, (label, frame) in zip(cycle(PALETTE), progress.items(), strict=False):
@@ -54,14 +54,14 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
 
 def information_timeline(frame: pd.DataFrame) -> Figure:
     """
-    Draw the interval for I[x_t; x~_t] over the time steps, with the bounds that its limits come from.
+    Draw the interval for I[x_t; x~_t] over the time steps, and mark the bounds that give its limits.
 
-    :param frame: From :func:`~sb3_tdpg.evaluation.interval_frame`.
+    :param frame: Result of :func:`~sb3_tdpg.evaluation.interval_frame`.
     """
     figure, ((axes,),) = new_panels(WIDTH * 0.75, 3.4)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
     axes.fill_between(t, lower, upper, color=PALETTE[1], alpha=0.12, linewidth=0)
-    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # visible also with one step
+    axes.vlines(t, lower, upper, color=PALETTE[1], alpha=0.25, linewidth=8)  # so that a single step is visible, too
     axes.plot(t, frame[["lower", "upper"]], color=PALETTE[1], linewidth=0.8)
     for limit, markers in BOUNDS.items():
         for name, (marker, label) in markers.items():
@@ -85,7 +85,7 @@ def knowledge_map(frame: pd.DataFrame) -> Figure:
 
     Constant components are grey. Values in brackets are not distinguishable from 0.
 
-    :param frame: From :func:`~sb3_tdpg.evaluation.state_knowledge`.
+    :param frame: Result of :func:`~sb3_tdpg.evaluation.state_knowledge`.
     :raises ValueError: if the frame has no component.
     """
     if len(frame) == 0:
@@ -123,9 +123,9 @@ def short_name(row: str) -> str:
 
 
 def legend_above(figure: Figure, axes: Axes, most: int = 3) -> None:
-    """Draw the legend of the axes above the figure, in at most as many columns."""
+    """Draw the legend of the axes above the figure, in at most ``most`` columns."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = -(-len(labels) // -(-len(labels) // most))  # as few rows as possible, evenly filled
+    columns = -(-len(labels) // -(-len(labels) // most))  # use as few rows as possible, evenly filled
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
 
 

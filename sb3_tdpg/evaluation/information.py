@@ -1,5 +1,5 @@
 """
-The information in the TRVs of any policy, measured on fresh episodes and independently of its training.
+Measure the information in the TRVs of a policy on fresh episodes, independently of its training.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
@@ -42,10 +42,10 @@ ESTIMATES = ("interval", "knowledge", "checks")  # the parts of an information r
 
 
 class InformationBounds(NamedTuple):
-    """Sums over the time steps of an episode, in nats."""
+    """Bounds on the information, summed over the time steps of an episode, in nats."""
 
     upper: float  # upper bound on I[x_t; x~_t]: the log-det bound
-    lower: float  # on I[encoder input; x~_t], which is I[x_t; x~_t] without memory and sensor noise
+    lower: float  # lower bound on I[encoder input; x~_t]; this is I[x_t; x~_t] without memory and sensor noise
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class InformationReport:
     interval: InformationInterval
     """Interval for I[x_t; x~_t] at each time step."""
     knowledge: pd.DataFrame
-    """Information about each component of the state, at most the upper limit of the interval: see
+    """Information about each component of the state, capped at the upper limit of the interval; see
     :func:`~sb3_tdpg.evaluation.state_knowledge`."""
     badge: TrustBadge
     """Checks of the interval and of the components."""
@@ -64,7 +64,7 @@ class InformationReport:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The interval as a frame: see :func:`interval_frame`."""
+        """The interval as a frame; see :func:`interval_frame`."""
         return interval_frame(self.interval)
 
     def figures(self) -> dict[str, Figure]:
@@ -85,10 +85,10 @@ def information_report(
     model: Any, env: VecEnv, n_episodes: int = 500, seed: int = 0, *, at_end: Callable[[], Any] = lambda: None
 ) -> InformationReport:
     """
-    Run fresh episodes and estimate what the policy's TRVs know about the state at each time step.
+    Run fresh episodes and estimate the information of the policy's TRVs about the state at each time step.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
-    :param env: Any number of environments.
+    :param env: A ``VecEnv`` with any number of environments.
     :param n_episodes: Number of episodes N; with fewer environments they are run in rounds.
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
     :param at_end: Called at the end of each of the three ``ESTIMATES``.
@@ -116,11 +116,11 @@ def information_report(
 
 
 def within(known: pd.DataFrame, interval: InformationInterval) -> tuple[pd.DataFrame, TrustCheck]:
-    """Limit what is known about each component by the upper limit of the whole state, and check that it fits."""
+    """Cap the information about each component at the limit for the whole state, and check it against this limit."""
     upper = interval.upper[known["t"]]
     excess = (known["nats_lower"] - upper).max()
     meaning = "nats by which the lower limit of a component of the state is above the upper limit of the whole state"
-    # Without a component that varies nothing exceeds the limit.
+    # If no component varies, nothing exceeds the limit.
     check = TrustCheck("components", max(0.0, float(excess)), 0.0, meaning)
     limited = {name: np.minimum(known[name], upper) for name in ("nats", "nats_lower")}
     return known.assign(**limited), check
@@ -129,16 +129,16 @@ def within(known: pd.DataFrame, interval: InformationInterval) -> tuple[pd.DataF
 @threads(1)
 def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None, *, seed: int = 0) -> pd.DataFrame:
     """
-    Estimate what the TRVs know about each component of the state at each time step.
+    Estimate the information of the TRVs about each component of the state at each time step.
 
     Components may share information, so their sum is not the information about the whole state.
 
-    :param batch: Rollouts ``(T, N, ...)``, for instance of :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
+    :param batch: Rollouts ``(T, N, ...)``, for instance from :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
     :param names: Names of the X components; default: ``x0``, ``x1``, ...
     :return: A row for each time step and component, with the columns ``t``, ``component``, ``nats`` (a lower bound on
         I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit of 95 %, clipped at 0) and ``r2`` (of a
-        leave-one-out regression of the component on the TRVs, clipped at 0). NaN where a component is constant and
-        where too few episodes are alive. Components that are constant at all time steps are left out.
+        leave-one-out regression of the component on the TRVs, clipped at 0). Values are NaN where a component is
+        constant and where too few episodes are alive. Components that are constant at all time steps are left out.
     """
     horizon, _, n_components = batch.states.shape
     names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
@@ -165,9 +165,9 @@ def interval_frame(interval: InformationInterval) -> pd.DataFrame:
     """
     Convert an interval to a frame with a row for each time step.
 
-    The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the bounds ``lower_name`` and ``upper_name`` that
-    they come from, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``, ``marginal``) and
-    ``n_episodes``.
+    The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the names of the bounds that give them,
+    ``lower_name`` and ``upper_name``, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``,
+    ``marginal``) and ``n_episodes``.
     """
     columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
     t = np.arange(len(interval.lower))
@@ -180,15 +180,15 @@ def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> tuple[Informat
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
     :param env: N environments.
-    :return: the samples ``(T, N, ...)``, on the CPU, of episodes that are not alive after their end, and their costs,
-        ``(N,)``
+    :return: the samples ``(T, N, ...)``, on the CPU, with ``alive`` False after the end of an episode, and the costs of
+        the episodes, ``(N,)``
     """
     problem = read_problem(env)
     steps, costs = [], np.zeros(env.num_envs)
     episodes = rollout(model, env, seeds=evaluation_seeds(seed), problem=problem, encode=True)
     for step in islice(episodes, problem.horizon):
         assert step.encoded is not None
-        alive = step.episode == 0  # what follows is another episode
+        alive = step.episode == 0  # later steps belong to another episode
         encoded = (x.cpu() for x in (step.encoded.trvs, step.encoded.means, step.encoded.stds))
         steps.append((th.as_tensor(step.states, dtype=th.float32), *encoded, th.as_tensor(alive)))
         costs -= step.rewards * alive
@@ -203,13 +203,13 @@ def rollout_information(model: Any, scenario: Scenario, n_episodes: int = 1000, 
 
 def information_bounds(batch: InformationBatch) -> InformationBounds:
     """
-    Bound the information of a batch, summed over time.
+    Return an upper and a lower bound on the information of a batch, summed over time.
 
-    A step with too few live episodes for an estimate counts as much as the last step with enough. If it counted as 0,
-    policies with many TRVs, which need more episodes, would seem to know less. The estimate of the lower bound can
-    exceed the upper bound, because the TRVs are sampled, and is clipped there.
+    A step with too few living episodes for an estimate counts as much as the last step with enough episodes. If it
+    counted as 0, policies with many TRVs, which need more episodes, would seem to have less information. The estimate
+    of the lower bound can exceed the upper bound, because the TRVs are sampled. It is clipped at the upper bound.
 
-    :param batch: From :func:`encode_episodes`, ``(T, N, ...)``.
+    :param batch: Result of :func:`encode_episodes`, ``(T, N, ...)``.
     """
     n_episodes, trv_dim = batch.trvs.shape[1:]
     if n_episodes < trv_dim + 2:
@@ -234,8 +234,9 @@ def _lower_bound(at_t: InformationBatch) -> float:
     Estimate the bound of :func:`~sb3_tdpg.information.loo.own_sample_bound`, with less noise from sampling the TRVs.
 
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
-    :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0
-    given the encoder's inputs. It is the control variate: for a Gaussian mixture it would remove all of the noise.
+    :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0 given
+    the encoder's inputs. This difference is the control variate. If the mixture were Gaussian, it would remove all of
+    the noise.
     """
     log_density = log_density_matrix(at_t)[0].double()
     own = log_density.diagonal() - log_density.logsumexp(dim=1) + math.log(len(log_density))  # (N,)

@@ -14,17 +14,18 @@ class InformationCallback(TDPGCallback):
     """
     Log a confidence interval (95 %) of the information, in addition to the estimate that the policy is trained with.
 
-    The interval is computed from the epoch's rollouts, which were made with the current policy. It works without the
-    penalty and does not change the training. It logs ``mi/lower`` and ``mi/upper``, the limits summed over time;
-    ``mi/lower_t00``, ``mi/upper_t00``, ... for each time step (TensorBoard only); and ``mi/knows_d``, ..., a lower
-    bound of the information about each component of the state, averaged over the time steps at which it varies.
-    Components are named as in the environment's ``state_names``, without the unit, or ``x0``, ``x1``, ...; those with
-    long names are left out on the console.
+    The interval is computed from the epoch's rollouts, which were made with the current policy. The callback works
+    without the penalty and does not change the training. The keys ``mi/lower`` and ``mi/upper`` are the limits summed
+    over time. The keys ``mi/lower_t00``, ``mi/upper_t00``, ... are the limits of each time step (TensorBoard only). The
+    keys ``mi/knows_d``, ... are lower bounds of the information about each component of the state, averaged over the
+    time steps at which the component varies. Components are named as in the environment's ``state_names``, without the
+    unit, or ``x0``, ``x1``, ...; long keys are left out on the console.
 
-    Where the steps share their weights, one random step of each episode is a sample, since those of one episode are not
-    independent; every episode counts the same. An epoch that has too few of them is passed over with a warning.
+    If the time steps share their weights, the interval uses one random step of each episode, since the steps of an
+    episode are not independent. Every episode then has the same weight. An epoch with too few episodes is skipped with
+    a warning.
 
-    :param eval_freq: Epochs from one interval to the next, beginning with the first.
+    :param eval_freq: Number of epochs from one interval to the next, beginning with the first epoch.
     :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.
     """
 
@@ -38,7 +39,7 @@ class InformationCallback(TDPGCallback):
     def _on_training_start(self) -> None:
         model, needed = self.tdpg, min_episodes(self.tdpg.policy.trv_dim)
         n_episodes = model.epoch_size // model.horizon
-        # With epoch_steps an epoch may have more of them, which end early.
+        # With epoch_steps an epoch may have more episodes, if some end early.
         if model.epoch_steps is None and n_episodes < needed:
             raise ValueError(
                 f"n_episodes={n_episodes} is too small for an interval of the information in {model.policy.trv_dim} "
@@ -63,7 +64,7 @@ class InformationCallback(TDPGCallback):
             t = (np.random.default_rng(model.epoch).random(n_episodes) * lengths).astype(int)
             batch = InformationBatch(*(x[t, np.arange(n_episodes)][None] for x in batch[:4]))
         self.interval = information_interval(batch, seed=model.epoch)
-        # As mi/total: of an episode, also where one estimate is made for its steps.
+        # As for mi/total, the values are those of an episode, also if its steps share one estimate.
         n_steps = model.rollout_buffer.mean_length if model.pools_information else 1.0
         for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
             self.logger.record(f"mi/{limit}", total * n_steps)
@@ -74,6 +75,6 @@ class InformationCallback(TDPGCallback):
         for name, values in zip(read_problem(self.training_env).state_names, estimates.T, strict=True):
             if np.isfinite(values).any():
                 key = f"mi/knows_{name.split(' (')[0]}"
-                # The console cuts longer keys, and two that become equal would end the training.
+                # The console truncates longer keys, and two keys that become equal would stop the training.
                 exclude = ("stdout", "log") if len(key) > 36 else ()
                 self.logger.record(key, float(np.nanmean(values.clip(min=0))), exclude=exclude)

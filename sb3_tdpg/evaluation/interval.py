@@ -27,8 +27,8 @@ from sb3_tdpg.information.base import InformationBatch
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
-COMPONENT_CONFIDENCE = 0.95  # of a lower limit for one component of the state, which is one-sided
-# Shares of the probability to miss. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
+COMPONENT_CONFIDENCE = 0.95  # of the one-sided lower limit for a component of the state
+# Shares of the error probability. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
 LOWER_BOUNDS = ("critic", "gaussian")
@@ -37,7 +37,7 @@ UPPER_BOUNDS = ("logdet", "loo", "marginal")
 
 @dataclass(frozen=True)
 class InformationInterval:
-    """Confidence limits of I[x_t; x~_t] at every time step in nats, NaN where fewer than ``min_episodes`` live."""
+    """Confidence limits of I[x_t; x~_t] at every time step, in nats; NaN with fewer than ``min_episodes`` alive."""
 
     lower: np.ndarray
     """``(T,)``: lower confidence limits, never below 0."""
@@ -47,15 +47,15 @@ class InformationInterval:
     """The bound that gives the lower limit of each step: ``"critic"`` or ``"gaussian"``, ``"zero"`` where both are
     negative, ``""`` where there is no limit."""
     upper_name: tuple[str, ...]
-    """Likewise ``"logdet"``, ``"loo"`` or ``"marginal"``."""
+    """The bound that gives the upper limit of each step: ``"logdet"``, ``"loo"``, ``"marginal"`` or ``""``."""
     estimates: dict[str, np.ndarray]
     """Point estimate of each bound, ``(T,)``, by name."""
     errors: dict[str, np.ndarray]
     """Standard error of each estimate, ``(T,)``, by name."""
     n_episodes: np.ndarray
-    """``(T,)``: episodes alive."""
+    """``(T,)``: number of living episodes."""
     confidence: float
-    """Probability, at least, that the interval of a step contains the truth."""
+    """Minimum probability that the interval of a step contains the true value."""
 
     @property
     def total(self) -> tuple[float, float]:
@@ -75,14 +75,14 @@ def normal_quantile(miss: float) -> float:
 
 def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
-    Divide the probability to miss between two limits, given the gap between their bounds.
+    Divide the error probability between two limits, given the gap between their bounds.
 
-    The truth lies in the gap, and a limit far from it cannot miss it. The worst case is a truth at either end of the
-    gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c standard errors from their
-    bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets half of the probability, with a
-    wide gap each gets all of it.
+    The true value lies in the gap, and a limit that is far from it cannot miss it. In the worst case the true value is
+    at either end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c
+    standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets half
+    of the probability. With a wide gap each limit gets all of it.
 
-    :param miss: Probability that either limit misses.
+    :param miss: Probability that either limit misses the true value.
     :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.
     """
     from scipy.optimize import brentq  # its import takes half a second
@@ -99,12 +99,13 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
 
 def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     r"""
-    Return the number c of standard errors that any of several correlated Gaussians exceeds with at most ``miss``.
+    Return how many standard errors any of several correlated Gaussians exceeds with a probability of at most ``miss``.
 
     Hunter's inequality (1976, Journal of Applied Probability 13(3)) bounds this probability by the sum of the single
-    probabilities minus the joint ones of the first Gaussian with each other. With Owen's function T this is
-    :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
-    of one, independent ones about Bonferroni's. The probability must be below 0.5.
+    probabilities minus the joint probabilities of the first Gaussian with each other one. With Owen's function T, the
+    bound for c standard errors is :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully
+    correlated Gaussians give the quantile of a single Gaussian, and independent ones about Bonferroni's quantile.
+    ``miss`` must be below 0.5.
     """
     from scipy.optimize import brentq
 
@@ -132,7 +133,7 @@ def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, flo
 
 
 def _gap(below: Collection[Estimate], above: Collection[Estimate]) -> float:
-    """Return the distance between the tightest bounds in standard errors."""
+    """Return the distance between the tightest lower and upper bounds, in standard errors."""
     if not (below and above):
         return math.nan
     lower, upper = max(below, key=lambda bound: bound.value), min(above, key=lambda bound: bound.value)
@@ -145,7 +146,7 @@ def min_episodes(trv_dim: int) -> int:
 
 
 def _steps(batch: InformationBatch, seed: int) -> Iterator[tuple[int, Encoded, np.random.Generator]]:
-    """Yield the time steps with enough living episodes, with draws of the TRVs and a random generator for each."""
+    """Yield the time steps with enough living episodes, each with draws of the TRVs and a random generator."""
     check_batch(batch)
     for t in np.flatnonzero(batch.living.sum(1).cpu() >= min_episodes(batch.trvs.shape[2])).tolist():
         rng = np.random.default_rng((seed, t))
@@ -162,39 +163,42 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
     which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
-    on the others. There are two kinds, and the larger bound counts:
+    on the others. There are two kinds of critics, and the larger bound counts:
 
-    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to each half of the episodes and
-      evaluated on the other. Up to 300 episodes are divided in three ways, since each division misses some pairs.
-    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, which is fitted fast and therefore
-      to more episodes: to all but two of eight groups, and evaluated on these two (of five groups with more than 300
-      episodes). It is tighter where states and TRVs are about jointly Gaussian.
+    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to one half of the episodes and
+      evaluated on the other half, and vice versa. Up to 300 episodes are divided in three ways, since each division
+      misses some pairs.
+    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, which is fast to fit and therefore
+      fitted to more episodes: to all but two of eight groups (of five groups for more than 300 episodes), and evaluated
+      on these two. It is tighter if states and TRVs are about jointly Gaussian.
 
     The means over episodes and pairs are taken over all critics of a kind before the logarithm. The encoder's density
-    alone gives no lower bound: it bounds the information about the encoder's *input*, which can be larger.
+    alone gives no lower bound, because it bounds the information about the encoder's *input*, which can be larger.
 
     **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
     e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
 
-    - ``"logdet"``: :class:`~sb3_tdpg.information.logdet.LogDet`, its bias removed by the jackknife;
+    - ``"logdet"``: :class:`~sb3_tdpg.information.logdet.LogDet`, with its bias removed by the jackknife;
     - ``"loo"``: :class:`~sb3_tdpg.information.loo.LeaveOneOut`;
     - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the marginal density a of the critic, also on
       fresh episodes.
 
     Each episode uses the mean over several draws of x~ given e, since the encoder's density is known. Control variates
-    remove the deviation of the noise from its expected mean square. Both reduce the error and change no expectation.
+    remove the deviation of the noise from its expected mean square. Both methods reduce the error and leave the
+    expectation unchanged.
 
-    Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of
-    the probability to miss, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
-    contributions of episodes: means that are too low come with standard errors that are too small. The shares depend on
-    the gap between the estimates (``miss_of_each_limit``), and each is valid for all bounds of a side together, since
-    the tightest is chosen (``joint_quantile``). The confidence is that of each step alone. Above about ``ln N`` nats
-    the lower limit becomes loose; it cannot exceed about ``ln(N^2 / 10)``.
+    Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of the
+    error probability, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
+    contributions of episodes, where means that are too low come with standard errors that are too small. The
+    probabilities of the two limits also depend on the gap between the estimates (``miss_of_each_limit``). Each limit is
+    valid for all bounds of its side together, because the tightest bound is chosen (``joint_quantile``). The confidence
+    holds for each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot exceed about
+    ``ln(N^2 / 10)``.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
-    :param confidence: Probability, at least, that the interval of a step contains the truth.
+    :param confidence: Minimum probability that the interval of a step contains the true value.
     :param seed: Seed of the divisions of the episodes and of the noise.
-    :raises ValueError: if ``confidence`` is not in (0, 1), and as ``check_batch``.
+    :raises ValueError: if ``confidence`` is not in (0, 1), or the batch fails ``check_batch``.
     """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
@@ -227,14 +231,14 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
     Bound the information of the TRVs about each component of the state from below, I[x^k_t; x~_t].
 
     The result is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
-    state. Where the TRVs depend on several components, their density given one of them has a complicated shape, and the
+    state. If the TRVs depend on several components, their density given one component has a complicated shape, and the
     Gaussian critic gives the better bound.
 
-    :param batch: As for :func:`information_interval`.
+    :param batch: As in :func:`information_interval`.
     :param seed: Seed of the division of the episodes and of the noise.
     :return: the estimates and their lower limits, each with a confidence of 95 %, ``(T, X)`` each, nats; NaN where a
         component is constant and where too few episodes are alive
-    :raises ValueError: as ``check_batch``.
+    :raises ValueError: if the batch fails ``check_batch``.
     """
     values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
     for t, step, rng in _steps(batch, seed):

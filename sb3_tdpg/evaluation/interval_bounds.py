@@ -16,13 +16,13 @@ from scipy.special import logsumexp, softmax
 from sb3_tdpg.evaluation.density_critic import LOG_2_PI, DensityCritic, Encoded, GaussianCritic, log_gaussians
 from sb3_tdpg.information.base import InformationBatch
 
-MAX_DRAWS = 12  # of the TRVs for each episode
-GROUPS = (8, 5)  # groups of episodes, two of which evaluate a Gaussian critic; five above MAX_REDIVIDED episodes
+MAX_DRAWS = 12  # largest number of draws of the TRVs for each episode
+GROUPS = (8, 5)  # groups of episodes; two evaluate a Gaussian critic; five groups above MAX_REDIVIDED episodes
 MAX_VALUES = 1_000_000  # densities of all draws under all episodes; bounds the memory
 MAX_TRAINING = 500  # episodes that a critic is fitted to; bounds the time
 DIVISIONS = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))  # of quarters of the episodes into halves
 MAX_REDIVIDED = 300  # more episodes are divided only once, since they gain little from further divisions
-MIN_HITS = 10  # clipped pairs of a state with another episode's TRVs that the critic's denominator counts as at least
+MIN_HITS = 10  # least number of clipped pairs (a state and another episode's TRVs) that the denominator counts
 
 
 class Estimate(NamedTuple):
@@ -50,7 +50,7 @@ class Estimate(NamedTuple):
 
 
 def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
-    """Draw the encoder's noise again at one time step, ``(1, n, ...)``; the first draw is the one of the rollout."""
+    """Draw the encoder's noise again at one time step, ``(1, n, ...)``; the first draw is that of the rollout."""
     states, trvs, means, stds = (x[0].detach().cpu().numpy().astype(np.float64) for x in batch[:4])
     n, dim = means.shape
     # Each noise is used with both signs, which cancels linear terms.
@@ -81,7 +81,7 @@ def noise_controls(step: Encoded) -> np.ndarray:
 
 class FreshPairs:
     """
-    Scores F of frozen critics on fresh ones of n episodes and all their pairs.
+    Collect the scores F of frozen critics on fresh episodes and on all their pairs, for n episodes.
 
     Scores are clipped from above so that single pairs do not dominate the mean of e^F. A clipped critic is a valid
     critic, too.
@@ -93,7 +93,7 @@ class FreshPairs:
         self._ratios, self._pair_times = np.zeros((2, n, n))
 
     def add(self, fresh: np.ndarray, scores: np.ndarray) -> None:
-        """Add a critic's scores of K draws of each of m ``fresh`` episodes with the state of each, ``(m K, m)``."""
+        """Add a critic's scores of K draws of each of m ``fresh`` episodes with all their states, ``(m K, m)``."""
         m = len(fresh)
         each, pairs = np.arange(m), np.ix_(fresh, fresh)
         scores = np.minimum(scores, self.log_clip).reshape(m, -1, m)
@@ -161,7 +161,7 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
     that the bound stays finite where no episode's TRVs fit the state of another.
 
     :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
-    :param ratios: e^F of the TRVs of each episode with the state of each, ``(n, n)``; 0 where they are not paired.
+    :param ratios: e^F of the TRVs of each episode with each state, ``(n, n)``; 0 where they are not paired.
     :param n_pairs: Number of pairs, about equally many for each episode.
     :param log_clip: Upper bound of F.
     """
@@ -175,7 +175,8 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
         # An episode contributes through its state and through its TRVs (Hoeffding's projection).
         influence = (ratios.sum(axis=0) + ratios.sum(axis=1)) * n / n_pairs / mean
         relative_variance = influence.var(ddof=1) / n
-        # At least the variance of as many independent pairs, since the projection can be almost constant by chance.
+        # The variance is at least that of as many independent pairs, since the projection can be almost constant by
+        # chance.
         parts = joint - influence
         least_variance = float(np.square(ratios).sum() / n_pairs / mean**2 - 1) / n_pairs
     # The logarithm of a mean is biased downward by half its relative variance.
@@ -191,7 +192,7 @@ def _marginal_gaps(step: Encoded, log_marginal: np.ndarray) -> np.ndarray:
 
 
 def log_det_bound(step: Encoded) -> Estimate:
-    """Bound with the Gaussian of the same covariance; the jackknife removes the bias of order 1/n."""
+    """Compute the log-det bound from a Gaussian of the same covariance; the jackknife removes the 1/n bias."""
     n, dim = step.means.shape
     variances, log_stds = np.square(step.stds), np.log(step.stds).sum(axis=1)
     scale = np.sqrt(variances.mean(axis=0))
@@ -213,7 +214,7 @@ def log_det_bound(step: Encoded) -> Estimate:
 
 
 def leave_one_out_bound(step: Encoded) -> Estimate:
-    """Bound with the mixture of the other episodes' densities, to which an episode also adds a component."""
+    """Compute the leave-one-out bound, from the mixture of the densities of all other episodes."""
     n, n_draws, dim = step.trvs.shape
     log_density = log_gaussians(step.trvs.reshape(-1, dim), step.means, np.square(step.stds))  # (n K, n)
     draws, own = np.arange(n * n_draws), np.repeat(np.arange(n), n_draws)

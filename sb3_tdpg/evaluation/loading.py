@@ -1,4 +1,4 @@
-"""Load the models of any algorithm."""
+"""Load saved models of TDPG, Stable-Baselines3 and sb3-contrib."""
 
 import json
 import zipfile
@@ -35,9 +35,9 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     """
     Load a model of TDPG, Stable-Baselines3 or sb3-contrib, and recognise its algorithm from the file.
 
-    If statistics of observations lie beside it (``vecnormalize.pkl`` of rl-zoo3, ``vec_normalize.pkl`` of the Hub),
-    these are normalised as in training. Loading unpickles the file, which can run any code: load only files that you
-    trust.
+    If statistics of observations lie beside the file (``vecnormalize.pkl`` of rl-zoo3, ``vec_normalize.pkl`` of the
+    Hub), the observations are normalised as in training. Loading unpickles the file, which can run any code: load only
+    files that you trust.
 
     :param path: The file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
@@ -47,7 +47,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     try:
         with zipfile.ZipFile(path) as archive:
             settings = dict(json.loads(archive.read("data")))
-    except Exception as e:  # damaged bytes lead to any error
+    except Exception as e:  # a damaged file can raise any error
         reason = e.strerror if isinstance(e, OSError) else e
         raise ValueError(f"{path} cannot be read ({reason}): give the .zip file that model.save() wrote") from e
     policy = settings.get("policy_class")
@@ -75,11 +75,12 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
 
 def statistics_beside(path: Path) -> Path | None:
     """
-    Return the statistics of observations that are saved for a model, if there are any.
+    Return the file with the statistics of observations of a model, or ``None`` if there is none.
 
-    The file is called ``vecnormalize.pkl`` by rl-zoo3, ``vec_normalize.pkl`` on the Hub.
+    The file is called ``vecnormalize.pkl`` by rl-zoo3 and ``vec_normalize.pkl`` on the Hub.
 
-    It lies beside the model or in a folder with its name; of ``<id>_1/best_model.zip``, in ``<id>_1/<id>/``.
+    It lies beside the model or in a folder with the model's name. For ``<id>_1/best_model.zip`` it lies in
+    ``<id>_1/<id>/``.
     """
     folder = path.parent
     folders = [folder, path.with_suffix(""), folder / folder.resolve().name.rpartition("_")[0]]

@@ -1,4 +1,4 @@
-"""Random numbers that depend on one seed, and leave the rest of the program as it was."""
+"""Derive all random numbers of an evaluation from one seed, and restore the generators afterwards."""
 
 import contextlib
 import copy
@@ -13,14 +13,14 @@ _DOMAIN = 0x7D96  # any constant: an evaluation with seed 0 must not replay the 
 
 
 class EvaluationSeeds(NamedTuple):
-    """The seeds that an evaluation derives from the seed that the user gives."""
+    """The seeds that an evaluation derives from the user's seed."""
 
     env: int
     policy: int
 
 
 def evaluation_seeds(seed: int) -> EvaluationSeeds:
-    """Derive the seeds of the environments and of the policy's sampling from the seed that the user gives."""
+    """Derive the seeds of the environments and of the policy's sampling from the user's seed."""
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed={seed!r} must be an integer of at least 0")
     env_seed, policy_seed = np.random.SeedSequence([seed, _DOMAIN]).generate_state(2)
@@ -33,7 +33,8 @@ def isolated_randomness(seed: int, model: Any) -> Iterator[None]:
     """
     Seed every generator that ``model.predict`` may sample from, and restore all of them afterwards.
 
-    These are the global ones of torch, NumPy and Python, and the model's action space, from which DQN explores.
+    They are the global generators of torch, NumPy and Python, and that of the model's action space, which DQN uses to
+    explore.
     """
     numpy_state, python_state, action_space = np.random.get_state(), random.getstate(), model.action_space  # noqa: NPY002
     device = th.device(getattr(model, "device", "cpu"))

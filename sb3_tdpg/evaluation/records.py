@@ -1,5 +1,5 @@
 """
-From scenarios to records: one row for each episode of a model, or its true states.
+Run models in scenarios, and record one row for each episode, or the true states.
 
 Dimension key: T horizon, N episodes, X state.
 """
@@ -46,18 +46,19 @@ def evaluate_scenarios(
     environment reports ``info["is_success"]``, there is also a column ``failure``.
 
     The same seed gives the same frame. In a scenario all models start from the same initial states, and they meet the
-    same noise if the environment draws the same number of random numbers whatever the actions. The same holds for all
-    scenarios of one environment. The global random generators are restored.
+    same noise if the number of random numbers that the environment draws does not depend on the actions. Under the same
+    condition, all scenarios of one environment share their initial states and noise. The global random generators are
+    restored at the end.
 
     :param model: One SB3 model, or a mapping from labels to models.
-    :param scenarios: The rows of the table to make.
+    :param scenarios: The scenarios to run, in the order of the rows.
     :param n_episodes: Number of episodes of each model in each scenario that has no number of its own.
     :param seed: Seed of the environments and of the policies' sampling.
     :param deterministic: Act without noise. The default is the stochastic policy, which the paper's tables use.
     :param env_kwargs: Keywords for the environments of all scenarios; a scenario's own keywords take precedence.
     :param labels: Constant columns to put in front, for instance ``dict(train_seed=3)``.
     :param progress_bar: Show a progress bar.
-    :raises ValueError: if an argument does not fit; no episode has been run by then.
+    :raises ValueError: if an argument is invalid; no episode has been run then.
     """
     models = _named_models(model)
     rows = [scenario.with_kwargs(**(env_kwargs or {})) for scenario in scenarios]
@@ -93,13 +94,13 @@ def run_episodes(
 
     :param n_episodes: Number of episodes, unless the scenario has its own.
     :param at_end: Called at the end of each episode.
-    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``:
-        first the first episodes of all environments, then the second ones, and so on
+    :return: a row for each episode with ``episode``, ``cost``, ``length``, ``final_*`` and, if known, ``failure``; the
+        first episodes of all environments come first, then the second episodes, and so on
     """
     n_episodes = scenario.n_episodes or n_episodes
     env = scenario_env(scenario, model, n_episodes=min(n_episodes, MAX_PARALLEL_EPISODES))
     returns, monitored = np.zeros(env.num_envs), is_monitored(env)
-    ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and environment
+    ended: dict[tuple[int, int], dict[str, Any]] = {}  # by the episode's number in its environment, and the environment
     with contextlib.closing(env):
         for step in rollout(model, env, n_episodes, seeds=evaluation_seeds(seed), deterministic=deterministic):
             returns += step.rewards
@@ -110,7 +111,7 @@ def run_episodes(
                 ended[int(step.episode[i]), int(i)] = dict(cost=cost, length=length, **_final_columns(info))
                 at_end()
             returns[step.dones] = 0
-    # If they were numbered as they end, a number would mean another start for each model and perturbation.
+    # If episodes were numbered in the order of their ends, a number would mean another start for each model.
     order = sorted(range(n_episodes), key=list(ended).__getitem__)
     records = pd.DataFrame(list(ended.values())).iloc[order]
     return records.reset_index(drop=True).rename_axis("episode").reset_index()
@@ -143,7 +144,7 @@ def rollout_states(
 
 
 def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:
-    """Flatten the numbers of the last info of an episode."""
+    """Flatten the numbers in an episode's last info to columns."""
     columns: dict[str, Any] = {}
     for name, value in info.items():
         try:

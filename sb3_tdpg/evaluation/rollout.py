@@ -1,5 +1,5 @@
 """
-The rollout loop that everything after the training shares: run a policy for whole episodes, step by step.
+Run a policy for whole episodes, step by step; all code after the training uses this loop.
 
 Dimension key: E environments, X state, Z TRVs, ``*obs`` and ``*action`` as in the spaces.
 """
@@ -52,20 +52,21 @@ def rollout(
     """
     Run a policy and yield every step.
 
-    As in SB3's ``evaluate_policy``, each environment has a quota of episodes: the first N that finish would be short
-    ones. After its quota it runs on with a cleared memory; only steps with ``finished`` end an episode that counts.
+    As in SB3's ``evaluate_policy``, each environment has a quota of episodes, because the first N episodes that finish
+    would be short ones. After its quota an environment runs on, with a cleared memory. Only steps with ``finished`` end
+    an episode that counts.
 
-    With ``seeds`` the global random generators belong to the rollout until it ends: draw nothing from them in the body
-    of the loop. They are restored when the loop ends, also by ``break`` or an exception.
+    With ``seeds`` the rollout uses the global random generators until it ends, so do not draw from them in the body of
+    the loop. They are restored when the loop ends, also by ``break`` or an exception.
 
-    :param model: An SB3 model, or anything with its method ``predict``.
+    :param model: An SB3 model, or an object with the same method ``predict``.
     :param env: E environments; they are reset first. MaskablePPO gets their ``action_masks()``.
     :param n_episodes: Number of episodes of all environments together; ``None``: run until the caller stops.
-    :param seeds: Seeds of the environments and of the policy's sampling; ``None``: take the generators as they are.
+    :param seeds: Seeds of the environments and of the policy's sampling; ``None``: use the generators as they are.
     :param deterministic: Act without noise; see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param problem: From ``read_problem(env)``: also yield the true states.
-    :param encode: Also yield the TRVs with their densities. For TDPG models, with a stochastic policy.
-    :param observe: Changes the observations before the policy sees them, for instance ``normalize_obs``.
+    :param problem: Result of ``read_problem(env)``, to yield the true states, too.
+    :param encode: Whether to yield the TRVs with their densities, too (only for TDPG models and a stochastic policy).
+    :param observe: Function that changes the observations before the policy gets them, for instance ``normalize_obs``.
     """
     n_envs = env.num_envs
     quota = np.full(n_envs, np.inf) if n_episodes is None else (n_episodes + np.arange(n_envs)) // n_envs
@@ -78,7 +79,7 @@ def rollout(
     with contextlib.nullcontext() if seeds is None else isolated_randomness(seeds.policy, model):
         if seeds is not None:
             env.seed(seeds.env)
-            if getattr(model, "use_sde", False):  # SB3 draws it at the start of a training only
+            if getattr(model, "use_sde", False):  # SB3 draws this noise only at the start of a training
                 model.policy.reset_noise(n_envs)
         observations: Any = env.reset()
         if problem is not None:
@@ -87,7 +88,7 @@ def rollout(
             seen = observations if observe is None else observe(observations)
             if encode:
                 trvs = th.zeros(n_envs, model.policy.trv_dim, device=model.device) if memory is None else memory[0]
-                now = np.where(starts, 0, t)  # zero for environments that are through their quota
+                now = np.where(starts, 0, t)  # zero for environments that have run their quota
                 encoded, actions = act(model, seen, trvs * th.as_tensor(~starts[:, None], device=model.device), now)
                 memory = (encoded.trvs, now + 1)
             else:
@@ -109,7 +110,7 @@ def rollout(
 
 
 def is_monitored(env: VecEnv) -> bool:
-    """Tell whether ``info["episode"]`` reports the return and the length of each episode."""
+    """Return whether ``info["episode"]`` reports the return and the length of each episode."""
     return is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
 
 

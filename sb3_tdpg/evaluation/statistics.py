@@ -1,7 +1,7 @@
 """
-Statistics over training seeds for few runs, computed by rliable.
+Compute statistics over a few training seeds with rliable.
 
-They follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
+The statistics follow Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice".
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ N_BOOTSTRAP = 2000
 
 def aggregate_seeds(records_by_seed: pd.DataFrame) -> pd.DataFrame:
     """
-    Summarise each model in each scenario over its training seeds: the quality of the method, not of one policy.
+    Summarise the costs of each method in each scenario over its training seeds.
 
     The summary is the interquartile mean of the seeds' mean costs, with a percentile bootstrap interval of 95 % over
     seeds.
@@ -60,7 +60,7 @@ def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str) -
     """
     Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
 
-    Pairing removes the differences between seeds where both methods start from one policy and meet the same episodes.
+    Pairing removes the differences between seeds if both methods start from the same policy and run the same episodes.
 
     :param control: Label of the method to compare with; it must have the same seeds.
     :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
@@ -85,7 +85,7 @@ def interquartile_means(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, 
 
 
 def _interquartile_mean(x: np.ndarray) -> np.ndarray:
-    """Compute the mean of the middle half along the first axis, as scipy's ``trim_mean`` in a tenth of the time."""
+    """Compute the mean of the middle half along the first axis, like scipy's ``trim_mean`` but ten times as fast."""
     cut = len(x) // 4
     return np.asarray(np.sort(x, axis=0)[cut : len(x) - cut].mean(axis=0))
 
@@ -109,7 +109,7 @@ def probabilities_of_improvement(
 
 
 def _seed_means(records_by_seed: pd.DataFrame, models: Sequence[str]) -> pd.Series:
-    """Average the mean costs of the scenarios, which must be the same for all seeds of the methods."""
+    """Average the mean costs over the scenarios; all seeds of the methods must have the same scenarios."""
     shown = records_by_seed[records_by_seed["model"].isin(models)]
     means = shown.groupby(["model", "train_seed", "scenario"])["cost"].mean().unstack()
     if means.isna().any(axis=None):

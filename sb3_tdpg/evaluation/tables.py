@@ -1,4 +1,4 @@
-"""From records to tables: statistics over episodes, and numbers beside the paper's."""
+"""Make tables from records: statistics over episodes, and comparisons with the paper's numbers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ def summary_table(records: pd.DataFrame) -> pd.DataFrame:
     """
     Summarise the cost over the episodes of each model in each scenario, and of each ``train_seed`` if there are any.
 
-    :param records: What :func:`~sb3_tdpg.evaluation.evaluate_scenarios` returned.
+    :param records: Result of :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
     :return: the columns ``model``, ``scenario``, ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem`` (standard
         error of the mean), ``median``; ``failure_share`` if there is a column ``failure``; ``seed``, ``deterministic``
     """
@@ -35,7 +35,7 @@ def add_ratio(summary: pd.DataFrame, reference: str = "Training") -> pd.DataFram
     """
     Add a column ``ratio``: the mean cost divided by the same model's mean cost in a reference scenario.
 
-    :param summary: From :func:`summary_table`.
+    :param summary: Result of :func:`summary_table`.
     :param reference: Name of the scenario to divide by.
     """
     if reference not in (names := list(summary["scenario"].unique())):
@@ -52,12 +52,13 @@ def comparison_markdown(
     """
     Write a Markdown table with a row for each scenario, and for each model its numbers beside the paper's.
 
-    :param summary: From :func:`summary_table`, or from :func:`aggregate_seeds`: then a cell shows the interquartile
-        mean over seeds and its interval.
+    :param summary: Result of :func:`summary_table`, or of :func:`aggregate_seeds`; with the latter, a cell shows the
+        interquartile mean over seeds and its interval.
     :param scenarios: The rows, in this order. The paper's numbers are shown for models whose label is a key of
         ``scenario.paper``.
-    :param quantity: Name of the numbers, for the line below the table.
-    :return: the table with the lowest numbers of each row in bold, ours and the paper's, and a line on how it was made
+    :param quantity: Name of the compared quantity, for the line below the table.
+    :return: the table, with our lowest number and the paper's lowest number of each row in bold, and a line on how the
+        table was made
     """
     over_seeds = "iqm" in summary.columns
     require_columns(summary, ["model", "scenario", *(("iqm", "low", "high") if over_seeds else ("mean", "std"))])
@@ -98,7 +99,7 @@ def _text(row: pd.Series, digits: int) -> str:
 
 
 def _footer(summary: pd.DataFrame, paper: Sequence[PaperResult], quantity: str) -> str:
-    """Say what the numbers are and how they were made."""
+    """Describe the numbers and how they were made."""
     if "iqm" not in summary.columns:
         what = f"Mean {quantity} (standard deviation over episodes)"
     elif (summary["n_seeds"] == 1).all():

@@ -40,7 +40,7 @@ class TrustBadge:
 
     checks: tuple[TrustCheck, ...]
     capped_steps: tuple[int, ...]
-    """Time steps whose lower estimate is at least 90 % of ln N, where the truth can be much higher."""
+    """Time steps whose lower estimate is at least 90 % of ln N, where the true value can be much higher."""
 
     @property
     def passed(self) -> bool:
@@ -63,7 +63,7 @@ class TrustBadge:
     def _warning(self) -> str:
         if not self.capped_steps:
             return ""
-        # Runs of steps: "0 to 199".
+        # Successive steps are written as "0 to 199".
         breaks = np.flatnonzero(np.diff(self.capped_steps) != 1) + 1
         runs = np.split(np.array(self.capped_steps), breaks)
         steps = ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
@@ -78,13 +78,13 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
     - **shuffled pairs**: when every state is paired with the TRVs of another episode, there is no information, and the
       lower bounds must find none;
     - **data processing**: a noisier copy of the TRVs (with four times the encoder's mean variance) has no more
-      information about the state. Its lower limit must not exceed the upper limit of the TRVs, and its estimate must
-      not exceed theirs; negative estimates count as 0;
+      information about the state. The lower limit of the copy must not exceed the upper limit of the TRVs, and the
+      copy's estimate must not exceed that of the TRVs. Negative estimates count as 0;
     - **encoder density**: :math:`(\tilde x - \mu) / \sigma` must have mean square 1. Otherwise the TRVs were not drawn
-      from the density that every bound uses (but without noise, for instance).
+      from the density that every bound uses, for instance because they have no noise.
 
-    Each check reports its worst time step. A check of a sound interval fails with a probability of about 1 %, all time
-    steps together.
+    Each check reports its worst time step. A check of a sound interval fails with a probability of about 1 % over all
+    time steps together.
 
     :param batch: The rollouts ``(T, N, ...)`` of the interval.
     :param interval: The result of :func:`~sb3_tdpg.evaluation.information_interval`; computed if not given.
@@ -101,7 +101,7 @@ def trust_checks(batch: InformationBatch, interval: InformationInterval | None =
     checks = (
         _shuffled_pairs(batch, steps, normal_quantile(miss / len(LOWER_BOUNDS)), seed),
         _data_processing(batch, interval, steps, normal_quantile(miss), seed),
-        _encoder_density(batch, steps, miss / 2),  # either sign counts
+        _encoder_density(batch, steps, miss / 2),  # half of the probability for either sign
     )
     lower = np.maximum(*(interval.estimates[name][steps] for name in LOWER_BOUNDS))
     capped = steps[lower >= NEAR_THE_CAP * np.log(interval.n_episodes[steps])]
@@ -122,7 +122,7 @@ def _shuffled_pairs(batch: InformationBatch, steps: np.ndarray, quantile: float,
 def _data_processing(
     batch: InformationBatch, interval: InformationInterval, steps: np.ndarray, quantile: float, seed: int
 ) -> TrustCheck:
-    # One variance for all episodes of a time step: noise that depends on the encoder's would carry information.
+    # All episodes of a time step get the same variance: noise that depends on the encoder's would carry information.
     living = batch.living[..., None]
     total = batch.stds.square().masked_fill(~living, 0.0).sum(1, keepdim=True)
     stds = (batch.stds.square() + ADDED_VARIANCE * total / living.sum(1, keepdim=True).clamp(min=1)).sqrt()

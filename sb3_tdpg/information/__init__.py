@@ -1,5 +1,5 @@
 """
-Mutual-information estimators and bounds; independent of Stable-Baselines3.
+Estimators of mutual information and bounds on it, independent of Stable-Baselines3.
 
 To add an estimator, add a file here and a row to :data:`ESTIMATORS`.
 """
@@ -9,7 +9,7 @@ from typing import cast
 
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
-# Only the file of the estimator that is trained is read.
+# Only the module of the chosen estimator is imported.
 ESTIMATORS: dict[str, str | type[InformationEstimator]] = {
     "mine": "sb3_tdpg.information.mine:Mine",
     "nwj": "sb3_tdpg.information.nwj:Nwj",
@@ -21,14 +21,14 @@ ESTIMATORS: dict[str, str | type[InformationEstimator]] = {
     "directed-loo": "sb3_tdpg.information.directed:DirectedLeaveOneOut",
     "vib": "sb3_tdpg.information.vib:VariationalBottleneck",
 }
-"""The estimators by name: a class, or where to find it, in the form ``"module:class"``."""
+"""The estimators by name: a class, or its location in the form ``"module:class"``."""
 
 
 def get_estimator_class(estimator: str | type[InformationEstimator]) -> type[InformationEstimator]:
     """
-    Return the class of an estimator that is named in :data:`ESTIMATORS` or is such a class itself.
+    Return the class of an estimator, given its name in :data:`ESTIMATORS` or the class itself.
 
-    :raises ValueError: if it is neither.
+    :raises ValueError: if the argument is neither.
     """
     found = ESTIMATORS.get(estimator) if isinstance(estimator, str) else estimator
     if isinstance(found, str):

@@ -1,5 +1,5 @@
 """
-The interface of every mutual-information estimator.
+Define the interface of all mutual-information estimators.
 
 Dimension key: T time steps, N episodes, X state, Z task-relevant variables (TRVs).
 """
@@ -23,11 +23,11 @@ class InformationBatch(NamedTuple):
     stds: th.Tensor  # (T, N, Z)
     alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
     prev_trvs: th.Tensor | None = None  # (T, N, Z), x~_{t-1}, for estimators of the directed information
-    episode: th.Tensor | None = None  # (T, N) its number, where several samples may be of one; None: each is of its own
+    episode: th.Tensor | None = None  # (T, N), episode of each sample; None: each sample has its own
 
     @property
     def living(self) -> th.Tensor:
-        """Which episodes are alive, also if ``alive`` is None: ``(T, N)`` bool."""
+        """Whether each episode is alive at each step, also if ``alive`` is None: ``(T, N)`` bool."""
         return self.trvs.new_ones(self.trvs.shape[:2], dtype=th.bool) if self.alive is None else self.alive
 
     def at(self, t: int) -> InformationBatch:
@@ -41,11 +41,11 @@ class InformationBatch(NamedTuple):
         return self._each(lambda x: x[:, episodes])._replace(alive=alive)
 
     def pooled(self) -> InformationBatch:
-        """Pool the steps that are alive over all times as samples of one variable: ``(1, n, ...)``."""
+        """Pool the living steps of all times as samples of one variable: ``(1, n, ...)``."""
         return self._each(lambda x: x[self.living][None])
 
     def _each(self, take: Callable[[th.Tensor], th.Tensor]) -> InformationBatch:
-        """Apply a function to all samples, which all live in the result."""
+        """Apply a selection to all fields; all samples of the result are alive."""
         prev_trvs, episode = (None if x is None else take(x) for x in (self.prev_trvs, self.episode))
         states, trvs, means, stds = map(take, self[:4])
         return InformationBatch(states, trvs, means, stds, None, prev_trvs, episode)
@@ -53,7 +53,7 @@ class InformationBatch(NamedTuple):
 
 class InformationEstimator(nn.Module):
     """
-    Estimates I[x_t; x~_t] in nats for every time step at once.
+    Estimator of I[x_t; x~_t] in nats for all time steps at once.
 
     :param horizon: Number of time steps T.
     :param state_dim: Number of components X of the state.
@@ -88,7 +88,7 @@ class InformationEstimator(nn.Module):
         return th.cat([self._estimate(batch.at(t), t) if enough else zero for t, enough in enumerate(has_enough)])
 
     def has_enough(self, batch: InformationBatch) -> th.Tensor:
-        """Return at which steps so many episodes are alive that there is an estimate: ``(T,)`` bool."""
+        """Return for each step whether enough episodes are alive for an estimate: ``(T,)`` bool."""
         return batch.living.sum(dim=1) >= self.min_episodes(batch.trvs.shape[1])
 
     def min_episodes(self, n_episodes: int) -> int:
@@ -97,9 +97,9 @@ class InformationEstimator(nn.Module):
 
     @property
     def recommended_episodes(self) -> int:
-        """Number of episodes of an epoch below which the estimate is misleading."""
+        """Number of episodes per epoch below which the estimate is misleading."""
         return self.trv_dim + 2
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        """Estimate all steps (``t=None``, ``(T, N, ...) -> (T,)``) or one (``(1, n, ...) -> (1,)``) where all live."""
+        """Estimate all steps (None: ``(T, N, ...) -> (T,)``) or step t (``(1, n, ...) -> (1,)``) of living episodes."""

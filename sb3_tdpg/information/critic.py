@@ -16,7 +16,7 @@ from torch import nn
 from sb3_tdpg.common.networks import BatchedMLP, flatten_parameters
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
-MIN_EPISODES = 2  # for an estimate: a state is paired with the TRVs of another episode
+MIN_EPISODES = 2  # an estimate pairs a state with the TRVs of another episode
 MOMENTS = ("exp_avg", "exp_avg_sq", "step")  # of Adam
 
 
@@ -29,7 +29,7 @@ class Scores(NamedTuple):
 
 def derange(n: int, device: th.device) -> th.Tensor:
     """Draw a permutation of n episodes without fixed points: ``(n,)``."""
-    # A random cycle: no state is paired with its own TRVs.
+    # In a random cycle, no state is paired with its own TRVs.
     order = th.randperm(n, device=device)
     other = th.empty_like(order)
     other[order] = order.roll(1)
@@ -40,24 +40,27 @@ class CriticEstimator(InformationEstimator):
     """
     T critics F^theta_t(x_t, x~_t) as one batched network (Algorithm 1), fitted to each epoch's rollouts.
 
-    A subclass defines the bound (:meth:`_bound`), and the critics' objective (:meth:`_objective`) if it is another one.
+    A subclass defines the bound (:meth:`_bound`), and the critics' objective (:meth:`_objective`) if it differs from
+    the bound.
 
     :param hidden_sizes: Hidden layers of each critic.
     :param activation_fn: Nonlinearity of the critics.
     :param learning_rate: Adam's learning rate.
-    :param batch_size: Minibatch size B; at most half of the episodes, since joint and marginal samples of a step come
-        from different episodes, and a quarter where some end before others.
+    :param batch_size: Minibatch size B. It is reduced to at most half of the episodes, because the joint and the
+        marginal samples of an optimiser step come from different episodes, and to a quarter if some episodes end before
+        others.
     :param gradient_steps: Optimiser steps ("MINE epochs") in each policy epoch.
     :param warmup_gradient_steps: Optimiser steps in the first policy epoch.
-    :param refit_below: Critics with an estimate on the batch below this value, in nats, or one that is not finite, have
-        diverged. They are fitted from new weights for ``refit_gradient_steps``. Without this guard a policy can exploit
-        a frozen critic, whose bound has no lower limit.
-    :param refit_above: Likewise for estimates above this value.
-    :param refit_gradient_steps: See ``refit_below``.
+    :param refit_below: Limit in nats: a critic has diverged if its estimate on the batch is lower or not finite. It is
+        then fitted from new weights for ``refit_gradient_steps`` steps. Without this guard a policy can exploit a
+        frozen critic, whose bound has no lower limit.
+    :param refit_above: Upper limit in nats: a critic has also diverged if its estimate is higher.
+    :param refit_gradient_steps: Optimiser steps of such a refit.
     :param reset_moments: Whether Adam's moments start from zero in each epoch, since the data have changed.
     :param standardize: Whether to standardise each component of the state at each time step.
     :param held_out: Share of the episodes, drawn in each fit, that the critics are not trained on. :meth:`fit` reports
-        both estimates, summed over time, as ``"held_out"`` and ``"trained_on"``: a large gap means overfitting.
+        the estimates on both groups of episodes, summed over time, as ``"held_out"`` and ``"trained_on"``. A large gap
+        means overfitting.
     """
 
     def __init__(
@@ -102,12 +105,12 @@ class CriticEstimator(InformationEstimator):
         self.standardize = standardize
         self.held_out = held_out
         self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
-        # Of Adam; all zero is a fresh start.
+        # The moments of Adam; all zero is a fresh start.
         shapes = (flatten_parameters(self.critic).shape,) * 2 + (th.Size(),)
         for name, shape in zip(MOMENTS, shapes, strict=True):
             self.register_buffer(name, th.zeros(shape))
         self.register_buffer("is_warm", th.tensor(False))
-        # Not saved: each epoch's fit comes before the estimates.
+        # This buffer is not saved, because each epoch fits the critics before it estimates.
         self.register_buffer("is_trained", th.ones(horizon, dtype=th.bool), persistent=False)
         self.register_buffer("state_mean", th.zeros(horizon, 1, state_dim))
         self.register_buffer("state_std", th.ones(horizon, 1, state_dim))
@@ -121,9 +124,9 @@ class CriticEstimator(InformationEstimator):
     @property
     def recommended_episodes(self) -> int:
         """
-        Ten for each input of a critic.
+        Number of recommended episodes: ten for each input of a critic.
 
-        With so many episodes and no information, the critics still report 0.5 to 1 nat at each step; with 2 episodes
+        With this many episodes and no information, the critics still report 0.5 to 1 nat at each step. With 2 episodes
         they report 10 to 200 nats.
         """
         return 10 * (self.state_dim + self.trv_dim)
@@ -142,7 +145,7 @@ class CriticEstimator(InformationEstimator):
         return self._bound(scores)
 
     def _pair(self, states: th.Tensor, trvs: th.Tensor, other_trvs: th.Tensor) -> th.Tensor:
-        """Pair states ``(..., B, X)`` with their TRVs, then with those of others: ``(..., B + B * K, X + Z)``."""
+        """Pair states ``(..., B, X)`` with their TRVs, then with TRVs of others: ``(..., B + B * K, X + Z)``."""
         return th.cat([th.cat([states, trvs], -1), th.cat([states, other_trvs], -1)], dim=-2)
 
     def _split(self, values: th.Tensor, n: int) -> Scores:
@@ -152,7 +155,7 @@ class CriticEstimator(InformationEstimator):
 
     @th.no_grad()
     def fit(self, batch: InformationBatch) -> dict[str, float]:
-        """Train the critics on the epoch's samples (Algorithm 1); as in every ``InformationEstimator``."""
+        """Train the critics on the epoch's samples (Algorithm 1), and return diagnostics for the log."""
         train, held_out = self._hold_out(batch)
         if self.standardize:
             self._update_scaling(train)
@@ -180,14 +183,14 @@ class CriticEstimator(InformationEstimator):
         return report
 
     def make_optimizer(self, critic: BatchedMLP) -> th.optim.Adam:
-        """Make an Adam that moves all parameters of a network as one vector, which is much faster."""
+        """Make an Adam optimiser that updates a network's parameters as one vector, which is much faster."""
         return th.optim.Adam([flatten_parameters(critic)], lr=self.learning_rate, fused=True)
 
     def _hold_out(self, batch: InformationBatch) -> tuple[InformationBatch, InformationBatch | None]:
         """Divide the episodes at random into those to train on and those to hold out, if any."""
         if self.held_out == 0:
             return batch, None
-        of_column = None if batch.episode is None else batch.episode[0]  # steps of an episode stay together
+        of_column = None if batch.episode is None else batch.episode[0]  # the steps of an episode stay together
         numbers = th.arange(batch.trvs.shape[1]) if of_column is None else of_column.unique()
         n = len(numbers)
         n_held_out = round(self.held_out * n)
@@ -203,7 +206,7 @@ class CriticEstimator(InformationEstimator):
         return batch.select(~is_held_out), batch.select(is_held_out)
 
     def _total(self, batch: InformationBatch, steps: th.Tensor) -> float:
-        """Sum the estimates of some steps over those with enough living episodes."""
+        """Sum the estimates over those of the given steps that have enough living episodes."""
         living = ((t, batch.at(t)) for t in steps.tolist())
         return float(sum(self._estimate(at, t).item() for t, at in living if at.trvs.shape[1] >= MIN_EPISODES))
 
@@ -225,7 +228,7 @@ class CriticEstimator(InformationEstimator):
     def _minibatches(self, batch: InformationBatch, n: int, n_steps: int) -> Iterator[th.Tensor]:
         """Draw the critics' inputs for each gradient step from n joint samples and the TRVs of n other episodes."""
         (n_rows, n_episodes), device, alive = batch.trvs.shape[:2], batch.trvs.device, batch.alive
-        # Draw as many steps at once as memory allows: a call takes as long as a gradient step.
+        # Draw as many gradient steps at once as memory allows, because a draw takes as long as a gradient step.
         per_step = n_rows * (n_episodes + self._n_pairs(n) * sum(self.sizes[:1]))
         chunk = max(1, min(n_steps, 4_000_000 // per_step))
         for start in range(0, n_steps, chunk):
@@ -233,7 +236,7 @@ class CriticEstimator(InformationEstimator):
             if alive is None:
                 chosen = th.rand(size, 1, n_episodes, device=device).topk(2 * n, dim=2).indices
             else:
-                # Dead episodes come last; steps with fewer than 2n living ones are not trained.
+                # Episodes that have ended come last. Time steps with fewer than 2n living episodes are not trained.
                 priority = th.rand(size, *alive.shape, device=device).masked_fill(~alive, 2.0)
                 chosen = priority.topk(2 * n, dim=2, largest=False).indices
             # Selecting rows of (T * N, .) is faster than indexing two dimensions.
@@ -246,7 +249,7 @@ class CriticEstimator(InformationEstimator):
         return 2 * n
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """Differentiate the negative objective of the time steps ``steps``, in these rows, by the critic's outputs."""
+        """Return the gradient of the negative objective of the time steps ``steps`` by the critic's outputs."""
         with th.enable_grad():
             values = values.requires_grad_()
             scores = self._split(values, n)
@@ -257,7 +260,7 @@ class CriticEstimator(InformationEstimator):
         """Fit the critics of the steps ``broken`` from new weights."""
         fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(batch.trvs)
         self._forget(broken)
-        for name in MOMENTS:  # the old ones may not be finite, either
+        for name in MOMENTS:  # the old moments may not be finite, either
             getattr(self, name).zero_()
         alive = None if batch.alive is None else batch.alive[broken]
         rows = InformationBatch(*(x[broken] for x in batch[:4]))._replace(alive=alive)
@@ -281,15 +284,15 @@ class CriticEstimator(InformationEstimator):
         return (states - self.state_mean[rows]) / self.state_std[rows]
 
     def _minibatch_size(self, batch: InformationBatch) -> int:
-        """Return B, with room for episodes that have ended: a gradient step needs 2 B that are alive."""
+        """Return B, limited so that a gradient step has 2 B living episodes."""
         return max(1, min(self.batch_size, batch.trvs.shape[1] // (2 if batch.alive is None else 4)))
 
     def min_episodes(self, n_episodes: int) -> int:
-        """Return two: a state is paired with the TRVs of another episode."""
+        """Return two, because a state is paired with the TRVs of another episode."""
         return MIN_EPISODES
 
     def has_enough(self, batch: InformationBatch) -> th.Tensor:
-        """Return at which steps there is an estimate: the critic was trained, and two episodes are alive."""
+        """Return for each step whether the critic was trained and two or more episodes live: ``(T,)`` bool."""
         return self.is_trained & super().has_enough(batch)
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:

@@ -1,4 +1,4 @@
-"""Bounds given the last TRVs: a memory is not charged again for what it keeps."""
+"""Bounds on the directed information, which counts information only once if the TRVs keep it for several steps."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from sb3_tdpg.information.base import InformationBatch
 from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut
 
-RIDGE = 1e-4  # of a regression, in shares of the mean variance of its inputs
+RIDGE = 1e-4  # penalty of the regression, relative to the mean variance of its inputs
 
 
 class DirectedLogDet(LogDet):
     r"""
-    The bound of :class:`~sb3_tdpg.information.logdet.LogDet` on what a linear regression on the last TRVs leaves of
-    the present ones.
+    The bound of :class:`~sb3_tdpg.information.logdet.LogDet` on the residuals of a linear regression of the
+    present TRVs on the last ones.
 
-    The penalty becomes the directed information from the sensor to the TRVs: what the sensor brings into them. (What
-    the actions write into later observations does not count.) Given x~_{t-1}, the TRVs depend on the past only through
-    y_t, hence
+    The penalty becomes the directed information from the sensor to the TRVs, which is the information that the sensor
+    adds at each step. (The influence of the actions on later observations does not count.) Given x~_{t-1}, the TRVs
+    depend on the past only through y_t, hence
 
     .. math::
         I[y_{0:T} \to \tilde x_{0:T}] = \sum_t I[y_{0:t}; \tilde x_t | \tilde x_{0:t-1}]
@@ -26,9 +26,9 @@ class DirectedLogDet(LogDet):
         \le \sum_t \tfrac12 \log\det \mathrm{Cov}(\tilde x_t - A_t \tilde x_{t-1})
         - E[\textstyle\sum_i \log \sigma_i(e_t)]
 
-    with the matrix A_t of a linear regression: a Gaussian has the largest entropy, and the best linear prediction
-    leaves at least the variance of the best one. A bit that is kept for T steps costs one bit here, and T bits in the
-    sum over time of I[x_t; x~_t], on which this is no bound.
+    with the matrix A_t of a linear regression. The last inequality holds because a Gaussian has the largest entropy,
+    and because the best linear prediction leaves at least the variance of the best prediction. A bit that is kept for T
+    steps costs one bit here, and T bits in the sum over time of I[x_t; x~_t]. This estimate is no bound on that sum.
     """
 
     bound = "neither"  # type: ignore[assignment]  # of the inherited "upper": it bounds another quantity
@@ -39,8 +39,8 @@ class DirectedLogDet(LogDet):
 
 class DirectedLeaveOneOut(LeaveOneOut):
     r"""
-    The bound of :class:`~sb3_tdpg.information.loo.LeaveOneOut` on what a linear regression on the last TRVs leaves of
-    the present ones.
+    The bound of :class:`~sb3_tdpg.information.loo.LeaveOneOut` on the residuals of a linear regression of the
+    present TRVs on the last ones.
 
     It bounds the same directed information as :class:`DirectedLogDet`. With :math:`r_i = \tilde x_i - A_t
     \tilde x_{i, t-1}`, and :math:`q_j` the density of r in episode j, a Gaussian around
@@ -50,9 +50,9 @@ class DirectedLeaveOneOut(LeaveOneOut):
         I[y_t; \tilde x_t | \tilde x_{t-1}] \le h(r) - h(\tilde x_t | e_t) \le E\left[\frac1N \sum_i \log
         \frac{q_i(r_i)}{\frac{1}{N-1} \sum_{j \ne i} q_j(r_i)}\right].
 
-    The first step is h(x~_t | x~_{t-1}) = h(r | x~_{t-1}) <= h(r), for any A_t. The second needs no shape of the
-    density: a bit costs at most ln 2, where the log-det bound charges the distance of its two values, so that the
-    policy makes them harder to tell apart.
+    The first inequality is h(x~_t | x~_{t-1}) = h(r | x~_{t-1}) <= h(r), for any A_t. The second holds for any shape of
+    the density, so a bit costs at most ln 2. With the log-det bound, the cost of a bit grows with the distance of its
+    two values, and the policy makes the values harder to distinguish.
     """
 
     bound = "neither"  # type: ignore[assignment]  # of the inherited "upper": it bounds another quantity
@@ -63,7 +63,7 @@ class DirectedLeaveOneOut(LeaveOneOut):
 
 def without_memory(batch: InformationBatch) -> InformationBatch:
     """
-    Subtract what a linear regression of the means on the last TRVs predicts, from TRVs and means.
+    Subtract from TRVs and means the prediction of a linear regression of the means on the last TRVs.
 
     :raises ValueError: if the batch does not have the last TRVs.
     """

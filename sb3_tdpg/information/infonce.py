@@ -17,7 +17,7 @@ class InfoNCE(CriticEstimator):
     .. math::
         E\left[F(x_i, \tilde x_i) - \log \frac{1}{B} \sum_j e^{F(x_i, \tilde x_j)}\right].
 
-    A lower bound with low variance that cannot exceed ``ln B``: 3.9 nats with ``batch_size=50``.
+    This lower bound has low variance. It cannot exceed ``ln B``, which is 3.9 nats with ``batch_size=50``.
     """
 
     bound = "lower"
@@ -42,7 +42,7 @@ class InfoNCE(CriticEstimator):
         n_steps, n = trvs.shape[:2]
         size = min(self.batch_size, n)
         n_groups = n // size
-        # The bound is defined for groups of B samples: average it over the groups in the batch.
+        # The bound is defined for groups of B samples, so it is averaged over the groups in the batch.
         states, trvs = (x[:, : n_groups * size].unflatten(1, (n_groups, size)) for x in (states, trvs))
         inputs = self._pair(states, trvs, trvs)  # (T, G, B + B * B, X + Z)
         flat = inputs.flatten(1, 2)

@@ -11,15 +11,15 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 class LeaveOneOut(InformationEstimator):
     r"""
-    The marginal q(x~_t) is replaced by the mixture of the *other* episodes' encoder densities:
+    Bound the information with the mixture of the *other* episodes' encoder densities in place of the marginal q(x~_t).
 
     .. math::
         I[x_t; \tilde x_t] \le I[e_t; \tilde x_t] \le E\left[\frac1N \sum_i \log
         \frac{q(\tilde x_i | e_i)}{\frac{1}{N-1} \sum_{j \ne i} q(\tilde x_i | e_j)}\right],
         \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    An upper bound in expectation, for any shape of q(x~_t). It is loose above about ln N. Where the steps of an episode
-    are pooled, the mixture leaves out all steps of the same episode.
+    This is an upper bound in expectation, for any shape of q(x~_t). It is loose above about ln N. If the steps of an
+    episode are pooled, the mixture leaves out all steps of the same episode.
     """
 
     bound = "upper"
@@ -32,7 +32,7 @@ class LeaveOneOut(InformationEstimator):
         else:
             same = batch.episode[:, :, None] == batch.episode[:, None, :]
         n_others = (~same).sum(dim=2)
-        alone = n_others == 0  # all samples are of one episode, and say nothing
+        alone = n_others == 0  # no sample of another episode, so no estimate
         others = log_density.masked_fill(same & ~alone[..., None], -math.inf)
         bound = own - th.logsumexp(others, dim=2) + n_others.clamp(min=1).log()
         return bound.masked_fill(alone, 0.0).mean(dim=1)
@@ -46,8 +46,8 @@ def own_sample_bound(batch: InformationBatch) -> th.Tensor:
         I[e_t; \tilde x_t] \ge E\left[\frac1N \sum_i \log
         \frac{q(\tilde x_i | e_i)}{\frac1N \sum_j q(\tilde x_i | e_j)}\right], \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    This is InfoNCE with the optimal critic, and at most ln N. Where the encoder's input is a function of the state (no
-    memory, T = 1, and no sensor noise), it also bounds :math:`I[x_t; \tilde x_t]`.
+    The bound is InfoNCE with the optimal critic, and is at most ln N. If the encoder's input is a function of the state
+    (no memory, T = 1, and no sensor noise), it is also a lower bound on :math:`I[x_t; \tilde x_t]`.
 
     :return: ``(T,)``, nats
     """
@@ -64,8 +64,8 @@ def log_density_matrix(batch: InformationBatch) -> th.Tensor:
     """
     trvs, means, stds = batch.trvs, batch.means, batch.stds
     precision = stds.square().reciprocal()  # (T, N, Z)
-    # sum_z (x_iz - m_jz)^2 / s_jz^2 as matrix products, without a (T, N, N, Z) intermediate. Centred first, since the
-    # expanded square loses digits far from the origin.
+    # sum_z (x_iz - m_jz)^2 / s_jz^2 as matrix products, without a (T, N, N, Z) intermediate. The values are centred
+    # first, since the expanded square loses digits far from the origin.
     centre = means.mean(dim=1, keepdim=True).detach()
     x, m = trvs - centre, means - centre
     quadratic = x.square() @ precision.mT - 2 * x @ (m * precision).mT + (m.square() * precision).sum(-1)[:, None, :]

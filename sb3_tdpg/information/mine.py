@@ -20,13 +20,13 @@ class Mine(CriticEstimator):
     r"""
     The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (Equation 8).
 
-    A lower bound for a fixed critic on *fresh* samples, except for the upward bias of the logarithm of a mean, which is
-    small for many samples. On the samples that the critic was fitted to, it tends to be too high.
+    For a fixed critic and *fresh* samples the estimate is a lower bound, except for the upward bias of the logarithm of
+    a mean, which is small for many samples. On the samples that the critic was fitted to, it tends to be too high.
 
     :param ema_decay: Weight **on the past** of an exponential moving average over gradient steps, which replaces the
-        denominator of the critic's gradient (Equation 10) to reduce the bias of minibatches: 0.99 averages over about
-        100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging. ``None``: the mean
-        of each minibatch.
+        denominator of the critic's gradient (Equation 10) to reduce the bias of minibatches. A value of 0.99 averages
+        over about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging. ``None``
+        uses the mean of each minibatch.
     :param kwargs: See :class:`~sb3_tdpg.information.critic.CriticEstimator`.
     :raises ValueError: if ``ema_decay`` is not in [0, 1).
     """
@@ -49,7 +49,7 @@ class Mine(CriticEstimator):
         return scores.joint.mean(dim=1) - log_mean_exp(scores.marginal)
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """Differentiate in closed form (Equation 10): -1 / B at joint samples, a softmax at marginal ones."""
+        """Return the gradient in closed form (Equation 10): -1 / B at joint samples, a softmax at marginal samples."""
         gradient = th.zeros_like(values)
         marginal = values[rows, n:, 0]
         gradient[rows, :n, 0] = -1.0 / n
@@ -61,7 +61,7 @@ class Mine(CriticEstimator):
         return gradient
 
     def _update_log_ema(self, log_mean: th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """Update the average of the denominator with this minibatch's, in logarithms since e^F overflows."""
+        """Update the moving average of the denominator with a minibatch, in logarithms because e^F overflows."""
         assert self.ema_decay is not None
         past = self.log_ema[steps]
         log_decay = math.log(self.ema_decay) if self.ema_decay > 0 else -math.inf

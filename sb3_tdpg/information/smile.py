@@ -18,7 +18,8 @@ class Smile(CriticEstimator):
     The critic is trained on the stable Jensen-Shannon objective, whose optimum is the log density ratio. Clipping
     reduces the variance; the result is neither a lower nor an upper bound.
 
-    :param clip: tau of the paper; a larger value reduces the bias and increases the variance.
+    :param clip: Largest absolute score, tau in the SMILE paper. A larger value reduces the bias and increases the
+        variance.
     :param kwargs: See :class:`~sb3_tdpg.information.critic.CriticEstimator`.
     """
 

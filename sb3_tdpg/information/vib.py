@@ -9,7 +9,7 @@ import torch as th
 from sb3_tdpg.envs import checks
 from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
-EM_STEPS = 30  # of expectation-maximisation, in each fit of several components
+EM_STEPS = 30  # steps of expectation-maximisation in each fit of several components
 
 Prior = tuple[th.Tensor, th.Tensor, th.Tensor]  # means and variances, (T, K, Z), and logarithms of the weights, (T, K)
 
@@ -25,22 +25,22 @@ class VariationalBottleneck(InformationEstimator):
         \le E\, D[q(\tilde x_t | e_t) \,\|\, r_t].
 
     The prior r_t of each time step is a mixture of K diagonal Gaussians :math:`w_k N_k`, fitted to each epoch's
-    rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form; the estimate is an upper
-    bound of it by Jensen's inequality, which needs no samples (Hershey and Olsen, 2007):
+    rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form. The estimate is an upper
+    bound on it by Jensen's inequality, which needs no samples (Hershey and Olsen, 2007):
 
     .. math::
         D[q \,\|\, r_t] \le -\log \sum_k w_k e^{-D[q \| N_k]}.
 
-    With one component this is exact, and the best prior has the moments of the TRVs: the estimate is
+    With one component this bound is exact, and the best prior has the moments of the TRVs. The estimate is then that of
     :class:`~sb3_tdpg.information.logdet.LogDet` without the covariances, so it is looser for correlated TRVs. A mixture
     is fitted by expectation-maximisation; the responsibility of a component for an episode is proportional to
     :math:`w_k e^{-D[q \| N_k]}`.
 
-    Before the first fit the prior is the standard normal. On the samples of the fit, the estimate is too low by about
-    d / N for d TRVs and each component.
+    Before the first fit the prior is the standard normal. On the samples of the fit, the estimate is about d / N nats
+    too low for d TRVs, per component.
 
     :param n_components: Number of Gaussians K in the prior of a time step.
-    :raises ValueError: if it is not an integer of at least 1.
+    :raises ValueError: if ``n_components`` is not an integer of at least 1.
     """
 
     bound = "upper"
@@ -61,7 +61,7 @@ class VariationalBottleneck(InformationEstimator):
         """
         Fit the prior of each time step to the encoder's densities in the living episodes.
 
-        It does not change at steps with fewer than ``min_episodes`` of them.
+        The prior does not change at steps with fewer than ``min_episodes`` living episodes.
         """
         means, variances = batch.means.detach(), batch.stds.detach().square()  # (T, N, Z)
         enough = self.has_enough(batch)
@@ -109,7 +109,7 @@ def _moments(means: th.Tensor, variances: th.Tensor, responsibility: th.Tensor, 
     :param responsibility: ``(T, N, K)``
     :param pseudo: A Gaussian that counts as an additional episode of every component, so that none is empty.
     """
-    # Around the mean of the living episodes: second moments lose digits far from it.
+    # The moments are around the mean of the living episodes, because second moments lose digits far from it.
     weight = responsibility.sum(2, keepdim=True)
     origin = (weight * means).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
     centred = means - origin

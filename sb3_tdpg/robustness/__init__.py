@@ -1,7 +1,7 @@
 """
-Robustness: perturbations of any environment's observations, in five severities, to evaluate policies.
+Perturb the observations or the actions of any environment, in five severities, to evaluate policies.
 
-:mod:`sb3_tdpg.robustness.training` perturbs the images of a training.
+:mod:`sb3_tdpg.robustness.training` has the perturbations for training.
 """
 
 from sb3_tdpg.robustness import effects as effects  # fills the registry

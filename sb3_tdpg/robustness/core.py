@@ -1,7 +1,7 @@
 """
-The application of a perturbation to the episodes of N environments, for both wrappers.
+Apply perturbations to the episodes of N environments.
 
-Dimension key: N environments, n of them at a time.
+Dimension key: N environments, n of these at a time.
 """
 
 import zlib
@@ -15,11 +15,11 @@ from sb3_tdpg.buffers import each_part
 from sb3_tdpg.robustness.registry import KEEP, NOTHING, Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
-CHUNK = 64  # images perturbed at once: bounds the memory
+CHUNK = 64  # number of images perturbed at once, to limit the memory
 _DOMAIN = 0x50E7  # any constant: a perturbation must not draw what the environment with the same seed draws
 
 Observations = Any
-"""An array ``(n, *obs)``, or a dict of such."""
+"""An array ``(n, *obs)``, or a dict of such arrays."""
 
 Drawn = dict[str, np.ndarray]
 States = np.ndarray | None
@@ -40,11 +40,11 @@ class Members:
     Hold one member of a family of perturbations for each of N episodes. This base class changes nothing.
 
     The members have their own random generator, so the random numbers of the environment do not change. A subclass
-    draws what an episode keeps, and calls :meth:`begin` at the end of its constructor.
+    draws the values that an episode keeps, and calls :meth:`begin` at the end of its constructor.
 
     :param names: Part of the seed, so that nested perturbations and parts do not draw the same numbers.
-    :param seed: ``None``: random, until :meth:`reseed`.
-    :param children: Members that are seeded with these, and begin with them.
+    :param seed: Seed of the generator; ``None``: random, until :meth:`reseed`.
+    :param children: Members that are reseeded, and begin episodes, together with this object.
     """
 
     uses_states = False
@@ -55,7 +55,7 @@ class Members:
         self._entropy = [_DOMAIN, *codes, *([] if seed is None else [seed])]
         self._rng = np.random.default_rng(None if seed is None else self._entropy)
         self.n, self.children = n, list(children)
-        self._episode: Drawn = {}  # what was drawn for each episode, and what it goes on with: (N, ...)
+        self._episode: Drawn = {}  # values drawn for each episode, and its running state: (N, ...)
 
     def reseed(self, env_seed: int) -> None:
         """Restart the random generator from the seeds of the environments and of the perturbation."""
@@ -64,7 +64,7 @@ class Members:
             child.reseed(env_seed)
 
     def begin(self, which: np.ndarray) -> None:
-        """Begin episodes in the environments with the indices ``which``, ``(n,)``: draw what is constant in them."""
+        """Begin episodes in the environments ``which``, ``(n,)``, and draw the values that stay constant in them."""
         for name, values in self._draw(len(which)).items():
             if len(which) == self.n:
                 self._episode[name] = values
@@ -74,7 +74,7 @@ class Members:
             child.begin(which)
 
     def repeat(self, n: int) -> "Members":
-        """Give n episodes the member that the only one has, whose next observation is its first."""
+        """Copy the member of a single episode to n episodes, before the first observation."""
         self._episode = {name: values.repeat(n, axis=0) for name, values in self._episode.items()}
         self.n, self.children = n, [child.repeat(n) for child in self.children]
         return self
@@ -83,7 +83,7 @@ class Members:
         self, observations: Observations, which: np.ndarray | None = None, states: States = None
     ) -> Observations:
         """
-        Perturb the next observations of some episodes: a new array.
+        Perturb the next observations of some episodes, and return them as a new array.
 
         :param observations: ``(n, *obs)``
         :param which: indices of the episodes, ``(n,)``; default: all.
@@ -98,16 +98,16 @@ class Members:
         return shown
 
     def _draw(self, n: int) -> Drawn:
-        """Draw what n episodes that begin keep: arrays ``(n, ...)``."""
+        """Draw the values that n new episodes keep: arrays ``(n, ...)``."""
         return {}
 
     def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
-        """Perturb observations, as a call does, and change in place what was drawn for their episodes."""
+        """Perturb observations, and update the values in ``episode`` in place."""
         return each_part(np.copy, observations)
 
 
 class Perturber(Members):
-    """Apply a perturbation to the batches of a sensor, to whose space it applies."""
+    """Apply a perturbation to batches of observations; it must apply to the sensor's space."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class Perturber(Members):
         part: str = "",
     ) -> None:
         self.perturbation, self.value, self.sensor = perturbation, perturbation.value(severity), sensor
-        self.parts: dict[str, Perturber] = {}  # of a Dict that has no timing in common
+        self.parts: dict[str, Perturber] = {}  # of a Dict, unless its parts share one timing
         if isinstance(sensor.space, spaces.Dict) and perturbation.kind != "any":
             for key, each in sensor.parts.items():
                 if perturbation.objection(each.space, each.horizon) is None:
@@ -150,11 +150,11 @@ class Perturber(Members):
         return perturbed
 
     def _in_time(self, observations: Observations, episode: Drawn) -> Observations:
-        """Show other observations than the present ones, or nothing."""
+        """Replace the present observations by earlier ones, or by nothing."""
         t = episode["t"]
         source = self.perturbation.apply(t, self.value, episode, self._rng)
         of_all = source if source.ndim == 1 else np.zeros_like(t)
-        each, age = np.arange(len(t)), of_all.clip(0, t)  # until then, the first observation
+        each, age = np.arange(len(t)), of_all.clip(0, t)  # the first observation is shown until then
         result = {}
         for key, now in observations.items() if isinstance(observations, dict) else [("", observations)]:
             past, shown = episode[f"past {key}"], episode[f"shown {key}"]

@@ -1,5 +1,5 @@
 """
-All perturbations, each a function of a batch of observations with its row of the registry above it.
+Define all perturbations. Each is a function of a batch of observations, which a decorator adds to the registry.
 
 Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Perturbations
 of the timing get the time of each episode, ``(n,)``, and return which observation is shown.
@@ -18,7 +18,7 @@ from sb3_tdpg.robustness.sensor import Sensor
 
 MIN_BLUR = 0.35  # pixels: a narrower Gaussian changes nothing
 N_TEXTURES = 16
-FIRST_TEXTURE = 1000  # a seed: the seeds of users start at 0
+FIRST_TEXTURE = 1000  # seed of the first texture; the seeds of users start at 0
 
 
 @perturbation("image", "standard deviation, share of the range", (0.05, 0.10, 0.15, 0.20, 0.25))
@@ -52,7 +52,7 @@ def contrast(images: np.ndarray, factor: float, episode: Episode, rng: np.random
 
 
 def draw_turn(rng: np.random.Generator, n: int, degrees: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw for each episode in which direction its colours turn about the axis of greys."""
+    """Draw the direction in which the colours of each episode turn about the axis of greys."""
     from scipy.spatial.transform import Rotation
 
     angle = np.deg2rad(degrees) * rng.choice([-1.0, 1.0], n)
@@ -103,12 +103,12 @@ def dropped_pixels(images: np.ndarray, share: float, episode: Episode, rng: np.r
 
 
 def evenly(number: np.ndarray, share: float, phase: np.ndarray) -> np.ndarray:
-    """Choose a share of the numbers 0, 1, ... evenly; independent choices would leave out some short episodes."""
+    """Choose a share of the numbers 0, 1, ... at even distances; independent choices could miss short episodes."""
     return np.floor(share * (number + 1) + phase) > np.floor(share * number + phase)
 
 
 def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw where the count of lost readings starts."""
+    """Draw the phase at which each episode starts to count lost readings."""
     return dict(phase=rng.random(n))
 
 
@@ -148,7 +148,7 @@ def texture_overlay(images: np.ndarray, opacity: float, episode: Episode, rng: n
 
 
 def draw_shift(rng: np.random.Generator, n: int, distance: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw in which direction the camera of each episode is turned, in whole pixels."""
+    """Draw the shift of each episode's images, in a random direction and in whole pixels."""
     _, *lengths = sensor.shape
     angle = rng.uniform(0, 2 * np.pi, n)
     shift = max(1.0, distance * lengths[0]) * np.stack([np.sin(angle), np.cos(angle)])
@@ -178,13 +178,13 @@ def vector_bias(vectors: np.ndarray, offset: float, episode: Episode, rng: np.ra
 
 @perturbation("vector", "factor", (1.05, 1.1, 1.2, 1.5, 2.0), draw=draw_signs)
 def vector_scale(vectors: np.ndarray, factor: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Multiply every component by a factor or divide it, constant for an episode."""
+    """Multiply or divide every component by a factor, in the same way for a whole episode."""
     return vectors * factor ** episode["sign"]
 
 
 @perturbation("vector", "share of the readings", (0.1, 0.2, 0.35, 0.5, 0.7), draw=draw_phase)
 def vector_dropout(vectors: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Set some components to 0, others at every step."""
+    """Set some components to 0, different ones at every step."""
     n, size = vectors.shape  # the same share of the readings in every episode
     rank = rng.permuted(np.tile(np.arange(size), (n, 1)), axis=1)
     reading = episode["t"][:, None] * size + rank
@@ -196,7 +196,7 @@ perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", later_only
 
 @perturbation("any", "probability", (0.1, 0.25, 0.4, 0.6, 0.8), later_only=True, timing=True)
 def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Repeat the last observation with a probability, at each step anew."""
+    """Repeat the last observation with this probability at each step."""
     return np.where((t > 0) & (rng.random(len(t)) < probability), KEEP, 0)
 
 
@@ -205,16 +205,16 @@ def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Gen
     draw=lambda rng, n, longest, sensor: dict(delay=rng.integers(1, int(longest) + 1, n), age=np.zeros(n, np.int64)),
 )  # fmt: skip
 def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Show the observation of some steps ago, a delay drawn for the episode, with a jitter of one step."""
+    """Show the observation of some steps ago; each episode draws a delay, with a jitter of one step."""
     due = (episode["delay"] + rng.integers(-1, 2, len(t))).clip(0, int(longest))
     age = episode["age"]
-    age[:] = np.where(t == 0, 0, np.minimum(due, age + 1))  # nothing is shown again that is older than the last one
+    age[:] = np.where(t == 0, 0, np.minimum(due, age + 1))  # an observation older than the last one is not shown
     return age.copy()
 
 
 @perturbation(
     "any", "steps", (1, 2, 4, 8, 16), later_only=True, timing=True,
-    # It ends before the horizon if it can.
+    # The burst ends before the horizon if it is short enough.
     draw=lambda rng, n, steps, sensor: dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n)),
 )  # fmt: skip
 def blackout(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
@@ -227,7 +227,7 @@ LATEST = ("latest start, share of the episode", (1.0, 0.8, 0.6, 0.4, 0.2))
 
 
 def draw_start(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw at which step of each episode a failure begins, from the second one on."""
+    """Draw the step of each episode at which a failure begins, the second step at the earliest."""
     # The same random numbers give an earlier start at a higher severity.
     return dict(start=1 + (rng.random(n) * max(1, int(latest * (sensor.horizon - 1)))).astype(np.int64))
 
@@ -239,7 +239,7 @@ def freeze(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Genera
 
 
 def draw_group(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw which group of components fails, and when: ``(n, G)``, never for the other groups."""
+    """Draw the group of components that fails, and its first step: ``(n, G)``; the other groups never fail."""
     which = rng.integers(len(sensor.groups), size=n)
     start = draw_start(rng, n, latest, sensor)["start"]
     never = np.iinfo(np.int64).max

@@ -1,5 +1,5 @@
 """
-Declared families of perturbations, of which every episode has one member.
+Declare families of perturbations; every episode has one member of the family.
 
 Dimension key: N episodes side by side, n of them at a time, X state.
 """
@@ -26,26 +26,26 @@ from sb3_tdpg.robustness.training import WITH_KEYWORDS
 
 class Family:
     """
-    What an environment's episodes may show; :meth:`members` draws a member for each of them.
+    A declared family of perturbations; :meth:`members` draws a member for each episode.
 
-    A declaration is one of the following. A dict or a list: each episode has one of the entries, at
-    random; a range of severities counts as so many entries.
+    A declaration is one of the following. With a dict or a list, each episode has one of the entries, at random. A
+    range of severities counts as one entry for each severity.
 
     - a name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or a :class:`~sb3_tdpg.robustness.Perturbation`;
     - a dict: names with a severity or a range ``(1, 3)`` of them; ``"images"`` with keywords of
       :func:`~sb3_tdpg.robustness.training.images`; ``"noise_range"`` with those of
       :func:`~sb3_tdpg.robustness.training.noise_range`; and ``"env_kwargs"`` with a list of keywords for other scenes
-      of the environment, whose sensor sees the same state (and ``"redraw"``: names of the components of the state that
-      these draw anew for each episode);
-    - a list of ``(name, value)``, with the values of a dict, ``(name, value, factor)``, with a factor of the scale, and
-      ``None``: no perturbation;
+      of the environment, whose sensors observe the same state (with ``"redraw"``: names of components of the state that
+      the scenes draw anew for each episode);
+    - a list of entries, each ``(name, value)`` with a value as in a dict, ``(name, value, factor)`` with a factor for
+      the scale, or ``None`` for no perturbation;
     - a function ``(observations (n, *obs), rng) -> changed observations``, called at each step.
 
-    :param declared: See above.
+    :param declared: The declaration, see above.
     :param env: The environment; it must be reset afterwards.
-    :param severity: Severity for a name without one; ``None``: each episode has any.
+    :param severity: Severity for a name without one; ``None``: each episode has a random one.
     :param scale: See :class:`~sb3_tdpg.robustness.PerturbedVecEnv`.
-    :raises ValueError: if nothing of a name exists or applies.
+    :raises ValueError: if a perturbation does not exist or does not apply.
     """
 
     def __init__(self, declared: Any, env: gym.Env | VecEnv, severity: int | None = None, scale: Any = None) -> None:
@@ -86,7 +86,7 @@ class Family:
         return OneOf([make(n, seed=seed, part=str(i)) for i, make in enumerate(self._makers)], n, seed)
 
     def one(self, seed: int, n: int) -> Members:
-        """Give N episodes the same member, whose name is the seed."""
+        """Give N episodes the same member, which the seed identifies."""
         return self.members(1, seed).repeat(n)
 
     def _makers_of(self, entry: Any, redraw: Any) -> list[Callable[..., Members]]:
@@ -108,7 +108,7 @@ class Family:
         return default_scale(env.observation_space, env, self._given_scale)
 
     def _named(self, name: Any, value: Any, factor: float = 1.0) -> list[Callable[..., Members]]:
-        """Return one perturbation for each severity."""
+        """Return a maker of a perturbation for each severity."""
         env, horizon = self._env, horizon_of(self._env)
         if _has_keywords(name):
             try:
@@ -128,7 +128,7 @@ class Family:
         if found.kind == "action":
             space, scale = env.action_space, np.ones(env.action_space.shape or ())
         elif not found.timing and (found.kind != "image" or self._given_scale is not None):
-            of_parts = self._measured_scale  # never for images alone: it takes steps of the environment
+            of_parts = self._measured_scale  # not needed for images alone; measuring takes steps of the environment
             scale = None if of_parts is None else each_part(lambda part: factor * part, of_parts)
         sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, attribute_of(env, "observation_groups"))
         return [partial(Perturber, found, severity, sensor) for severity in range(low, high + 1)]
@@ -165,7 +165,7 @@ def _has_keywords(name: Any) -> bool:
 
 
 class OneOf(Members):
-    """Each episode has one of several perturbations, at random."""
+    """Give each episode one of several perturbations, at random."""
 
     def __init__(self, members: Sequence[Members], n: int, seed: int | None = None) -> None:
         super().__init__(n, "one of", seed=seed, children=members)
@@ -186,7 +186,7 @@ class OneOf(Members):
 
 
 class FunctionMembers(Members):
-    """What a function of the observations and a random generator returns."""
+    """Replace the observations by the result of a user's function of observations and random generator."""
 
     def __init__(
         self, function: Callable[[Any, np.random.Generator], Any], n: int, *, seed: int | None = None, part: str = ""
@@ -195,7 +195,7 @@ class FunctionMembers(Members):
         self.function = function
 
     def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
-        changed = self.function(each_part(np.copy, observations), self._rng)  # it may change them in place
+        changed = self.function(each_part(np.copy, observations), self._rng)  # the function may change them in place
         if not isinstance(observations, dict):
             changed = np.asarray(changed)
             if changed.shape != observations.shape or changed.dtype != observations.dtype:
@@ -210,10 +210,11 @@ class FunctionMembers(Members):
 
 class SceneMembers(Members):
     """
-    Other scenes of an environment of this package: its sensor, in the same state.
+    Observe the same state in other scenes of an environment of this package.
 
     :param scenes: Copies of the environment with other keywords.
-    :param redraw: Components of the state that the scenes draw anew for each episode, as at their start.
+    :param redraw: Indices of the state's components that are drawn anew for each episode, from the initial states of
+        the scenes.
     """
 
     uses_states = True
@@ -232,7 +233,7 @@ class SceneMembers(Members):
         return dict(number=number, redrawn=redrawn)
 
     def _by_scene(self, number: np.ndarray) -> list[tuple[POMDPEnv, np.ndarray]]:
-        """Group the places in ``number`` by scene."""
+        """Group the indices of ``number`` by scene."""
         for each in self.scenes:
             each.np_random = self._rng
         return [(self.scenes[i], np.flatnonzero(number == i)) for i in np.unique(number)]

@@ -1,4 +1,4 @@
-"""A picture of every perturbation of images in every severity."""
+"""Draw every perturbation of images in every severity."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PANEL = 1.1  # inches a side
-N_STEPS = 8  # before the image is taken
+N_STEPS = 8  # number of steps before the image is taken
 
 
 def perturbation_gallery(
@@ -30,15 +30,15 @@ def perturbation_gallery(
     """
     Draw one image under each perturbation (rows) in each severity (columns), beside the unperturbed image.
 
-    The image is that of the first environment after 8 steps with the action 0 (moved into the bounds), or the last one
-    of a shorter episode, so that late and lost frames can be seen. For an id, the perturbations of its scene
+    The image comes from the first environment after 8 steps with the action 0 (moved into the bounds), or is the last
+    image of a shorter episode. Late and lost frames are then visible. For an id, the perturbations of its scene
     (:func:`.scene_perturbations`) are drawn, too.
 
     :param env: An environment with images, or a registered id.
     :param names: The rows; default: all perturbations of images that apply.
     :param env_kwargs: Keywords for the environment's constructor, with an id.
-    :param seed: Seed of environment and perturbations.
-    :raises ValueError: if the observations are not images, or a perturbation does not apply, or there is none.
+    :param seed: Seed of the environment and the perturbations.
+    :raises ValueError: if the observations are not images, a perturbation does not apply, or there is none to draw.
     """
     if env_kwargs and not isinstance(env, str):
         raise ValueError("env_kwargs are for an environment that is made here: give its id in place of it")
@@ -54,11 +54,11 @@ def perturbation_gallery(
             return _look(made, seed)
 
     space, horizon, frames = look({})
-    sensor = Sensor(space, horizon=len(frames))  # what fails has failed in the last frame
+    sensor = Sensor(space, horizon=len(frames))  # so that failures begin before the last frame
     if not sensor.is_image:
         raise ValueError(f"a gallery shows images, and the observation space is {space}")
     rows: dict[str, list[np.ndarray]] = {}
-    # One picture does not show the timing.
+    # A single picture does not show perturbations of the timing.
     shown = [name for name in applicable(space, horizon) if PERTURBATIONS[name].kind == "image"]
     for name in [*shown, *scenes] if names is None else names:
         if name in scenes:

@@ -1,4 +1,4 @@
-"""What TDPG's argument ``nuisance`` puts around the environment."""
+"""Wrap TDPG's environment in the perturbations of its argument ``nuisance``."""
 
 from typing import Any
 
@@ -12,20 +12,20 @@ from sb3_tdpg.robustness.sensor import Sensor, parts_of
 from sb3_tdpg.robustness.wrappers import PerturbedVecEnv
 
 OF_DEPTH = [None, ("noise", 1), ("dropped_pixels", (1, 2))]
-"""The automatic nuisance of depth images, which is mild: in a fourth of the episodes nothing."""
+"""The automatic nuisance of depth images, which is mild: a quarter of the episodes is not perturbed."""
 
 
 class NuisanceVecEnv(PerturbedVecEnv):
-    """The wrapper that TDPG puts around its environment, and takes off again."""
+    """The wrapper that TDPG adds to its environment and can remove again."""
 
 
 def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
     """
-    Put a declared nuisance around an environment, in the place of another one.
+    Wrap an environment in a declared nuisance, which replaces an earlier one.
 
-    :param declared: ``None``: there is none. ``"auto"``: see :func:`automatic`. Else a declaration of a
+    :param declared: ``None``: no nuisance. ``"auto"``: see :func:`automatic`. Otherwise a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`; a name alone stands for all its severities.
-    :raises ValueError: if nothing of this name exists or applies.
+    :raises ValueError: if a perturbation does not exist or does not apply.
     """
     while isinstance(env, NuisanceVecEnv):
         env = env.venv
@@ -42,9 +42,9 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
 
 def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:
     """
-    Return the family of a declared nuisance of the sensor; in that of ``"auto"`` an episode keeps its changes.
+    Return the family of a declared nuisance of the sensor; with ``"auto"`` an episode keeps its changes.
 
-    :raises ValueError: if there is none, or it changes the actions.
+    :raises ValueError: if there is no nuisance, or it changes the actions.
     """
     found = automatic(declared, env.observation_space, held=True)
     if found is None:
@@ -57,9 +57,9 @@ def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:
 
 def automatic(declared: Any, space: spaces.Space, **keywords: Any) -> Any:
     """
-    Replace ``"auto"``: random changes for images of bytes, noise and dropped pixels for depth images.
+    Replace ``"auto"`` by random changes for images of bytes, or by noise and dropped pixels for depth images.
 
-    For vectors, and for depth images without bounds, it is ``None``.
+    For vectors, and for depth images without bounds, the result is ``None``.
 
     :param keywords: Keywords of :func:`~sb3_tdpg.robustness.training.images`.
     """

@@ -1,5 +1,5 @@
 """
-A phase of training that removes what the actions know of a nuisance of the sensor.
+A phase of training that makes the actions ignore a nuisance of the sensor.
 
 Dimension key: T horizon, N episodes, Z TRVs, U action.
 """
@@ -22,7 +22,7 @@ from sb3_tdpg.robustness.core import take
 from sb3_tdpg.robustness.families import Family
 from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, held_family
 
-BATCH_STEPS = 400  # of a gradient step: 16 episodes of 25 steps
+BATCH_STEPS = 400  # time steps of a gradient step, for instance 16 episodes of 25 steps
 
 
 def actions(policy: Any, batch: Any) -> list[Distribution]:
@@ -47,21 +47,21 @@ def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.T
 
 class NuisancePhase(TDPGCallback):
     r"""
-    After each epoch of plain rollouts, make the actions ignore a nuisance.
+    Make the actions ignore a nuisance, in a phase after each epoch of plain rollouts.
 
-    The policy on perturbed observations learns to do what it did on plain ones before the phase (the *teacher*), and on
-    plain ones to stay as it was, with the same noise of the TRVs:
+    The *teacher* is the policy before the phase, on plain observations. The policy learns to act like the teacher on
+    perturbed observations, and to stay like the teacher on plain ones, with the same noise of the TRVs:
 
     .. math:: E_t\, D(\pi(\cdot | \tilde x_t^\omega) \| \bar\pi(\cdot | \tilde x_t^0))
         + D(\pi(\cdot | \tilde x_t^0) \| \bar\pi(\cdot | \tilde x_t^0)).
 
-    Pass it to ``learn`` before a :class:`~sb3_tdpg.TrainingCheckpointCallback`; in a training that is resumed, its
-    optimiser starts anew.
+    Pass this callback to ``learn`` before a :class:`~sb3_tdpg.TrainingCheckpointCallback`. In a resumed training, the
+    optimiser of the phase starts anew.
 
-    :param nuisance: ``"auto"``: random changes of images of bytes, held for an episode; else a declaration of a
+    :param nuisance: ``"auto"``: random changes of images of bytes, which an episode keeps; otherwise a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`.
     :param n_steps: Gradient steps of a phase.
-    :raises ValueError: if nothing of this name exists or applies, or the rollouts are perturbed.
+    :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed.
     """
 
     optimizer: th.optim.Optimizer
@@ -83,7 +83,7 @@ class NuisancePhase(TDPGCallback):
                 "norm_obs=False and policy_kwargs=dict(normalize_observations=True)"
             )
         self.family = held_family(self.nuisance, env)
-        self.tdpg._last_obs = None  # the environment is reset once more: a scale may have been measured in it
+        self.tdpg._last_obs = None  # reset the environment again, since a scale may have been measured in it
         self.optimizer = th.optim.Adam(self.tdpg.policy.parameters(), lr=1e-3, fused=True)
 
     def _on_training_start(self) -> None:
@@ -106,7 +106,7 @@ class NuisancePhase(TDPGCallback):
         model.policy.set_training_mode(False)
 
     def perturbed(self, batch: Any) -> Any:
-        """Draw members for N episodes, and return what the changed sensor shows: ``(T, N, *obs)``."""
+        """Draw members for N episodes, and return the perturbed observations: ``(T, N, *obs)``."""
         members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
         states = batch.states.cpu().numpy()
         plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
@@ -114,22 +114,22 @@ class NuisancePhase(TDPGCallback):
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
     def _cut(self, batch: Any, observations: Any) -> Any:
-        """Cut whole episodes with these observations into the segments that the policy learns from, if any."""
+        """Replace the observations of whole episodes, and cut them into segments if the policy learns from segments."""
         model: Any = self.tdpg
         batch = batch._replace(observations=observations)
         return batch if model.policy.time_varying else batch.segments(model.bptt_steps or len(batch.costs))
 
     def remove(self, batch: Any) -> float:
         """
-        Take the gradient steps of an epoch.
+        Take the gradient steps of a phase.
 
-        :param batch: The rollouts: whole episodes, since a member of the nuisance lasts for one.
-        :return: the divergence of the new policy's actions on fresh perturbations, in nats a step
+        :param batch: The rollouts as whole episodes, since a member of the nuisance lasts for an episode.
+        :return: the divergence between the new policy's actions with and without fresh perturbations, in nats per step
         """
         policy, check_finite = self.tdpg.policy, self.tdpg._check_finite
         minibatches = self._minibatches(batch)
-        with th.no_grad():  # the policy as it is now, for all steps
-            whole = map(batch.select, minibatches)  # one at a time: images need room
+        with th.no_grad():  # the teacher is the present policy, for all gradient steps
+            whole = map(batch.select, minibatches)  # one at a time, since images need memory
             teachers = [actions(policy, self._cut(part, part.observations)) for part in whole]
         for columns, teacher in zip(minibatches, teachers, strict=True):
             part = batch.select(columns)

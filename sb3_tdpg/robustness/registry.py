@@ -1,4 +1,4 @@
-"""The registries of perturbations: of the sensor and the actuators, and of the scene."""
+"""The registries of perturbations, for the sensor and the actuators, and for the scene."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from sb3_tdpg.robustness.sensor import Sensor
 
 N_SEVERITIES = 5
 KINDS = ("image", "vector", "any", "action")
-KEEP, NOTHING = -1, -2  # in place of an age: what was shown last, and no observation at all
+KEEP, NOTHING = -1, -2  # instead of an age: the observation shown last, and no observation
 
-Episode = Mapping[str, np.ndarray]  # what was drawn for the episodes of a batch, and their time
+Episode = Mapping[str, np.ndarray]  # the values drawn for the episodes of a batch, and their time
 Draw = Callable[[np.random.Generator, int, float, Sensor], dict[str, np.ndarray]]
 Apply = Callable[[np.ndarray, float, Episode, np.random.Generator], np.ndarray]
 
@@ -30,19 +30,20 @@ class Perturbation:
     """
     A change to the observations or the actions, in five severities.
 
-    Both functions get a batch of n episodes and the value of the severity. ``apply(observations, value, episode, rng)``
-    returns the perturbed batch as a new array. It gets images as ``(n, C, H, W)`` float32 in [0, 1] and vectors as
-    ``(n, D)`` float64 in multiples of their scale (actions: as they are), and may exceed the bounds.
-    ``draw(rng, n, value, sensor)`` is called where an episode begins and returns arrays with a leading dimension of n.
-    ``apply`` finds them in ``episode``, beside the time ``episode["t"]``, ``(n,)``, which is 0 at the first
-    observation.
+    ``apply`` and ``draw`` work on n episodes and get the value of the severity.
+    ``apply(observations, value, episode, rng)`` returns the perturbed batch as a new array, which may exceed the
+    bounds. It gets images as ``(n, C, H, W)`` float32 in [0, 1], vectors as ``(n, D)`` float64 in multiples of their
+    scale, and actions without a scale. ``draw(rng, n, value, sensor)`` is called where an episode begins and returns
+    arrays with a leading dimension of n. ``apply`` finds them in ``episode``, beside the time ``episode["t"]``,
+    ``(n,)``, which is 0 at the first observation.
 
-    A perturbation of the *timing* gets ``episode["t"]`` in place of observations and returns which one is shown, as
-    ``(n,)`` integers: the age in steps, at most the value of the severity (0: the present one), ``KEEP`` for the one
-    that was shown last, or ``NOTHING``. With ``(n, G)`` it decides for each of ``sensor.groups``: 0 or ``NOTHING``.
+    A perturbation of the *timing* gets ``episode["t"]`` in place of observations, and returns which observation is
+    shown, as ``(n,)`` integers: the age in steps (0: the present one; at most the value of the severity), ``KEEP`` for
+    the observation that was shown last, or ``NOTHING``. It can also return ``(n, G)`` integers, 0 or ``NOTHING`` for
+    each of ``sensor.groups``.
 
     :param kind: ``"image"``, ``"vector"``, ``"any"`` (timing, for both and for ``Dict``) or ``"action"``.
-    :param parameter: The quantity that the severities are values of, with its unit.
+    :param parameter: Name of the quantity whose values are the severities, with its unit.
     :param severities: Five values, from the mildest to the strongest.
     :param summary: The effect in a few words.
     :param channels: Permitted numbers of image channels; ``None``: any.
@@ -80,10 +81,10 @@ class Perturbation:
         self, space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None
     ) -> str | None:
         """
-        Explain why this perturbation does not apply; ``None`` if it does.
+        Return the reason why this perturbation does not apply, or ``None`` if it applies.
 
-        :param space: The observation space; of a ``Dict``, the parts that it applies to are perturbed.
-        :param horizon: The longest episode, if there is a limit.
+        :param space: The observation space; in a ``Dict``, only the parts to which it applies are perturbed.
+        :param horizon: Largest number of steps of an episode, if there is a limit.
         :param action_space: Needed by perturbations of the actions.
         """
         if self.later_only and horizon == 1:
@@ -138,7 +139,7 @@ def find_applicable(
     horizon: int | None = None,
     action_space: spaces.Space | None = None,
 ) -> Perturbation:
-    """Return a perturbation, or the one of a name, if it applies; see :meth:`Perturbation.objection`."""
+    """Return a perturbation, given itself or its name, if it applies; see :meth:`Perturbation.objection`."""
     if isinstance(perturbation, str) and perturbation not in PERTURBATIONS:
         raise ValueError(f"perturbation={perturbation!r} is unknown: use one of {list(PERTURBATIONS)}")
     found = PERTURBATIONS[perturbation] if isinstance(perturbation, str) else perturbation
@@ -162,12 +163,12 @@ def severity_table(kind: str | None = None) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("perturbation")
 
 
-Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each
+Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each severity
 
-# The true state, and with it the task, does not change: no mugs in other places.
+# The true state, and with it the task, must not change, so no row moves a mug.
 SCENES: dict[str, dict[str, Severities]] = {
     "BallCatch-v0": {
-        # Another texture, blended into the training texture.
+        # A higher severity blends more of another texture into the training texture.
         "texture": tuple(dict(texture=f"{share}%-turquoise_waves") for share in (20, 40, 60, 80, 100)),
         # By default the camera is 2 m high and looks up by 30 degrees.
         "camera_pose": tuple(
@@ -184,7 +185,7 @@ SCENES: dict[str, dict[str, Severities]] = {
 
 def scene_perturbations(env_id: str) -> dict[str, Severities]:
     """
-    Return the perturbations in :data:`SCENES` of an environment: the ``env_kwargs`` of the five severities by name.
+    Return the perturbations of an environment in :data:`SCENES`: by name, the ``env_kwargs`` of five severities.
 
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     """

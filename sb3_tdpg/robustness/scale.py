@@ -1,5 +1,5 @@
 """
-The unit of vector perturbations: how much each component of the observation varies.
+Measure the unit of vector perturbations: how much each component of the observation varies.
 
 Dimension key: E environments; scales have the shape of the observation space.
 """
@@ -20,19 +20,20 @@ from sb3_tdpg.robustness.sensor import finite_range, kind_of, parts_of
 
 N_OBSERVATIONS = 500
 MAX_STEPS = 200
-_SEED = 0xCA1  # of every calibration: the same environment has the same scale
+_SEED = 0xCA1  # of every calibration, so that the same environment has the same scale
 
 
 def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> Any:
     """
     Measure the standard deviation of each observation component, over time and episodes, in a short rollout.
 
-    The rollout lasts until every environment has ended an episode and 500 observations have been seen, at most 200
+    The rollout lasts until every environment has ended an episode and 500 observations have been seen, but at most 200
     steps. The environments must be reset afterwards. Their random generators, and a seed that waits for the first
     reset, are restored, so the next episodes are the same as without the rollout.
 
-    :param model: SB3 model that acts; ``None``: clipped standard Gaussian actions, as of an untrained policy.
-    :return: in the shape of the observation space, float64; for the vectors in a ``Dict``, by key
+    :param model: SB3 model that acts; ``None``: clipped standard Gaussian actions, like those of an untrained policy.
+    :return: the standard deviations in the shape of the observation space, float64; for a ``Dict``, by key of each
+        vector
     """
     vec_env = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
     normalize = None if model is None else model.get_vec_normalize_env()
@@ -81,12 +82,13 @@ def _untrained(env: VecEnv) -> Callable[..., tuple[np.ndarray, None]]:
 
 def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None) -> Any:
     r"""
-    Return the scale of the components of a vector, or of the vectors in a ``Dict``, by key; ``None`` without a vector.
+    Return the scale of a vector's components, or of the vectors in a ``Dict`` by key; ``None`` if there is no vector.
 
     A component with finite bounds has the standard deviation of a uniform distribution between them,
-    :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The others are measured by :func:`observation_scale`.
+    :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The other components are measured by :func:`observation_scale`.
 
-    :param scale: Given by the user and used instead: a number, or one for each component; for a ``Dict`` also by key.
+    :param scale: The user's scale, which is used instead: a number, or one for each component; for a ``Dict`` also by
+        key.
     """
     vectors = _vectors(space)
     if not vectors:
@@ -107,7 +109,7 @@ def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None)
 
 
 def _given_or_bounds(space: Any, scale: Any) -> np.ndarray:
-    """Return the scale that was given for a vector, or that of its bounds, infinite where there are none."""
+    """Return the given scale of a vector, or the scale from its bounds, which is infinite where bounds are missing."""
     if scale is None:
         return finite_range(space) / np.sqrt(12)
     result = np.asarray(scale, dtype=np.float64)

@@ -1,5 +1,5 @@
 """
-The units of observations for perturbations, so that a severity means the same in every observation space.
+Convert observations to the units of perturbations, so that a severity means the same for every space.
 
 Dimension key: N environments, F stacked frames, C channels, H and W rows and columns, D components of a vector.
 """
@@ -25,10 +25,10 @@ def finite_range(space: spaces.Box) -> np.ndarray:
 
 def kind_of(space: spaces.Space) -> str | None:
     """
-    Return ``"image"``, ``"vector"`` or, if it is not a ``Box``, ``None``.
+    Return ``"image"`` or ``"vector"`` for a ``Box``, and ``None`` for any other space.
 
-    An image has finite bounds and three dimensions, one of them the channels, or two dimensions and bytes. Four
-    dimensions are a stack of images, the oldest first.
+    An image has finite bounds, and either three dimensions, of which one is the channels, or two dimensions of bytes. A
+    space of four dimensions is a stack of images, the oldest first.
     """
     if not isinstance(space, spaces.Box):
         return None
@@ -69,7 +69,8 @@ class Sensor:
         """
         The components of the flattened observation that fail together, by part.
 
-        They are the named ones, or each part of a ``Dict``, each channel of an image, each component of a vector.
+        The groups are those in ``named_groups``. If there are none, a group is a part of a ``Dict``, a channel of an
+        image or a component of a vector.
         """
         whole = {key: np.arange(int(np.prod(part.space.shape or ()))) for key, part in self.parts.items()}
         is_dict, named = isinstance(self.space, spaces.Dict), self.named_groups
@@ -99,7 +100,7 @@ class Sensor:
 
     @cached_property
     def is_image(self) -> bool:
-        """Whether there are pixels."""
+        """Whether the observation is an image."""
         return kind_of(self.space) == "image"
 
     @property
@@ -110,12 +111,12 @@ class Sensor:
 
     @property
     def n_frames(self) -> int:
-        """Number of stacked images F; 1 of a vector."""
+        """Number of stacked images F; 1 for a vector."""
         return self.space.shape[0] if self.is_image and len(self.space.shape) == 4 else 1
 
     @property
     def channels_last(self) -> bool:
-        """Whether the last axis holds the channels: as for Stable-Baselines3, unless the first one is the shortest."""
+        """Whether the last axis holds the channels; as in Stable-Baselines3, unless the first axis is the shortest."""
         return int(np.argmin(self.frame)) != 0
 
     @property
@@ -127,7 +128,7 @@ class Sensor:
 
     @property
     def is_depth(self) -> bool:
-        """Whether a pixel is one float: a distance, not a colour."""
+        """Whether a pixel is a single float, which is a distance and not a colour."""
         return self.is_image and np.issubdtype(self.space.dtype, np.floating) and self.shape[0] == 1
 
     def to_units(self, observations: np.ndarray) -> np.ndarray:

@@ -1,5 +1,5 @@
 """
-Perturbations for training: with keywords instead of severities, and strengths that are drawn.
+Perturbations for training, with keywords instead of severities and with random strengths.
 
 Dimension key: n images or episodes, C channels, H and W rows and columns, D components of a vector.
 """
@@ -16,7 +16,7 @@ from sb3_tdpg.robustness.sensor import Sensor
 
 PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
 
-PATTERN_GROUP = 16  # images whose patterns have cells of one size
+PATTERN_GROUP = 16  # number of images whose patterns have cells of one size
 
 
 def images(
@@ -31,20 +31,21 @@ def images(
     r"""
     Return a mixture of random changes of images, applied in this order to y in [0, 1].
 
-    1. colour: the channels are mixed, :math:`y \leftarrow M y`, :math:`M = I + \mathtt{color} \cdot` normal, with rows
-       divided by their sums (or by 0.3, if that is more);
-    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p, of 2 to 64 cells a side, with
-       edges or without (the same for 16 images side by side); a is uniform up to ``pattern``, 0 for three images of
-       ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's sides;
+    1. colour: the channels are mixed, :math:`y \leftarrow M y`, where M is :math:`I + \mathtt{color} \cdot` a standard
+       normal matrix, with each row divided by its sum (or by 0.3, if that is more);
+    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p. The pattern has 2 to 64 cells a
+       side, with sharp or smooth edges (the same for 16 images side by side). The opacity a is uniform up to
+       ``pattern``, 0 for three images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's
+       sides;
     3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
        [0, 1];
     4. noise: Gaussian at every pixel, with a standard deviation uniform up to ``noise``.
 
     The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound the information about
-    everything in the image, so what an encoder keeps of these changes counts as information.
+    everything in the image, so information about these changes also counts.
 
-    :param held: Whether an episode keeps what was drawn at its beginning, but for the noise; else every image has its
-        own.
+    :param held: Whether an episode keeps the changes that were drawn at its beginning, except for the noise. Otherwise
+        every image has its own changes.
     :param color: Strength of the mixing; 0 leaves the colours unchanged.
     :param pattern: Largest opacity of the pattern, at most 1.
     :param patch: Largest side of the opaque rectangle, at most 1.
@@ -59,7 +60,7 @@ def images(
             raise ValueError(f"{name}={value} must be between 0 and {largest:g}")
 
     def changes(rng: np.random.Generator, n: int, shape: Sequence[int]) -> dict[str, np.ndarray]:
-        """Draw n changes of images ``(C, H, W)``: everything but the noise at each pixel."""
+        """Draw n changes of images ``(C, H, W)``, except the noise at each pixel."""
         channels, height, width = shape
 
         def uniform() -> np.ndarray:
@@ -114,7 +115,7 @@ def _rectangles(rng: np.random.Generator, n: int, height: int, width: int, large
 
 def _changed(images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np.ndarray:
     """Change each image ``(n, C, H, W)``, float32 in [0, 1], as drawn, with new noise."""
-    of = {name: th.from_numpy(values) for name, values in drawn.items() if name != "t"}  # several times as fast
+    of = {name: th.from_numpy(values) for name, values in drawn.items() if name != "t"}  # torch is several times faster
     y = (of["mixing"] @ th.from_numpy(images).flatten(2)).unflatten(2, images.shape[2:])
     y = th.lerp(y, of["pattern"], of["amount"])
     y = of["scale"] * y + (1 - of["scale"]) * of["offset"]
@@ -124,10 +125,10 @@ def _changed(images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np
 
 def noise_range(low: float = 0.01, high: float | Sequence[float] = 1.0) -> Perturbation:
     """
-    Return noise whose standard deviation is drawn for each episode, log-uniform between two values in scales.
+    Return noise with a standard deviation that is drawn for each episode, log-uniform between two values, in scales.
 
     :param low: The smallest standard deviation.
-    :param high: The largest one; of several, each episode draws one first.
+    :param high: The largest standard deviation; if several are given, each episode first draws one of them.
     :raises ValueError: unless 0 < low <= high.
     """
     highs = np.atleast_1d(high)
@@ -144,4 +145,4 @@ def noise_range(low: float = 0.01, high: float | Sequence[float] = 1.0) -> Pertu
 
 
 WITH_KEYWORDS: dict[str, Callable[..., Perturbation]] = {"images": images, "noise_range": noise_range}
-"""Perturbations that a declaration gives keywords instead of severities, by name."""
+"""Perturbations, by name, that have keywords instead of severities in a declaration."""

@@ -1,5 +1,5 @@
 """
-The wrapper that perturbs the observations or the actions of an SB3 ``VecEnv``.
+A wrapper that perturbs the observations or the actions of an SB3 ``VecEnv``.
 
 Dimension key: N environments side by side.
 """
@@ -21,24 +21,25 @@ Scale = float | np.ndarray | Mapping[str, Any] | None
 
 class PerturbedVecEnv(VecEnvWrapper):
     """
-    Perturb the observations of N environments in one call, or their actions, in an evaluation or a training.
+    Perturb the observations or the actions of N environments, for evaluation or training.
 
-    Every episode has its own draw, also after an automatic reset; ``info["terminal_observation"]`` is perturbed as the
-    last observation of the episode that has ended. A perturbation of observations does not change state, reward, the
-    rest of info and the environments' random numbers. ``env.seed(...)`` also seeds the perturbation; without it and
-    without ``seed`` every reset takes a seed from torch's generator, so that the seed of a training and a checkpoint
-    cover it. Put this wrapper inside a ``VecNormalize`` or a ``VecFrameStack``.
+    Every episode has its own draw, also after an automatic reset. ``info["terminal_observation"]`` is perturbed as the
+    last observation of the episode that has ended. A perturbation of observations does not change the state, the
+    reward, the rest of ``info`` or the environments' random numbers. ``env.seed(...)`` also seeds the perturbation.
+    Without ``env.seed`` and without ``seed``, every reset takes a seed from torch's generator, so that the seed of a
+    training and a checkpoint also determine the perturbations. Put this wrapper inside a ``VecNormalize`` or a
+    ``VecFrameStack``.
 
     :param venv: The environments. Their attribute ``observation_groups`` may name the components that fail together:
         ``{"imu": [0, 1, 2]}``, or ``{"imu": ["gyroscope"]}`` in a ``Dict``.
     :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, a dict of several, of which each episode
-        has one, a function, ...: see :class:`~sb3_tdpg.robustness.families.Family`.
-    :param severity: Severity for a name: 1 (mild) to 5 (strong); ``None``: each episode has any.
+        has one, a function or another declaration; see :class:`~sb3_tdpg.robustness.families.Family`.
+    :param severity: Severity for a name: 1 (mild) to 5 (strong); ``None``: each episode has a random one.
     :param seed: Seed of the perturbation.
     :param scale: Scale of the components of a vector (in a ``Dict`` also by key); default: from the bounds of the
         space, and where they are infinite, measured in a short rollout
         (:func:`~sb3_tdpg.robustness.observation_scale`).
-    :raises ValueError: if name or severity are unknown, or the perturbation does not apply.
+    :raises ValueError: if the name or the severity is unknown, or the perturbation does not apply.
     """
 
     def __init__(
@@ -58,11 +59,11 @@ class PerturbedVecEnv(VecEnvWrapper):
             self._depth += isinstance(inner, PerturbedVecEnv)
             inner = inner.venv
         self.unperturbed: Any = None
-        """The observations of the last reset or step, as they came."""
+        """The observations of the last reset or step, before the perturbation."""
 
     def reset(self) -> Any:
         """Start N episodes, and perturb their first observations."""
-        (env_seed, *_) = self.unwrapped._seeds  # the reset takes it
+        (env_seed, *_) = self.unwrapped._seeds  # read here, since the reset clears it
         self.unperturbed = observations = self.venv.reset()
         if env_seed is None and self._seed is None:
             env_seed = int(th.randint(2**31, ()))
@@ -77,11 +78,11 @@ class PerturbedVecEnv(VecEnvWrapper):
         return np.stack([info["state"] for info in infos]) if self._perturber.uses_states else None
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Begin a step, with perturbed actions if they are what is perturbed."""
+        """Begin a step; perturb the actions if the perturbation is one of actions."""
         self.venv.step_async(self._perturber(actions) if self._is_plant else actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step, and perturb the observations."""
+        """Finish the step; perturb the observations unless the perturbation is one of actions."""
         observations, rewards, dones, infos = self.venv.step_wait()
         self.reset_infos = self.unwrapped.reset_infos
         self.unperturbed, ended = observations, np.flatnonzero(dones)
@@ -90,7 +91,7 @@ class PerturbedVecEnv(VecEnvWrapper):
             return observations, rewards, dones, infos
         if not len(ended):
             return self._perturber(observations, None, self._states(infos)), rewards, dones, infos
-        # First the observations of the running episodes up to their end, then the first ones of the next episodes.
+        # First perturb the last observations of the running and ended episodes, then the first ones of new episodes.
         last = each_part(np.copy, observations)
         reported = [i for i in ended if "terminal_observation" in infos[i]]
         for i in reported:
