@@ -138,7 +138,7 @@ QUICKSTART_MAKES = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "end", "makes"), [
-    ("README.md", "## Install", ("tdpg_squeeze.zip", "results/report-CartPole-v1/report.html")),
+    ("README.md", "## Install", ("tdpg_squeeze.zip", "results/report-ppo/report.html")),
     ("docs/guide/quickstart.md", "## In a notebook", QUICKSTART_MAKES),
 ])  # fmt: skip
 def test_the_blocks_of_a_first_page_chain_word_for_word(
