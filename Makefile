@@ -52,7 +52,7 @@ $(OLDEST)/.installed: setup.cfg constraints.txt constraints-oldest.txt
 	$(OLDEST)/$(BIN)/python -m pip install --disable-pip-version-check -c build/constraints-oldest.txt -e '.[zoo,postgres,tests,plots]'
 	@touch $@
 
-mutants: $(STAMP) ## make small changes to the code and count the changes that the tests detect (an hour or more)
+mutants: $(STAMP) ## make small changes to the code and count the changes that the tests detect (an hour)
 	$(PY) tests/mutants.py
 
 soak: $(STAMP) ## test for leaks, and with killed trainings and killed workers (ten minutes)
