@@ -6,7 +6,7 @@ import math
 import warnings
 
 LEAST_SLACK = 0.01  # smallest slack as a share of the limit or the improvement, since costs scatter
-NO_SCALE = 1e-9  # of costs that are all zero
+NO_SCALE = 1e-9  # a scale up to this counts as 0, and the weight does not start
 RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
 MAX_GROWTH = 1000.0  # largest ratio of w to its start; without it, w grows forever if no information is needed
 # The following constants are for a limit that is a share of the improvement.
@@ -36,11 +36,11 @@ class AutoWeight:
 
         log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
-    The scale is abs(C). With ``by_slack`` the scale is the slack, that is the distance of the lowest cost so far below
-    the limit. A limit of 95 % of the attainable return then has as strong an effect as a limit of 50 %. The aim is then
-    the middle of the slack instead of C, because the few episodes of an epoch say little about the expected cost. The
-    weight also grows more slowly than it shrinks, ``clip(., -3, 0.3)``, because a policy loses its return within a few
-    epochs and takes many epochs to recover it.
+    The scale is abs(C); at a scale of 0 the weight does not start. With ``by_slack`` the scale is the slack, that is
+    the distance of the lowest cost so far below the limit. A limit of 95 % of the attainable return then has as strong
+    an effect as a limit of 50 %. The aim is then the middle of the slack instead of C, because the few episodes of an
+    epoch say little about the expected cost. The weight also grows more slowly than it shrinks, ``clip(., -3, 0.3)``,
+    because a policy loses its return within a few epochs and takes many epochs to recover it.
 
     If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
     best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs

@@ -179,7 +179,7 @@ class EpisodeBuffer(RolloutBuffer):
 
     def clear_episodes(self, episodes: np.ndarray) -> None:
         """
-        Clear the columns of some episodes.
+        Clear the costs of some episodes, and mark their steps as not alive.
 
         :param episodes: their columns, ``(n,)``
         """

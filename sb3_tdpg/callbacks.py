@@ -107,8 +107,8 @@ class SelectionCallback(TDPGCallback):
         information.
     :param verbose: 1: print every new best epoch.
     :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; at the start of a training,
-        also if a ``VecNormalize`` normalises the observations. The policy can normalise them itself
-        (``normalize_observations``).
+        also if a ``VecNormalize`` normalises the observations with statistics that still change (``training=True``).
+        The policy can normalise them itself (``normalize_observations``).
     """
 
     def __init__(

@@ -241,7 +241,7 @@ def check_learning_rate(rate: float) -> None:
 
 
 def check_action_space(space: spaces.Space) -> None:
-    """Raise a ``ValueError`` if the policy has no distribution for this action space."""
+    """Raise a ``ValueError`` if no policy has a distribution for this action space, or its bounds are not finite."""
     if not isinstance(space, SUPPORTED_ACTION_SPACES):
         names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
         raise ValueError(f"the action space {space} is not supported: use one of {names}")

@@ -167,7 +167,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self._last_obs
 
     def _steps_of_this_epoch(self) -> int:
-        """Return the steps of this epoch: with ``epoch_steps`` those left, but at least a tenth of an epoch."""
+        """Return the steps of this epoch: those left, at most a whole epoch, and at least about a tenth of one."""
         size = self.epoch_size
         if self.epoch == 0:
             return size

@@ -27,7 +27,7 @@ class Defaults(NamedTuple):
     epoch_steps: int | None = None
     n_epochs: int = 1
     batch_size: int | None = None
-    batch_episodes: int | None = None  # batch_size as a number of episodes of any length
+    batch_episodes: int | None = None  # batch_size as a number of episodes of T steps, for any T
     clip_range: float = float("inf")
     normalize_advantage: bool = False
     encoder_gradient: str = "pathwise"

@@ -45,7 +45,7 @@ class Problem:
 
     def initial_states(self, env: VecEnv, obs: np.ndarray) -> np.ndarray:
         """Return x_0 after a reset or an automatic reset of all environments: ``(E, X)``."""
-        # Only the innermost environment has reset_infos; those of its wrappers stay empty.
+        # The reset_infos of SB3's wrappers stay empty.
         return self._states(env, env.unwrapped.reset_infos, obs)
 
     def next_states(self, env: VecEnv, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
@@ -82,7 +82,7 @@ def unperturbed(env: VecEnv, obs: Any) -> Any:
 
 def read_problem(env: VecEnv, **keywords: bool) -> Problem:
     """
-    Read the horizon and the state's dimension from an environment; a ``ValueError`` says what is missing.
+    Read the horizon and the state's dimension of an environment without a step; a ``ValueError`` says what is missing.
 
     :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """

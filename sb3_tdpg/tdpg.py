@@ -113,7 +113,8 @@ class TDPG(EpisodicAlgorithm):
     :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``: a GPU, if there is one, for images; for vectors the CPU, which
         is faster.
     :param n_threads: Number of threads of torch and of NumPy's linear algebra during ``learn``. Default: torch's
-        setting for images, otherwise 1, which is fastest for small networks and gives the same numbers on any machine.
+        setting for images, otherwise 1, which is fastest for small networks and gives the same numbers on any number of
+        cores.
     :param _init_setup_model: Whether to build the networks in the constructor.
     :raises ValueError: if an argument is out of range or does not fit the environment. Nothing has been trained then.
     """

@@ -6,7 +6,7 @@ Donsker-Varadhan formula gives
 
 .. math::
     \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
-    \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c},
+    \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c}.
 
 The right side needs only costs under p. The bound corrects the paper's Theorem II.1. The derivation is in
 ``docs/guide/certificate.md``.
@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import beta as beta_distribution
 
-# All of the highest costs are kept, then ranks that grow by this factor; 400 of a million costs remain.
+# All of the 50 highest costs are kept, then ranks that grow by this factor; about 400 of a million costs remain.
 _HIGHEST = 50
 _RANK_FACTOR = 1.04
 
@@ -100,8 +100,9 @@ def cost_distribution(
     For the i-th lowest of N costs, :math:`F(c_{(i)})` is stochastically above a Beta(i, N + 1 - i) variable. The lower
     quantiles at ``1 - confidence`` divided by the number of used ranks hold simultaneously (Bonferroni). The step
     function through these quantiles is a lower bound on F. The remaining probability above the highest cost, about
-    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``. The band bounds the mean of every increasing function
-    simultaneously, so the entropic risk may be optimised over beta.
+    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``; 400 is about the number of ranks for a million costs.
+    The band bounds the mean of every increasing function simultaneously, so the entropic risk may be optimised over
+    beta.
 
     :param costs: Independent and identically distributed, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.

@@ -150,7 +150,7 @@ def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
 
 
 def _command() -> str:
-    """Return the command line, with paths relative to the working directory."""
+    """Return the command line, with paths inside the working directory relative to it."""
     here = Path.cwd()
     program, *arguments = as_typed(sys.orig_argv)
     relative = [str(Path(a).relative_to(here)) if Path(a).is_relative_to(here) else a for a in arguments]

@@ -17,8 +17,8 @@ from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.evaluation.figures import INK, PALETTE, import_matplotlib, tidy
 
 MIN_WIDTH = 400  # pixels: smaller pictures are enlarged, so that the labels of the plot fit below
-# The next constants are pixels of a video of width MIN_WIDTH. A wider video has larger letters, since a phone shows
-# videos of all widths at the same size.
+# The resolution, the height and the margins, in pixels, are those of a video of width MIN_WIDTH. A wider video has
+# larger letters, since a phone shows videos of all widths at the same size.
 DPI = 100
 PANEL_HEIGHT = 180  # height of the plot of the TRVs
 LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # margins around the axes; the legend is at the right

@@ -23,6 +23,8 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
     If the model's own environment normalises observations (``VecNormalize``), the new environment does so with the
     same, frozen statistics. If the model's observations are stacked (``VecFrameStack``), the new observations are
     stacked, too. The scenario's ``sensor`` wraps the environment, inside the wrappers of the model.
+
+    :raises ValueError: if a model of TDPG was trained on normalised observations, and their statistics are missing.
     """
     env = make_episodes_env(
         scenario.env_id, n_envs, n_episodes=n_episodes, env_kwargs=scenario.env_kwargs, use_processes=False

@@ -70,7 +70,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
                 axes.plot(rows["t"], rows[limit], marker, color=PALETTE[1], markersize=6, label=f"{limit}: {label}")
     cap = np.log(frame["n_episodes"].max())
     if upper.max() > 0.7 * cap:
-        axes.axhline(cap, color=INK, linestyle=(0, (4, 3)), linewidth=1, label=r"$\ln N$: lower limits fall behind")
+        axes.axhline(cap, color=INK, linestyle=(0, (4, 3)), linewidth=1, label=r"$\ln N$: lower limits become loose")
     axes.set_ylim(bottom=0, top=max(1.05 * upper.max(), 0.1))
     axes.xaxis.set_major_locator(import_matplotlib().ticker.MaxNLocator(integer=True, min_n_ticks=1))
     axes.set_xlabel("time step $t$", fontsize=9)

@@ -116,7 +116,7 @@ def information_report(
 
 
 def within(known: pd.DataFrame, interval: InformationInterval) -> tuple[pd.DataFrame, TrustCheck]:
-    """Cap the information about each component at the limit for the whole state, and check it against this limit."""
+    """Cap the information about components at the whole state's upper limit; check their lower limits against it."""
     upper = interval.upper[known["t"]]
     excess = (known["nats_lower"] - upper).max()
     meaning = "nats by which the lower limit of a component of the state is above the upper limit of the whole state"

@@ -1,5 +1,8 @@
 """
-Define all perturbations. Each is a function of a batch of observations, which a decorator adds to the registry.
+Define all perturbations. Each is a function of a batch of observations or actions.
+
+The decorator ``@perturbation`` adds them to the registry. Two perturbations reuse the function of another one, and are
+added by a direct call.
 
 Images are ``(n, C, H, W)`` float32 in [0, 1]. Vectors are ``(n, D)`` float64 in multiples of their scale. Perturbations
 of the timing get the time of each episode, ``(n,)``, and return which observation is shown.

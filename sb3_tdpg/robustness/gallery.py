@@ -54,11 +54,11 @@ def perturbation_gallery(
             return _look(made, seed)
 
     space, horizon, frames = look({})
-    sensor = Sensor(space, horizon=len(frames))  # so that failures begin before the last frame
+    sensor = Sensor(space, horizon=len(frames))  # so that failures have begun by the last frame
     if not sensor.is_image:
         raise ValueError(f"a gallery shows images, and the observation space is {space}")
     rows: dict[str, list[np.ndarray]] = {}
-    # A single picture does not show perturbations of the timing.
+    # The kind "any" is left out: it changes the timing, which a single picture does not show.
     shown = [name for name in applicable(space, horizon) if PERTURBATIONS[name].kind == "image"]
     for name in [*shown, *scenes] if names is None else names:
         if name in scenes:

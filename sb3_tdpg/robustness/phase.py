@@ -61,7 +61,8 @@ class NuisancePhase(TDPGCallback):
     :param nuisance: ``"auto"``: random changes of images of bytes, which an episode keeps; otherwise a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`.
     :param n_steps: Gradient steps of a phase.
-    :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed.
+    :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed or normalised
+        (``VecNormalize``).
     """
 
     optimizer: th.optim.Optimizer

@@ -28,7 +28,7 @@ class PerturbedVecEnv(VecEnvWrapper):
     reward, the rest of ``info`` or the environments' random numbers. ``env.seed(...)`` also seeds the perturbation.
     Without ``env.seed`` and without ``seed``, every reset takes a seed from torch's generator, so that the seed of a
     training and a checkpoint also determine the perturbations. Put this wrapper inside a ``VecNormalize`` or a
-    ``VecFrameStack``.
+    ``VecFrameStack``; a perturbation of actions may also lie around a ``VecNormalize``.
 
     :param venv: The environments. Their attribute ``observation_groups`` may name the components that fail together:
         ``{"imu": [0, 1, 2]}``, or ``{"imu": ["gyroscope"]}`` in a ``Dict``.
@@ -39,7 +39,8 @@ class PerturbedVecEnv(VecEnvWrapper):
     :param scale: Scale of the components of a vector (in a ``Dict`` also by key); default: from the bounds of the
         space, and where they are infinite, measured in a short rollout
         (:func:`~sb3_tdpg.robustness.observation_scale`).
-    :raises ValueError: if the name or the severity is unknown, or the perturbation does not apply.
+    :raises ValueError: if the name or the severity is unknown, the perturbation does not apply, or it perturbs
+        observations that a ``VecNormalize`` has normalised.
     """
 
     def __init__(
