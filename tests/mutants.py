@@ -4,8 +4,8 @@ Mutation testing: ``make mutants`` makes small changes to the code and counts th
 The code that computes the results is changed: the losses, the update, the estimators of the information, the
 certificates and the environments. ``mutmut`` changes one operator, number or argument at a time. It then runs the tests
 that reach the changed function until one fails. Errors, warnings, and code that draws pictures or writes a page are not
-changed. By default a random sample of the changes is tried; ``--all`` tries all of them, which takes a day. A run that
-was stopped continues where it stopped.
+changed. By default a random sample of the changes is tried; ``--all`` tries all of them, which takes half a day. A run
+that was stopped continues where it stopped.
 """
 
 from __future__ import annotations

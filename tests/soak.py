@@ -1,5 +1,5 @@
 """
-Endurance test: ``make soak``, a quarter of an hour. It fails if it finds a leak, a difference or a lost trial.
+Endurance test: ``make soak``, ten minutes. It fails if it finds a leak, a difference or a lost trial.
 
 Memory and open files of this process must not grow after the first tenth of each job. Trainings that are killed and
 resumed must end with the same parameters as an uninterrupted training. A study must not lose a trial when its workers
