@@ -18,7 +18,7 @@ help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{ printf "  %-24s %s\n", $$1, $$2 }'
 	@echo "Variables: PYTHON=$(PYTHON) VENV=$(VENV) JOBS=$(JOBS) EXTRAS=$(EXTRAS)"
 
-venv: $(STAMP) ## create the virtual environment (every other target does so if needed)
+venv: $(STAMP) ## create the virtual environment (every target that needs Python does so)
 
 $(STAMP): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
@@ -89,7 +89,7 @@ reproduce-ball: $(STAMP) ## reproduce Table II: TDPG, policy gradient and Recurr
 reproduce-ball-controls: $(STAMP) ## add ablations, PPO, and RecurrentPPO with our encoder to Table II
 	$(PY) -m sb3_tdpg reproduce ball --out results/ball_catch --publish docs/results/ball_catch
 
-reproduce-ball-paper: $(STAMP) ## reproduce Table II with the paper's own algorithm, after policy gradient
+reproduce-ball-paper: $(STAMP) ## reproduce Table II with the paper's own algorithm, starting from policy gradient
 	$(PY) -m sb3_tdpg reproduce ball-paper --out results/ball_catch_paper --publish docs/results/ball_catch_paper
 
 reproduce-ball-varying: $(STAMP) ## run the ball-catching experiment with a varying launch (not in the paper)

@@ -11,7 +11,7 @@ from .base import POMDPEnv
 
 WALL = 0.0  # m
 LAVA = 5.0  # m
-GOAL = np.array([3.0, 0.0])  # m, m/s
+GOAL = np.array([3.0, 0.0])  # m, m per step
 
 
 class LavaEnv(POMDPEnv):
@@ -26,13 +26,13 @@ class LavaEnv(POMDPEnv):
         c_t = \lVert x_t - g \rVert, \qquad c_T = 100 \lVert x_T - g \rVert, \qquad g = (3, 0).
 
     The robot starts with ``v = 0`` and ``d`` uniform in [0, 5] m. If it hits the wall, it stops (``v = 0``), and the
-    control of that step has no effect. If it passes 5 m, it falls into the lava and stays at ``(5, 0)``.
+    control of that step has no effect. If it reaches 5 m, it falls into the lava and stays at ``(5, 0)``.
 
     The defaults follow the paper's text. Another cost definition fits the numbers of Table I better:
     ``LavaEnv(**sb3_tdpg.envs.scenarios.LAVA_TABLE_READING)``.
 
     :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
-    :param sensor_bias: Vector that is added to every observation, in m and m/s.
+    :param sensor_bias: Vector that is added to every observation, in m and m per step.
     :param start_beta: ``(a, b)``: the robot starts at 5 m times a random number from Beta(a, b). ``None``: uniformly.
     :param action_cost: Weight of ``|u_t|`` in the stage cost: 0 in the paper's text, 1 in the other cost definition.
     :param lava_stage_cost: Stage cost in the lava. ``None``: the distance from the goal, which is 2 in the lava.
@@ -63,7 +63,7 @@ class LavaEnv(POMDPEnv):
         sigma = " (it is sigma, not sigma^2)"
         self.sensor_noise_std = checks.not_negative("sensor_noise_std", sensor_noise_std, sigma)
         if sensor_bias is not None and not (np.shape(sensor_bias) == (2,) and np.isfinite(sensor_bias).all()):
-            raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, of m and m/s, or None")
+            raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, in m and m per step, or None")
         if start_beta is not None and not (
             np.shape(start_beta) == (2,) and np.isfinite(start_beta).all() and min(start_beta) > 0
         ):

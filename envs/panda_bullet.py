@@ -14,8 +14,9 @@ from .panda_scene import ROBOT_FILE, PandaScene, add_mug_body
 
 FINGER_SPINNING_FRICTION = 0.1
 HAND_ABOVE_GRASP = 0.1  # m: the height of a grasp is the height of a point between the fingers, near their tips
-# Half a turn does not change the gripper. This yaw of the hand is in the middle of the last joint's range, so that the
-# arm reaches all yaws of a half circle to either side of the nominal yaw.
+# Half a turn does not change the gripper. With this one of the two possible turns, the last joint is at -60 degrees at
+# the nominal yaw, and its range is -170 to 170 degrees. So the arm reaches all yaws within 90 degrees of the nominal
+# yaw.
 HAND_TURN = np.pi / 4 - np.pi
 LIFTED = 0.05  # m: a mug above this height counts as lifted
 LIFTED_FOR_GOOD = 0.06  # m

@@ -166,7 +166,7 @@ class PandaGraspEnv(SharedEnv):
         return self._with_noise(self._shared("images", self._seen(state)), self.np_random)
 
     def _seen(self, state: np.ndarray) -> np.ndarray:
-        """Return the states for the depth camera: the mug's pose and, if it is not constant, the camera's height."""
+        """Return the states for the depth camera: the mug's pose and, if the camera is raised, its height."""
         if self.camera_shift == 0:
             return state
         raised = state[:, 4:] if self.camera_range is not None else np.zeros((len(state), 1))

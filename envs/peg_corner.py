@@ -19,9 +19,9 @@ class PegCornerEnv(POMDPEnv):
     Slide a peg on a fenced table over a hole near one corner.
 
     State ``x = (x, y)``: position of the peg on a table of 6 cm by 6 cm. It starts uniformly in [2, 6]^2 cm. Action
-    ``u``: the displacement, at most ``max_action`` in each direction. The fence stops the peg. If a displacement would
-    cross one side by a distance ``b``, friction subtracts :math:`\mu b` from the component along that side. With
-    :math:`d_t = \lVert x_t - g \rVert`, ``g = (1.2, 1.2)`` cm, and T = 4 controls,
+    ``u``: at most ``max_action`` in each direction; the displacement is ``actuator_gain`` times the action. The fence
+    stops the peg. If a displacement would cross one side by a distance ``b``, friction subtracts :math:`\mu b` from the
+    component along that side. With :math:`d_t = \lVert x_t - g \rVert`, ``g = (1.2, 1.2)`` cm, and T = 4 controls,
 
     .. math::
         c_t = d_t, \qquad c_T = 30 \max(0, d_T - \text{tolerance}).
@@ -32,8 +32,8 @@ class PegCornerEnv(POMDPEnv):
     :param friction: Friction coefficient :math:`\mu` of the fence.
     :param tolerance: Distance from the hole up to which the terminal cost is zero, in cm.
     :param sensor_noise_std: Standard deviation of the sensor noise in cm.
-    :param max_action: The longest displacement in each direction, in cm.
-    :param actuator_gain: Factor between the action and the displacement.
+    :param max_action: Bound of the action in each direction, in cm.
+    :param actuator_gain: The displacement is this factor times the action.
     :param horizon: Number of controls T.
     :param render_mode: ``None`` or ``"rgb_array"``.
     :raises ValueError: if a keyword is out of its range.

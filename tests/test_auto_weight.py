@@ -165,8 +165,8 @@ def test_with_a_share_the_weight_starts_once_the_cost_has_levelled_off():
         weight.update(cost, information=4.0)
         values.append(weight.value)
     started = int(np.flatnonzero(values)[0])
-    # The weight starts after the cost has fallen: when the mean over five epochs differs from the mean ten epochs
-    # earlier by less than the slack.
+    # The weight starts after the cost has fallen: when the mean over five epochs is below the mean ten epochs earlier
+    # by less than the slack.
     assert 20 < started < 20 + WINDOW + LEVEL_EPOCHS
     assert weight.information_before == 4.0
     assert values[started] == pytest.approx(0.1 * 100.0 / 4.0)  # the penalty equals the slack

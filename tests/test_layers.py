@@ -8,8 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "sb3_tdpg"
 
-# The layers from bottom to top. A folder imports from earlier layers and from itself. Files that are not listed belong
-# to the layer "algorithm".
+# The layers from bottom to top. A module imports from its own layer and from lower layers. Files that are not listed
+# belong to the layer "algorithm".
 LAYERS = [
     ["common"],
     ["information"],

@@ -226,7 +226,7 @@ def test_what_skips_the_encoder_needs_as_many_trvs():
 
 @pytest.mark.parametrize("shows_velocity", [True, False])
 def test_changes_count_where_they_say_what_the_observation_does_not(shows_velocity):
-    """A mass on a spring is pushed at random; its last displacement predicts the next unless it shows its velocity."""
+    """A mass on a spring is pushed at random; its last displacement predicts the next unless its velocity is seen."""
     generator = np.random.default_rng(0)
     state, seen = generator.normal(size=(40, 2)), []
     for _ in range(50):

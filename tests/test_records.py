@@ -1,4 +1,4 @@
-"""``make records`` packs the records of single episodes that have a checksum, and no other files."""
+"""``make records`` packs the records of single episodes that have a checksum, and rejects records that differ."""
 
 import importlib.util
 import tarfile

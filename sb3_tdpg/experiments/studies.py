@@ -274,7 +274,7 @@ def work(
                     raise KeyboardInterrupt from e
                 continue
             if number is not None and trials[number].state == TrialState.FAIL:
-                # Interrupts and outages do not count towards the maximum number of retries.
+                # A trial may be interrupted, or lost in an outage, any number of times.
                 max_retries = None if outage or is_interrupted else MAX_RETRIES
                 RetryHeartbeatStaleTrialCallback(max_retries)(study, trials[number])
             if is_interrupted:

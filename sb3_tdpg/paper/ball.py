@@ -84,7 +84,7 @@ EARLIER_ENCODER = dict(
 
 
 def methods(launch: str) -> tuple[Method, ...]:
-    """List the methods. Each one is the default with the change in its name; all take the same number of steps."""
+    """List TDPG with its defaults, variants with the change in their names, and baselines; all take as many steps."""
     env_kwargs = dict(LAUNCHES[launch])  # a mapping proxy cannot be sent to another process
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:

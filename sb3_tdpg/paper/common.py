@@ -164,7 +164,7 @@ def comparisons_table(
     quantity: str = "mean cost",
 ) -> str:
     """
-    Make a table of the probability that one method is better than another, and of the difference of their means.
+    Make a table of the probability that one method is better than another, and of the paired difference of their means.
 
     The probability is for one seed of each method. Each mean is over the rows of one of ``kinds``, and over the seeds
     that both methods have. Comparisons with a method that has no records are left out.

@@ -1,8 +1,8 @@
 """
 Compare TDPG under sensor faults with baselines on the funnels, a task with a cue, lava, and an arm.
 
-The baselines include methods that are trained with sensor noise of several ranges, or with the faults themselves (label
-"told the faults").
+The baselines include methods that are trained with sensor noise of several ranges, or with the sensor faults themselves
+(label "told the faults").
 """
 
 from collections.abc import Collection, Mapping, Sequence

@@ -16,7 +16,7 @@ from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 
 CLEAR = 0.05
 """A difference counts as clear up to this p-value."""
-MAX_EXACT = 8  # up to this number of models the test is exact; SciPy does this only without equal costs
+MAX_EXACT = 8  # the test is exact if a method has at most this many models; SciPy does this only without equal costs
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,14 @@ class Numbers:
     groups: pd.DataFrame
     """The mean over the severities of each perturbation, for each method. The columns are those of ``levels`` without
     ``severity``, the cost above the unperturbed cost with its interval (``added``, ``added_low``, ``added_high``), and
-    ``lowest``: whether the cost is clearly below the cost of every other method, and the intervals do not overlap."""
+    ``lowest``: whether the cost is clearly below the cost of every other method, that is, its interval is below the
+    other interval and the p-value is at most 0.05."""
     comparisons: pd.DataFrame
     """The comparison of each method with the first method (``reference``), with a row for each perturbation. ``p_cost``
     is the share of the pairs of models in which the method's model costs less. ``p_added`` is the share in which the
-    perturbation adds less to the cost of the method's model. ``pvalue_...`` is from the exact two-sided Mann-Whitney
-    test. ``cost`` and ``added`` are the verdicts: ``"less"`` or ``"more"`` up to a p-value of 0.05, otherwise
-    ``"undecided"``."""
+    perturbation adds less to the cost of the method's model. ``pvalue_...`` is from the two-sided Mann-Whitney test,
+    which is exact if one of the two methods has at most ``MAX_EXACT`` models. ``cost`` and ``added`` are the verdicts:
+    ``"less"`` or ``"more"`` up to a p-value of 0.05, otherwise ``"undecided"``."""
     model_levels: pd.DataFrame
     """The mean cost of each model in each row: ``model``, ``train_seed``, ``perturbation``, ``severity``, ``cost``."""
     model_groups: pd.DataFrame
