@@ -80,7 +80,8 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
     The true value lies in the gap, and a limit that is far from it cannot miss it. In the worst case the true value is
     at either end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c
     standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets half
-    of the probability. With a wide gap each limit gets all of it.
+    of the probability. With a wide gap each limit gets the whole probability, because the true value can be
+    close to one of them only.
 
     :param miss: Probability that either limit misses the true value.
     :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.

@@ -102,4 +102,9 @@ class InformationEstimator(nn.Module):
 
     @abstractmethod
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:
-        """Estimate all steps (None: ``(T, N, ...) -> (T,)``) or step t (``(1, n, ...) -> (1,)``) of living episodes."""
+        """
+        Estimate the information in nats at every step (``t=None``), or at one step t.
+
+        With ``t=None`` all episodes are alive: ``(T, N, ...) -> (T,)``. For one step, the batch has only the n episodes
+        that are alive: ``(1, n, ...) -> (1,)``.
+        """
