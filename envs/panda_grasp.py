@@ -81,7 +81,8 @@ class PandaGraspEnv(SharedEnv):
     :param yaw_range: The mug's yaw starts uniformly in ``(low, high)``, in rad. At yaw 0 the handle points to the left.
     :param camera_range: Each trial raises the camera by a distance that is uniform in ``(low, high)``, in m. This
         distance is the fifth state component.
-    :param camera_shift: Every trial raises the camera by this distance, in m. The state does not contain it.
+    :param camera_shift: Constant distance by which the camera is raised in all trials, in m. The state does not
+        contain it.
     :param mug_scale: Size of the mug, as a multiple of the size of the paper's mug (93 mm across, 81 mm high).
     :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
     :param friction: Friction coefficient of the mug and of the fingers. (Bullet multiplies the coefficients of two

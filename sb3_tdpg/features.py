@@ -159,7 +159,7 @@ class TRVCnn(BaseFeaturesExtractor):
             self._features_dim = features_dim
 
     def pooled(self, images: th.Tensor) -> th.Tensor:
-        """Replace squares of pixels by their means, unless pooled: ``(N, C, H, W) -> (N, C, H / pool, W / pool)``."""
+        """Average images that are not pooled yet over squares: ``(N, C, H, W) -> (N, C, H / pool, W / pool)``."""
         if self.pool == 1 or images.shape[2:] != self.image_size:
             return images
         if self.pool == 2 and images.dtype == th.uint8 and images.is_contiguous() and images.shape[3] % 2 == 0:

@@ -101,7 +101,7 @@ class TDPG(EpisodicAlgorithm):
     :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
         the next state; unused with ``baseline="mean"``.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping.
-    :param nuisance: Changes of the sensor in the rollouts that the policy should ignore. ``"auto"``: random colours,
+    :param nuisance: Perturbations of the rollouts that the policy should learn to ignore. ``"auto"``: random colours,
         patterns, contrasts and noise for images, noise and dropped pixels for depth images, no changes for vectors.
         ``None``: no changes. For a dict of perturbations and severities, a function and other declarations see
         :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is wrapped accordingly.

@@ -179,7 +179,7 @@ def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | Non
 
 
 def largest_divisor(n_episodes: int, limit: int = 50) -> int:
-    """Return the largest divisor up to a limit, so that all environments run the same number of episodes."""
+    """Return the largest number of environments, up to a limit, that divides ``n_episodes``."""
     return max(n for n in range(1, min(n_episodes, limit) + 1) if n_episodes % n == 0)
 
 

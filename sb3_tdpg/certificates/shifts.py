@@ -240,11 +240,11 @@ class TrainingEpisodes:
 
     def budgets(self, shift: Shift, n_episodes: int | None = None) -> list[Budget]:
         """
-        Bound the divergence of the distributions over episodes of TRVs, states and actions, from recorded episodes.
+        Bound the divergence between episodes with and without the shift, from recorded episodes.
 
-        Under the shifted distribution, the mean divergence of a step is at most the largest mean over all distributions
-        within the divergence of the earlier steps. Where the divergence exceeds a cap, the bound assumes an unshifted
-        step and the largest episode cost.
+        An episode consists of its TRVs, states and actions. Under the shifted distribution, the mean divergence of a
+        step is at most the largest mean over all distributions within the divergence of the earlier steps. Where the
+        divergence exceeds a cap, the bound assumes an unshifted step and the largest episode cost.
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """

@@ -102,8 +102,8 @@ class RayVecEnv(VecEnv):
 
     An exception of an environment is raised unchanged. If an actor dies (killed, crashed, machine lost), the next call
     raises :class:`DeadActorError`. With ``max_restarts`` Ray restarts the actor instead, and the actor makes new
-    environments. The attributes that were set and the running episodes are lost. The next step gives a warning and ends
-    these episodes like a time limit, with reward 0 and ``info["episode_lost"]=True``.
+    environments. The running episodes are lost, and so are attributes set by ``set_attr``. The next step gives a
+    warning and ends these episodes like a time limit, with reward 0 and ``info["episode_lost"]=True``.
 
     :param env_fns: Functions that make one environment each.
     :param n_actors: Number of actors; default: one for each CPU of the cluster, but not more than environments.

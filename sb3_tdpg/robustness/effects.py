@@ -242,7 +242,7 @@ def freeze(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Genera
 
 
 def draw_group(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw the group of components that fails, and its first step: ``(n, G)``; the other groups never fail."""
+    """Draw one group of components to fail in each episode, and the first step at which each fails: ``(n, G)``."""
     which = rng.integers(len(sensor.groups), size=n)
     start = draw_start(rng, n, latest, sensor)["start"]
     never = np.iinfo(np.int64).max
