@@ -185,7 +185,7 @@ def frame(takes: Takes, shown: dict[str, np.ndarray], faulty: bool, time: float)
 
 
 def sensor_fault(path: Path) -> None:
-    """Train both policies on two tasks with seed 0 (two minutes in total), and film them without and with the fault."""
+    """Train both policies on two tasks with seed 0 in two minutes, and record them without and with the fault."""
     takes = {}
     for task, (env_id, n_steps, _, _) in TASKS.items():
         for name, settings in POLICIES.items():

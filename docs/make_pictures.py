@@ -242,7 +242,7 @@ def panda_grasp(path: Path) -> None:
 
 
 def learned(path: Path, env_id: str, **shown: Any) -> None:
-    """Train TDPG with its defaults, and film episodes with the TRVs below the scene."""
+    """Train TDPG with its defaults, and record episodes with the TRVs below the scene."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.zip")
         TDPG("TRVPolicy", env_id, seed=0).learn().save(model)

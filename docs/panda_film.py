@@ -1,4 +1,4 @@
-"""Film the Panda with two policies from the batched model, without and with a sensor fault; see ``make pictures``."""
+"""Record the Panda under two policies of the batched model, with and without a sensor fault (``make pictures``)."""
 
 from dataclasses import dataclass
 from pathlib import Path
