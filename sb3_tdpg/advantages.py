@@ -18,9 +18,9 @@ from sb3_tdpg.common.running_norms import Changes, RunningNorm
 from sb3_tdpg.losses import cost_to_go
 
 N_CENTRES = 20
-# Number of centres of a regression that all time steps share. It has more samples, which lie further apart.
+# Number of centres if all time steps share one regression, whose samples are more numerous and lie further apart.
 N_SHARED_CENTRES = 100
-N_PASSES, BATCH_SIZE = 10, 64  # passes over an epoch's steps, and minibatch size, of the value network
+N_PASSES, BATCH_SIZE = 10, 64  # of the value network: passes over an epoch's steps, and minibatch size in steps
 
 AdvantageFunction = Callable[..., th.Tensor]
 """``(costs, states, alive, gamma, gae_lambda) -> advantages``; see the functions below."""
@@ -30,7 +30,7 @@ def episode_mean_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Return the cost of each episode minus the mean over the batch, as in the paper: ``(T, N)``.
+    Return the cost of each episode minus the mean cost of all episodes, as in the paper: ``(T, N)``.
 
     The arguments are those of :func:`regression_advantages`; ``states``, ``alive`` and ``gae_lambda`` are unused.
     """
@@ -42,23 +42,24 @@ def regression_advantages(
     costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
 ) -> th.Tensor:
     """
-    Estimate advantages (GAE, Schulman et al., 2016) with one regression V_t(x_t) on the true state per time step.
+    Estimate advantages (GAE, Schulman et al., 2016) with regressions of the cost-to-go on the true state.
 
-    Above a horizon of 50, all time steps share one regression on the state and the remaining horizon, because a few
-    long episodes have many samples in total but few at each step.
+    Up to a horizon of 50 steps, each time step has its own regression. Above it, all time steps share one regression on
+    the state and the remaining horizon, because a few long episodes have many samples in total but few at each step.
 
-    With ``gae_lambda=1`` an advantage is the cost-to-go minus its regression on the state. The gradient stays unbiased,
-    because only the baseline uses the true state, and x_t precedes the noise of step t. Each half of the episodes is
-    predicted from the other half, so no episode's own cost enters its baseline. A smaller ``gae_lambda`` replaces later
-    costs by V. This value has less noise but ignores the policy's memory, so the TRVs (task-relevant variables) get too
-    little credit for the information that they carry from step to step.
+    With ``gae_lambda=1`` an advantage is the cost-to-go minus the regression's prediction V_t(x_t). The gradient stays
+    unbiased, because only the baseline uses the true state, and x_t does not depend on the noise of step t. The
+    baseline of each half of the episodes comes from a regression on the other half, so the cost of an episode does not
+    enter its own baseline. A smaller ``gae_lambda`` replaces later costs by V. This prediction has less noise than the
+    costs but ignores the policy's memory. The TRVs (task-relevant variables) then get too little credit for the
+    information that they carry from step to step.
 
-    :param costs: ``(T, N)``
-    :param states: x_t, ``(T, N, X)``
-    :param alive: ``(T, N)``
+    :param costs: cost of each step, ``(T, N)``
+    :param states: true state x_t, ``(T, N, X)``
+    :param alive: 1 while an episode runs, then 0, ``(T, N)``
     :param gamma: discount factor
-    :param gae_lambda: 1 uses the observed costs; 0 uses the value of the next state instead of all later costs
-    :return: ``(T, N)``
+    :param gae_lambda: 1: observed costs; 0: predicted cost-to-go of the next state instead of all later costs
+    :return: advantages, ``(T, N)``
     """
     targets = cost_to_go(costs, gamma)
     fold = (th.arange(costs.shape[1], device=costs.device) % 2).expand_as(costs)
@@ -71,11 +72,11 @@ def regression_advantages(
 
 def generalised_advantages(costs: th.Tensor, values: th.Tensor, gamma: float, gae_lambda: float) -> th.Tensor:
     """
-    Estimate advantages from values (GAE, Schulman et al., 2016).
+    Estimate advantages from predicted costs-to-go (GAE, Schulman et al., 2016).
 
-    :param costs: ``(T, N)``, zero after the end of an episode
-    :param values: V_t(x_t), ``(T, N)``, zero after the end of an episode
-    :return: ``(T, N)``
+    :param costs: cost of each step, ``(T, N)``, zero after the end of an episode
+    :param values: predicted costs-to-go V_t(x_t), ``(T, N)``, zero after the end of an episode
+    :return: advantages, ``(T, N)``
     """
     next_values = th.cat([values[1:], th.zeros_like(values[:1])])
     return cost_to_go(costs + gamma * next_values - values, gamma * gae_lambda)
@@ -83,16 +84,17 @@ def generalised_advantages(costs: th.Tensor, values: th.Tensor, gamma: float, ga
 
 class ValueFunction(nn.Module):
     """
-    A network for the cost-to-go V_t(x_t), given the true state and the remaining time, fitted to each epoch's rollouts.
+    A network that predicts the cost-to-go V_t(x_t) from the true state and the remaining time.
 
-    Unlike the regressions, the network keeps what it has learnt in earlier epochs, so a few long episodes per epoch
-    suffice. Only the baseline uses the network. The robot therefore need not know the true state (asymmetric critic,
-    Pinto et al., 2018).
+    The network is fitted to each epoch's rollouts. Unlike the regressions, it keeps what it has learnt in earlier
+    epochs, so a few long episodes per epoch suffice. Only the baseline uses the network. The robot therefore need not
+    know the true state (asymmetric critic, Pinto et al., 2018).
 
-    :param state_dim: X
-    :param horizon: T
-    :param with_changes: Whether the network also gets the informative part of the state's change since the last step
-        (:class:`~sb3_tdpg.common.running_norms.Changes`). It is meant for observations that stand in for the state.
+    :param state_dim: Number of components X of the state.
+    :param horizon: Number of time steps T.
+    :param with_changes: Whether the network also gets the change of the state since the last step, as scaled by
+        :class:`~sb3_tdpg.common.running_norms.Changes`. This option is meant for observations that stand in for the
+        state.
     """
 
     def __init__(self, state_dim: int, horizon: int, with_changes: bool = False) -> None:
@@ -109,19 +111,19 @@ class ValueFunction(nn.Module):
     offset: th.Tensor
     scale: th.Tensor
     explained = math.nan
-    """Share of the variance of the last targets that the values explained before the network was fitted to them."""
+    """Share of the variance of the latest targets that the network explained before it was fitted to them."""
 
     def advantages(
         self, costs: th.Tensor, states: th.Tensor, alive: th.Tensor, gamma: float = 1.0, gae_lambda: float = 1.0
     ) -> th.Tensor:
         """
-        Fit the network to an epoch, then estimate the epoch's advantages (GAE) with the new values.
+        Fit the network to an epoch's rollouts, then estimate the epoch's advantages (GAE) with the new values.
 
-        The values from before the fit belong to an older policy. The new values were fitted to the same costs that they
-        are compared with, which causes a bias. This bias is small if an epoch has many episodes. The arguments are
-        those of :func:`regression_advantages`.
+        The fit comes first, because the values from before it belong to an older policy. The new values, however, were
+        fitted to the same costs from which they are subtracted. The resulting bias is small if an epoch has many
+        episodes. The arguments are those of :func:`regression_advantages`.
 
-        :return: ``(T, N)``
+        :return: advantages, ``(T, N)``
         """
         with th.no_grad():
             values = alive * self(states, gamma)
@@ -135,7 +137,7 @@ class ValueFunction(nn.Module):
         Predict the discounted cost from each step to the end.
 
         :param states: x_0 to x_{T-1}, ``(T, N, X)``
-        :return: ``(T, N)``
+        :return: predicted costs-to-go, ``(T, N)``
         """
         return self.offset + self.scale * self.network(self._inputs(states, gamma))[..., 0]
 
@@ -153,10 +155,10 @@ class ValueFunction(nn.Module):
         """
         Fit the network to the targets of an epoch.
 
-        :param states: ``(T, N, X)``
-        :param targets: ``(T, N)``
-        :param alive: ``(T, N)``
-        :return: share of the variance of the targets that the values explained before this fit
+        :param states: true state x_t, ``(T, N, X)``
+        :param targets: costs-to-go to predict, ``(T, N)``
+        :param alive: 1 while an episode runs, then 0, ``(T, N)``
+        :return: share of the variance of the targets that the network explained before this fit
         """
         living = alive.bool()
         y = targets[living]
@@ -192,7 +194,7 @@ class ValueFunction(nn.Module):
 
 
 def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold: th.Tensor, gamma: float) -> th.Tensor:
-    """Predict the targets by one regression on the state and the remaining horizon: ``(T, N)``."""
+    """Predict the targets with one regression on the state and the remaining horizon: ``(T, N)``."""
     # With a discount, to_go differs only between the last steps.
     to_go = cost_to_go(th.ones_like(targets), gamma) / len(targets)
     living = alive.flatten().nonzero()[:, 0]
@@ -209,7 +211,7 @@ def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold
 
 
 def _held_out_predictions(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, fold: th.Tensor) -> th.Tensor:
-    """Predict each of two folds from the other: ``(T, N)``."""
+    """Predict the targets of each of two folds with a regression on the other fold: ``(T, N)``."""
     predictions = th.zeros_like(targets)
     for held_out in (0, 1):
         predictions += (fold == held_out) * weight * _ridge(features, targets, weight * (fold != held_out))
@@ -217,7 +219,7 @@ def _held_out_predictions(features: th.Tensor, targets: th.Tensor, weight: th.Te
 
 
 def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: float = 0.5) -> th.Tensor:
-    """Predict the targets by a weighted ridge regression with an intercept at each time step: ``(T, N)``."""
+    """Predict the targets with a weighted ridge regression with an intercept at each time step: ``(T, N)``."""
     total = weight.sum(1, keepdim=True).clamp(min=1.0)  # (T, 1)
     mean = (weight * targets).sum(1, keepdim=True) / total
     feature_mean = (weight[..., None] * features).sum(1, keepdim=True) / total[..., None]
@@ -234,7 +236,7 @@ def _ridge(features: th.Tensor, targets: th.Tensor, weight: th.Tensor, penalty: 
 
 
 def _state_features(states: th.Tensor, alive: th.Tensor, n_centres: int = N_CENTRES) -> th.Tensor:
-    """Compute features per time step: the standardised state, its squares, and Gaussian bumps at some of the states."""
+    """Compute features at each time step: the standardised state, its squares, and Gaussian radial basis functions."""
     weight = alive[..., None]
     total = weight.sum(1, keepdim=True).clamp(min=1.0)
     mean = (weight * states).sum(1, keepdim=True) / total
@@ -255,7 +257,7 @@ BASELINES: dict[str, AdvantageFunction | None] = {
 
 def get_baseline(name: str) -> AdvantageFunction | None:
     """
-    Return the function of a baseline; ``None`` for the network ``"value"`` (:class:`ValueFunction`).
+    Return the function that computes the advantages; ``None`` for ``"value"``, a network (:class:`ValueFunction`).
 
     :raises ValueError: if no baseline has this name.
     """

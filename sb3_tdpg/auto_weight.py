@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 
-LEAST_SLACK = 0.01  # smallest slack as a share of the limit or the improvement, since costs scatter
+LEAST_SLACK = 0.01  # smallest slack, as a share of the limit or of the improvement, since costs scatter
 NO_SCALE = 1e-9  # a scale up to this counts as 0, and the weight does not start
-RATE = 0.3  # largest increase of log w per epoch, reached at a cost of one scale below the limit
+RATE = 0.3  # largest increase of log w per epoch, reached if the cost is one scale below the limit
 MAX_GROWTH = 1000.0  # largest ratio of w to its start; without it, w grows forever if no information is needed
 # The following constants are for a limit that is a share of the improvement.
 WINDOW = 5  # number of epochs over which a cost is averaged
@@ -16,7 +16,7 @@ LATEST_START = 0.5  # share of the training after which the weight starts in any
 
 
 def share_of(cost_limit: object) -> float | None:
-    """Convert a text such as ``"95%"`` to a share, or return ``None`` if it is not a share between 0 and 100 %."""
+    """Convert a string such as ``"95%"`` to the share 0.95; ``None`` for anything but a share between 0 and 100 %."""
     if not (isinstance(cost_limit, str) and cost_limit.endswith("%")):
         return None
     try:
@@ -31,27 +31,27 @@ class AutoWeight:
     Adapt the weight w of the information by dual ascent, to minimise the information subject to E[cost] <= C.
 
     The weight is 0 until the cost first meets the limit. It starts at the value for which the penalty equals the scale
-    (the penalty is smaller if the information is below 1 nat). From then on it grows while the cost is below the limit
-    and shrinks while the cost is above it, like SAC's ``ent_coef="auto"`` for the entropy:
+    in the formula below (information below 1 nat counts as 1 nat). From then on it grows while the cost is below the
+    limit and shrinks while the cost is above the limit, as SAC adapts its entropy weight with ``ent_coef="auto"``:
 
         log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
-    The scale is abs(C); at a scale of 0 the weight does not start. With ``by_slack`` the scale is the slack, that is
-    the distance of the lowest cost so far below the limit. A limit of 95 % of the attainable return then has as strong
-    an effect as a limit of 50 %. The aim is then the middle of the slack instead of C, because the few episodes of an
-    epoch say little about the expected cost. The weight also grows more slowly than it shrinks, ``clip(., -3, 0.3)``,
-    because a policy loses its return within a few epochs and takes many epochs to recover it.
+    The scale is abs(C); if it is 0, the weight does not start. With ``by_slack`` the scale is the slack: the limit
+    minus the lowest cost so far. A limit of 95 % of the attainable return then has as strong an effect as a limit of
+    50 %. In the formula, C - slack / 2 then replaces C, because the few episodes of an epoch say little about the
+    expected cost. The range of ``clip`` is then -3 to 0.3, so the weight grows more slowly than it shrinks. The reason
+    is that a policy loses its return within a few epochs and takes many epochs to recover it.
 
     If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
     best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs
-    so far. The weight starts when this mean cost has levelled off (it falls by less than C - best in ten epochs), and
-    at the latest in the middle of the training. An earlier start would change the attainable cost. In the second half
-    of the training the weight grows more and more slowly, so that the last policy has settled. Costs may have either
-    sign. A share implies ``by_slack``.
+    so far. The weight starts when this mean cost has fallen by less than C - best in ten epochs, and at the latest in
+    the middle of the training. An earlier start would change the attainable cost. In the second half of the training
+    the weight grows more and more slowly, so that the last policy has settled. Costs may have either sign. A share
+    implies ``by_slack``.
 
-    :param cost_limit: C, or a share such as ``"95%"``.
-    :param by_slack: See above.
-    :param first_cost: Cost of the first epoch, if the training has begun without the weight.
+    :param cost_limit: Limit C on the expected cost, or a share of the improvement such as ``"95%"``.
+    :param by_slack: Whether the scale is the slack, as described above.
+    :param first_cost: Mean cost of the first epoch, if the training began without this weight.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class AutoWeight:
             self.information_before = information
 
     def _update_limit(self, cost: float, share: float) -> bool:
-        """Update the limit of a share, and return whether the cost has levelled off."""
+        """Update the cost limit that a share implies, and return whether the cost has levelled off."""
         if self.first_cost is None:
             self.first_cost = cost
         self._costs = [*self._costs, cost][-WINDOW - LEVEL_EPOCHS :]
@@ -123,7 +123,7 @@ class AutoWeight:
         return len(self._costs) == WINDOW + LEVEL_EPOCHS and before - smoothed < slack
 
     def kept(self) -> str | None:
-        """Describe how much information the last epoch kept, as in ``"12.1 of 20.3 nats kept, ..."``, or ``None``."""
+        """Describe the kept information, as in ``"12.1 of 20.3 nats kept, ..."``; ``None`` before the weight starts."""
         if self.information_before is None:
             return None
         cost, information = self._last

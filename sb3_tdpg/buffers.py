@@ -80,9 +80,10 @@ class EpisodeBatch(NamedTuple):
         """
         Return the samples that the mutual-information estimators use.
 
-        :param pooled: Whether to pool the living steps of all times as samples of one variable: ``(1, n, ...)``.
+        :param pooled: Whether to treat the steps of all times, up to the end of each episode, as samples of one
+            variable: ``(1, n, ...)``.
         """
-        # Rebuilt TRVs are used here, too, so that gradients reach both sides of the recurrence.
+        # The previous TRVs come from trvs, so that gradients also flow through them if trvs have been rebuilt.
         prev_trvs = th.cat([self.prev_trvs[:1], self.trvs[:-1]])
         alive = None if bool(self.alive.all()) else self.alive.bool()
         batch = InformationBatch(self.states, self.trvs, self.means, self.stds, alive, prev_trvs)
@@ -112,11 +113,11 @@ class EpisodeBuffer(RolloutBuffer):
     A rollout buffer of ``(T, N, ...)`` arrays, indexed by time step and episode (in SB3: time step and environment).
 
     ``buffer_size`` is the horizon T, and ``n_envs`` is the number of episodes N, independent of the number of
-    environments. N grows if an epoch has more episodes. After the end of a short episode the arrays hold zeros
-    (``stds``: ones), and ``alive`` is 0 there.
+    environments. N grows if an epoch has more episodes than that. After the end of a short episode the arrays hold
+    zeros (``stds``: ones), and ``alive`` is 0 there.
 
-    :param state_dim: X
-    :param trv_dim: Z
+    :param state_dim: Number of components X of the state.
+    :param trv_dim: Number of TRVs Z.
     :param kwargs: See :class:`~stable_baselines3.common.buffers.RolloutBuffer`.
     """
 
@@ -157,7 +158,7 @@ class EpisodeBuffer(RolloutBuffer):
         """
         Store one step of some episodes.
 
-        :param t: time step of each episode, ``(n,)``, or one for all episodes
+        :param t: time step of each episode, ``(n,)``, or a single time step for all of them
         :param episode: column of each episode, ``(n,)``, or a slice of columns
         :param values: ``observations``, ``states``, ``noise``, ``trvs``, ``means``, ``stds``, ``actions``, ``costs``,
             each ``(n, ...)``
@@ -181,7 +182,7 @@ class EpisodeBuffer(RolloutBuffer):
         """
         Clear the costs of some episodes, and mark their steps as not alive.
 
-        :param episodes: their columns, ``(n,)``
+        :param episodes: columns of these episodes, ``(n,)``
         """
         self.costs[:, episodes] = 0.0
         self.alive[:, episodes] = 0.0
@@ -221,10 +222,10 @@ class RunningEpisodes:
     """
     Track the time step and the buffer column of each environment's episode, and the end of an epoch.
 
-    :param n_envs: E.
+    :param n_envs: Number of environments E.
     :param n_episodes: Number of episodes, divided equally among the environments. ``None``: an environment begins
         another episode while fewer than ``n_steps`` steps are stored.
-    :param horizon: T.
+    :param horizon: Largest number of steps T of an episode.
     """
 
     def __init__(self, n_envs: int, n_episodes: int | None, n_steps: int, horizon: int) -> None:
@@ -237,16 +238,16 @@ class RunningEpisodes:
 
     @property
     def running(self) -> np.ndarray:
-        """Indices of the environments whose steps are stored, in order."""
+        """Indices of the environments whose steps are stored, in ascending order."""
         return np.flatnonzero(self.column >= 0)
 
     def advance(self, dones: np.ndarray, infos: Sequence[dict[str, Any]] = ()) -> np.ndarray:
         """
         Count a step of the running environments, and assign new columns where episodes have ended.
 
-        :param dones: ``(E,)``
-        :param infos: The infos of the step.
-        :return: the columns of lost episodes, which run again: RayVecEnv has restarted their environments
+        :param dones: whether the episode of each environment has ended, ``(E,)``
+        :param infos: The infos that the environments returned at this step.
+        :return: columns of the lost episodes, which run again because RayVecEnv has restarted their environments
         :raises ValueError: if an episode is longer than the horizon.
         """
         running = self.running

@@ -27,7 +27,7 @@ class TDPGCallback(BaseCallback):
     """A callback for :class:`~sb3_tdpg.TDPG`."""
 
     def init_callback(self, model: BaseAlgorithm) -> None:
-        """Raise a ``ValueError`` if the algorithm is not TDPG, before the training starts."""
+        """Raise a ``ValueError`` before the training starts if the algorithm is not TDPG."""
         if not isinstance(model.policy, TRVPolicy):
             raise ValueError(f"{type(self).__name__} is for TDPG, but the model is a {type(model).__name__}")
         super().init_callback(model)
@@ -45,9 +45,9 @@ class MINECallback(TDPGCallback):
     """
     Fit the mutual-information critics to the rollouts of each epoch (lines 3 to 5 of Algorithm 2).
 
-    :class:`~sb3_tdpg.TDPG` adds this callback before the user's callbacks, so that they can read the current
-    ``model.information``. A MINECallback in the user's list replaces the added one. Without a penalty (``beta=inf``) no
-    critic is trained, as in plain policy gradient.
+    :class:`~sb3_tdpg.TDPG` adds this callback before the user's callbacks, which can then read the current
+    ``model.information``. A MINECallback in the user's list replaces the one that TDPG would add. Without a penalty
+    (``beta=inf``) no critic is trained, as in plain policy gradient.
     """
 
     def _on_training_start(self) -> None:
@@ -69,8 +69,8 @@ class Candidate(NamedTuple):
     """The policy of one epoch, measured on its own rollouts."""
 
     epoch: int
-    cost: float  # empirical expected cost
-    information: float  # sum over t, nats; infinite where it was not estimated
+    cost: float  # mean cost of the epoch's episodes
+    information: float  # sum over t, nats; infinite if it was not estimated
 
     def __str__(self) -> str:
         known = f"information {self.information:.3g} nat" if np.isfinite(self.information) else "information unknown"
@@ -95,20 +95,22 @@ class SelectionCallback(TDPGCallback):
 
     With ``cost_limit`` alone, the best epoch follows the paper's rule: it has the lowest information among the epochs
     whose mean cost is below the limit. With ``mi_limit``, the best epoch has the lowest cost among the epochs whose
-    information is below ``mi_limit`` (and whose cost is below ``cost_limit``, if given). If many epochs reach about 0
-    nats, the paper's rule picks one of them arbitrarily, whereas the second rule picks the one with the lowest cost.
+    information is below ``mi_limit``. If both limits are given, only epochs whose cost is below ``cost_limit`` count.
+    If many epochs reach about 0 nats, the paper's rule picks one of them arbitrarily, whereas the second rule picks the
+    one with the lowest cost.
 
-    The policy is kept in memory; :meth:`restore` puts it back into the model. With ``save_path`` each better policy is
-    also saved. It then survives an interrupted training, and the selection of a resumed training starts from it.
+    The policy is kept in memory; :meth:`restore` puts it back into the model. With ``save_path`` each new best policy
+    is also saved. It is then not lost if the training is interrupted, and a resumed training continues the selection
+    from it.
 
     :param cost_limit: Upper limit on the expected cost.
     :param mi_limit: Upper limit on the information in nats, summed over time.
     :param save_path: File of the selected model (``.zip``); a ``.json`` file beside it holds the epoch, cost and
         information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, one is NaN, or ``mi_limit`` is negative; at the start of a training,
-        also if a ``VecNormalize`` normalises the observations with statistics that still change (``training=True``).
-        The policy can normalise them itself (``normalize_observations``).
+    :raises ValueError: if neither limit is given, a limit is NaN, or ``mi_limit`` is negative. It is also raised at the
+        start of a training if a ``VecNormalize`` normalises the observations with statistics that still change
+        (``training=True``). Let the policy normalise the observations instead (``normalize_observations``).
     """
 
     def __init__(
@@ -148,7 +150,7 @@ class SelectionCallback(TDPGCallback):
                 "changing: give norm_obs=False and policy_kwargs=dict(normalize_observations=True)"
             )
         resumes = self.model.num_timesteps > 0
-        # The record is written last. If it is missing, that epoch runs again.
+        # The record is written after the model. If it is missing, that epoch runs again.
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
@@ -194,7 +196,7 @@ class SelectionCallback(TDPGCallback):
         """
         Put the selected policy into the model.
 
-        :return: its epoch, cost and information
+        :return: epoch, cost and information of the selected policy
         :raises ValueError: if no epoch met the limits.
         """
         if self.best is None or self._best_policy is None:
@@ -215,7 +217,7 @@ class TrainingCheckpointCallback(TDPGCallback):
     Write a file from which a killed training continues exactly as if it had not been killed.
 
     Every ``save_freq`` epochs, before the rollouts, this callback saves the model with the state of all random number
-    generators. It also resets the environments, so that their generators are their whole state. An older file is
+    generators. It also resets the environments, so that only their generators have to be saved. An older file is
     replaced only when the new one is complete. To continue::
 
         model = TDPG.load("checkpoint.zip", env=env)
@@ -223,7 +225,7 @@ class TrainingCheckpointCallback(TDPGCallback):
 
     Environments must take their randomness from ``np_random``, as Gymnasium requires.
 
-    :param save_path: The file (``.zip``).
+    :param save_path: Path of the file (``.zip``).
     :param save_freq: Number of epochs between checkpoints.
     :param verbose: 1: print each checkpoint.
     """
@@ -246,8 +248,7 @@ class TDPGProgressBar(ProgressBarCallback):
     """
     SB3's progress bar with the epoch's cost and information, and the failure rate if episodes report success.
 
-    If the output is not a terminal, a bar would appear only at the end. Then a line is printed every 30 seconds
-    instead.
+    If the output is not a terminal, a bar would appear only at the end, so a line is printed every 30 seconds instead.
     """
 
     SECONDS = 30.0
@@ -265,7 +266,7 @@ class TDPGProgressBar(ProgressBarCallback):
 
     @classmethod
     def close(cls) -> None:
-        """Close the bar after the end or an interruption; otherwise the terminal's cursor stays hidden."""
+        """Close the bar when the training ends or is interrupted; otherwise the terminal's cursor stays hidden."""
         while cls._open:
             cls._open.pop().pbar.close()
 
@@ -284,7 +285,7 @@ class TDPGProgressBar(ProgressBarCallback):
 
 
 def _zip_path(path: str | os.PathLike[str]) -> Path:
-    """Append ``.zip`` unless the path has it; a dot in the name (``beta_0.013``) does not count as a suffix."""
+    """Append ``.zip`` unless the path ends in it; a dot in the name (``beta_0.013``) does not count as a suffix."""
     path = Path(path)
     return path if path.suffix == ".zip" else path.with_name(path.name + ".zip")
 
