@@ -39,14 +39,14 @@ OF_PPO = dict(
 
 
 def nearest_name(name: str, names: Iterable[str]) -> str:
-    """Suggest the name that was probably meant, as ``": did you mean ...?"``, or return an empty text."""
+    """Suggest the name that was probably meant, as ``": did you mean ...?"``, or return an empty string."""
     found = get_close_matches(name, list(names), n=1)
     return f": did you mean {found[0]!r}?" if found else ""
 
 
 def refuse_others(others: Mapping[str, Any], names: Iterable[str]) -> None:
     """
-    Raise a ``TypeError`` for unknown arguments; it names the equivalent of a PPO argument, or the nearest name.
+    Raise a ``TypeError`` for an unknown argument, and suggest the equivalent of a PPO argument or the nearest name.
 
     :param others: The unknown arguments.
     :param names: The names of TDPG's arguments.
@@ -118,7 +118,7 @@ def check_batch_size(settings: Mapping[str, Any], epoch_size: int, *, time_varyi
     """
     Check the minibatch size, and that several updates on the same rollouts use clipping.
 
-    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name, and ``horizon``.
+    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name, and the ``horizon``.
     :param epoch_size: Number of steps of an epoch.
     :param time_varying: Whether each time step has weights of its own.
     """
@@ -174,7 +174,7 @@ def warn_if_short(total_timesteps: int, epoch_size: int) -> None:
 
 def schedule_of(name: str, value: Any) -> Schedule | Any:
     """
-    Convert a text such as ``"lin_1e-3"`` (falls to 0) or ``"lin_1e-3_1e-5"`` to a schedule; keep other values.
+    Convert a string such as ``"lin_1e-3"`` (falls to 0) or ``"lin_1e-3_1e-5"`` to a schedule; keep other values.
 
     :param name: Name of the argument, for the error message.
     """
@@ -241,7 +241,7 @@ def check_learning_rate(rate: float) -> None:
 
 
 def check_action_space(space: spaces.Space) -> None:
-    """Raise a ``ValueError`` if no policy has a distribution for this action space, or its bounds are not finite."""
+    """Raise a ``ValueError`` if TDPG does not support this action space, or its bounds are not finite."""
     if not isinstance(space, SUPPORTED_ACTION_SPACES):
         names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
         raise ValueError(f"the action space {space} is not supported: use one of {names}")
@@ -261,13 +261,13 @@ def check_start(what: str, space: spaces.Space) -> None:
 
 
 def nearest_multiples(n: int, divisor: int) -> str:
-    """Return the multiples of ``divisor`` nearest to ``n`` as text."""
+    """Return the multiples of ``divisor`` nearest to ``n`` as a string."""
     below = n // divisor * divisor
     return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"
 
 
 def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
-    """Call ``make`` with the user's keywords, or raise a ``ValueError`` that names a similar keyword."""
+    """Call ``make`` with the user's keywords, or raise a ``ValueError`` that suggests a similar keyword."""
     what = f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}"
     if not isinstance(kwargs, dict):
         raise ValueError(what)
@@ -281,7 +281,7 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
 
 
 def check_single(observation: Any, space: spaces.Space) -> None:
-    """Raise a ``ValueError`` if an observation is a dict for another space, or the tuple that ``reset`` returns."""
+    """Raise a ``ValueError`` for a dict if the space is no ``Dict``, and for the tuple that ``reset`` returns."""
     if isinstance(observation, dict) and not isinstance(space, spaces.Dict):
         raise ValueError(f"the observation is a dict, but the policy was made for {space}")
     if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
@@ -311,7 +311,7 @@ def check_time(t: np.ndarray, horizon: int) -> None:
 
 
 def check_floors(**floors: float | None) -> None:
-    """Raise a ``ValueError`` if a smallest variance is negative."""
+    """Raise a ``ValueError`` if a lower bound of a variance is negative."""
     for name, floor in floors.items():
         if floor is not None and not floor >= 0:
             raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")

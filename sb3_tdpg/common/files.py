@@ -26,10 +26,11 @@ def write_atomically(path: Path, text: str) -> None:
 @contextmanager
 def replaced_atomically(path: Path) -> Iterator[Path]:
     """
-    Yield a temporary path, which replaces the target when the block ends without an error.
+    Yield a temporary path; the file written there replaces the target when the block ends without an error.
 
     Missing folders are created. Several processes may replace the same target at once. After a power cut the target has
-    the old or the new content, never a part of it. Temporary files of a killed process are removed the next time.
+    the old or the new content, never a part of it. The next call for the same target removes the temporary files of a
+    killed process.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
@@ -43,7 +44,7 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
         partial = Path(folder, path.name)
         try:
             yield partial
-        except OSError as e:  # of a full disk
+        except OSError as e:  # for instance of a full disk
             if e.errno is not None and e.filename is None:
                 e.filename = str(path)
             raise
@@ -55,7 +56,7 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder until the block or this process ends; an ``OSError`` means that another process has locked it."""
+    """Lock a folder until the block or this process ends; raise an ``OSError`` if another process has locked it."""
     if fcntl is None:
         raise OSError("this system cannot lock a folder")
     descriptor = os.open(folder, os.O_RDONLY)
@@ -67,7 +68,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file, or the list of files of a folder, is written to the disk."""
+    """Wait until the content of a file, or the file list of a folder, is written to the disk."""
     with suppress(OSError):  # not every system can flush a folder
         descriptor = os.open(path, os.O_RDONLY)
         try:

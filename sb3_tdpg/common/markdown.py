@@ -13,10 +13,10 @@ def markdown_table(
     """
     Write a Markdown table.
 
-    :param rows: A frame, a list of dicts, or a list of lists together with ``columns``. The index is left out.
+    :param rows: A ``DataFrame`` (its index is left out), a list of dicts, or a list of lists together with ``columns``.
     :param columns: Header of the table; default: the names in ``rows``.
-    :param digits: Decimals of floats. ``NaN`` and ``None`` become empty cells.
-    :param align: ``"l"``, ``"r"`` or ``"c"`` for each column; the last letter holds for the remaining columns.
+    :param digits: Number of decimals of a float. ``NaN`` and ``None`` become empty cells.
+    :param align: ``"l"``, ``"r"`` or ``"c"`` for each column; the last letter applies to the remaining columns.
         Default: numbers are right-aligned, everything else is left-aligned.
     """
     # pandas is imported here, since its import takes most of a second and a training writes no table.
@@ -40,7 +40,7 @@ def markdown_table(
 
 
 def fill_template(package: str, template: str, **values: Any) -> str:
-    """Fill a template from a package's folder ``templates/``; several empty lines become one."""
+    """Fill a template from a package's folder ``templates/``; successive empty lines become one."""
     try:
         from jinja2 import Environment, PackageLoader
     except ImportError as e:
@@ -51,5 +51,5 @@ def fill_template(package: str, template: str, **values: Any) -> str:
 
 
 def escaped(name: str) -> str:
-    """Escape the characters of a user's name that are Markdown syntax."""
+    """Escape Markdown syntax in a name that a user has chosen."""
     return re.sub(r"([\\`*\[\]<>]|(?<!\w)_|_(?!\w))", r"\\\1", name)

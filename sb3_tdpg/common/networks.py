@@ -27,8 +27,8 @@ class BatchedLinear(nn.Module):
     Each map is initialised like a :class:`torch.nn.Linear`.
 
     :param n_maps: Number of maps M: the horizon for weights that vary in time, 1 for weights shared by all steps.
-    :param in_features: I
-    :param out_features: O
+    :param in_features: Number of inputs I of each map.
+    :param out_features: Number of outputs O of each map.
     """
 
     def __init__(self, n_maps: int, in_features: int, out_features: int) -> None:
@@ -42,13 +42,13 @@ class BatchedLinear(nn.Module):
         return th.baddbmm(self.bias, x, self.weight)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
-        """Apply the map of one index: ``(N, I) -> (N, O)``."""
+        """Apply the map with the given index: ``(N, I) -> (N, O)``."""
         return th.addmm(self.bias[index], x, self.weight[index])
 
 
 class BatchedMLP(nn.Module):
     """
-    M multi-layer perceptrons of the same shape as one network.
+    M multi-layer perceptrons with the same layer sizes, evaluated together.
 
     :param n_maps: Number of networks M.
     :param sizes: Width of every layer, from the input to the output.
@@ -66,7 +66,7 @@ class BatchedMLP(nn.Module):
         return self.through(x, BatchedLinear.forward)
 
     def at(self, x: th.Tensor, index: int) -> th.Tensor:
-        """Evaluate the network of one index: ``(N, I) -> (N, O)``."""
+        """Evaluate the network with the given index: ``(N, I) -> (N, O)``."""
         return self.through(x, lambda layer, x: layer.at(x, index))
 
     def through(self, x: th.Tensor, apply: Callable[[Any, th.Tensor], th.Tensor]) -> th.Tensor:
@@ -79,10 +79,10 @@ class BatchedMLP(nn.Module):
 
 def flatten_parameters(module: nn.Module) -> nn.Parameter:
     """
-    Store all parameters of a module in one vector, and all gradients in another; the originals become views.
+    Store all parameters of a module in one vector and all gradients in another; the module keeps views of both.
 
     An optimiser's step on one vector takes a fraction of the time of a step on many small tensors. Call this function
-    again after the parameters may have been moved or replaced (``to``, ``copy.deepcopy``).
+    again after an operation that may move or replace the parameters (``to``, ``copy.deepcopy``).
 
     :return: the vector, whose ``grad`` is the vector of all gradients
     """
@@ -133,12 +133,12 @@ class TimeMLP(nn.Module):
 
     @th.no_grad()
     def scale_output(self, factor: float) -> None:
-        """Scale the parameters of the last layer, so that the outputs are small at the start."""
+        """Multiply the parameters of the last layer by a factor, for instance to make the initial outputs small."""
         for parameter in self.mlp.layers[-1].parameters():
             parameter.mul_(factor)
 
     def at(self, x: th.Tensor, t: int) -> th.Tensor:
-        """Evaluate one step, the same for all episodes: ``(N, I) -> (N, O)``."""
+        """Evaluate the same step of all episodes: ``(N, I) -> (N, O)``."""
         return self.mlp.at(x, t if self.time_varying else 0)
 
     def at_times(self, x: th.Tensor, t: np.ndarray) -> th.Tensor:

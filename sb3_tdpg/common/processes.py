@@ -24,8 +24,8 @@ def process_pool(
     Open a pool of worker processes, which start tasks in the order in which they are submitted.
 
     Every worker computes with one thread, in a process that has computed nothing before. It calls the ``initializer``
-    before its first task. Workers ignore Ctrl-C. An exception in the ``with`` block, such as ``KeyboardInterrupt``,
-    stops all workers at once. Workers also end when this process is killed.
+    before its first task. Workers themselves ignore Ctrl-C. An exception in the ``with`` block, such as the
+    ``KeyboardInterrupt`` of Ctrl-C, stops all workers at once. Workers also end when this process is killed.
     """
     # All workers are forked from one process that has imported the package once and computed nothing.
     context: Any = mp.get_context("spawn")
@@ -37,7 +37,8 @@ def process_pool(
         resource_tracker.ensure_running()  # comes first, because it unblocks Ctrl-C
         with _postponing_ctrl_c(), _blocking_ctrl_c():  # the server must not get Ctrl-C while it imports
             forkserver.ensure_running()
-    # Only this process holds the writing end, so the workers notice when it is closed or this process has died.
+    # Only this process holds the writing end of the pipe, so the workers notice when it is closed or this process has
+    # died.
     reading, writing = context.Pipe(duplex=False)
     with _Pool(n_processes, context, _start_worker, (reading, initializer, initargs)) as pool, reading:
         try:
@@ -53,7 +54,7 @@ def process_pool(
 
 
 class _Pool(ProcessPoolExecutor):
-    """A pool that postpones Ctrl-C while a worker starts, so that no worker is left behind without its queues."""
+    """A pool that postpones Ctrl-C while a worker starts, so that no worker is left running without its queues."""
 
     def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
         with _postponing_ctrl_c():
@@ -89,7 +90,7 @@ def _blocking_ctrl_c() -> Iterator[None]:
 def _start_worker(reading: Connection, initializer: Callable[..., Any] | None, initargs: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_at_end_of, args=(reading,), daemon=True).start()
-    # The default lock is a semaphore between processes, which a stopped worker would leave behind.
+    # The default lock of tqdm is a semaphore between processes, which a stopped worker would leave behind.
     tqdm.set_lock(threading.RLock())
     set_threads(1)
     if initializer is not None:

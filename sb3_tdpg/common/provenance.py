@@ -71,7 +71,7 @@ def write_run_config(path: Path, config: Mapping[str, Any]) -> None:
     Write a run's configuration as JSON, atomically; a missing :func:`provenance` is added.
 
     :param path: The file; missing folders are created.
-    :param config: Settings and seeds; see ``jsonable``.
+    :param config: Settings and seeds, which ``jsonable`` converts to JSON types.
     """
     content = jsonable({**config, "provenance": config.get("provenance") or provenance()})
     write_atomically(path, json.dumps(content, indent=2) + "\n")
@@ -99,7 +99,7 @@ def check_same_config(path: Path, config: Mapping[str, Any], what: str) -> None:
 
 def differences(found: Any, wanted: Any) -> str:
     """
-    Describe the first few differences between two JSON values in one line; return an empty text if they are equal.
+    Describe the first few differences between two JSON values in one line; return an empty string if they are equal.
 
     :return: for example ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
     """
@@ -128,7 +128,7 @@ _MISSING = object()  # None is a value
 
 
 def _excerpt(text: str, start: int) -> str:
-    """Shorten a long text to ``MAX_LENGTH`` characters from ``start`` on, or to its end."""
+    """Return the ``MAX_LENGTH`` characters from ``start`` on; if fewer follow, return the last ``MAX_LENGTH``."""
     start = max(0, min(start, len(text) - MAX_LENGTH))
     end = start + MAX_LENGTH
     return f"{'...' * (start > 0)}{text[start:end]}{'...' * (end < len(text))}"
@@ -136,14 +136,14 @@ def _excerpt(text: str, start: int) -> str:
 
 def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
     """
-    Write a frame as CSV without its index, atomically; the same frame gives the same bytes.
+    Write a ``DataFrame`` as CSV without its index, atomically; the same data give the same bytes.
 
-    The path ends in ``.csv``, or in ``.csv.gz`` or ``.csv.xz`` (smaller) for a compressed file. Missing folders are
-    created.
+    The path ends in ``.csv``, or for a compressed file in ``.csv.gz`` or ``.csv.xz`` (the smaller of the two). Missing
+    folders are created.
     """
     if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
         raise ValueError(f"path={str(path)!r} must end in .csv, .csv.gz or .csv.xz")
-    # Without mtime the compressed file would differ from one second to the next.
+    # Without a fixed mtime the compressed file would differ from one second to the next.
     compression: Any = dict(method="gzip", mtime=0) if path.suffix == ".gz" else "infer"
     with replaced_atomically(path) as unfinished:
         frame.to_csv(unfinished, index=False, compression=compression)
@@ -158,7 +158,7 @@ def _command() -> str:
 
 
 def as_typed(command: Sequence[str]) -> list[str]:
-    """Return a command without the folder of its program, and without the interpreter of an installed program."""
+    """Return a command as the user typed it: without the program's folder and an installed program's interpreter."""
     interpreter, arguments = Path(command[0]), list(command[1:])
     if arguments and interpreter.is_absolute() and Path(arguments[0]).parent == interpreter.parent:
         return [Path(arguments[0]).name, *arguments[1:]]
@@ -183,9 +183,9 @@ def _git() -> dict[str, Any] | None:
 
 def jsonable(value: Any) -> Any:
     """
-    Convert a value to JSON types; infinite numbers and unknown types become text, such as ``"inf"``.
+    Convert a value to JSON types; infinite numbers and unknown types become strings, such as ``"inf"``.
 
-    A function has the same text in every process, unless it is a closure, whose name does not identify its content.
+    A function gives the same string in every process, except for a closure, whose name does not identify its content.
     """
     if isinstance(value, partial):
         return jsonable(dict(function=value.func, arguments=value.args, **value.keywords))
@@ -203,7 +203,7 @@ def jsonable(value: Any) -> Any:
 
 
 def with_numbers(value: Any) -> Any:
-    """Replace ``"inf"``, ``"-inf"`` and ``"nan"``, which JSON cannot write as numbers, by numbers."""
+    """Replace the strings ``"inf"``, ``"-inf"`` and ``"nan"`` by numbers, which JSON cannot represent."""
     if isinstance(value, dict):
         return {key: with_numbers(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -24,7 +24,7 @@ class RandomState:
 
     @classmethod
     def capture(cls, env: VecEnv) -> RandomState:
-        """Take the snapshot. Until it is pickled, it shares the environments' generators."""
+        """Take a snapshot, which shares the environments' generators until it is pickled."""
         normalize = unwrap_vec_normalize(env)
         return cls(
             random.getstate(),

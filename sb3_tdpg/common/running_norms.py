@@ -1,4 +1,4 @@
-"""Standardise vectors, and their changes from step to step, by running statistics of the training."""
+"""Standardise vectors, and their changes from step to step, with statistics that the training updates."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class Changes(nn.Module):
     """
     Compute the standardised change of each component since the last step, scaled by the information that it adds.
 
-    If the velocities of a system are hidden, the last change helps to predict the next one. If they are observed, the
-    last change adds only noise. Two predictions of the next change measure this: the first uses the components and
-    their products, the second also uses the last change. The change of a component is multiplied by the share of the
-    variance of its next change that only the second prediction explains.
+    If the velocities of a system are hidden, the last change helps to predict the next change. If they are observed,
+    the last change adds only noise. Two predictions of the next change measure the information: the first uses the
+    components and their products, the second also uses the last change. Each change is multiplied by a share: the part
+    of the next change's variance that only the second prediction explains.
 
-    :param dim: F
+    :param dim: Number of components F.
     """
 
     def __init__(self, dim: int) -> None:
@@ -68,12 +68,12 @@ class Changes(nn.Module):
     @th.no_grad()
     def update(self, x: th.Tensor, alive: th.Tensor) -> None:
         """
-        Update the statistics with an epoch; ``share`` is the mean over all epochs.
+        Update the statistics with an epoch's steps; ``share`` becomes the mean over all epochs so far.
 
-        :param x: ``(T, N, F)``
-        :param alive: ``(T, N)``
+        :param x: the components at each step, ``(T, N, F)``
+        :param alive: 1 while an episode runs, then 0, ``(T, N)``
         """
-        # Sort the samples by episode, so that the halves come from different episodes, or different parts of one.
+        # Sort the samples by episode, so that the two halves come from different episodes, or different parts of one.
         x, alive = x.transpose(0, 1).double(), alive.transpose(0, 1).bool()
         changes = x[:, 1:] - x[:, :-1]
         if not alive[:, 1:].any():
@@ -99,7 +99,7 @@ def _products(x: th.Tensor) -> th.Tensor:
 
 
 def _unexplained(inputs: th.Tensor, targets: th.Tensor, half: int) -> th.Tensor:
-    """Fit a linear prediction to the first ``half`` samples; return its mean squared error on the others, ``(F,)``."""
+    """Fit a linear prediction to the first ``half`` samples; return its mean squared error on the rest, ``(F,)``."""
     inputs = (inputs - inputs.mean(0)) / inputs.std(0).clamp(min=1e-6)
     inputs = th.cat([inputs, th.ones_like(inputs[:, :1])], dim=1)
     fit, test = inputs[:half], inputs[half:]

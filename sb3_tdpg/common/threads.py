@@ -14,7 +14,7 @@ def usable_cores() -> int:
 
 
 def set_threads(n: int) -> None:
-    """Limit torch and the linear algebra of NumPy and SciPy to this many threads from now on."""
+    """Limit torch and the linear algebra of NumPy and SciPy to ``n`` threads from now on."""
     th.set_num_threads(n)
     threadpool_limits(n, user_api="blas")
 
@@ -22,11 +22,11 @@ def set_threads(n: int) -> None:
 @contextmanager
 def threads(n: int | None) -> Iterator[None]:
     """
-    Limit torch and the linear algebra of NumPy and SciPy to this many threads in a block, or in a function
-    (``@threads(1)``); ``None`` changes nothing.
+    Limit torch and the linear algebra of NumPy and SciPy to ``n`` threads in a block or a decorated function.
 
-    One thread is best for small arrays. Two threads are 10 % faster than one if a core is free. If other programs use
-    the cores, the two threads wait for each other at every step and can take a hundred times as long.
+    The decorator is ``@threads(n)``; ``n=None`` changes nothing. One thread is best for small arrays. Two threads are
+    10 % faster than one if a core is free. If other programs use the cores, the two threads wait for each other at
+    every step and can take a hundred times as long.
     """
     if n is None:
         yield

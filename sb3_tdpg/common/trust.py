@@ -1,5 +1,5 @@
 """
-Read files of other people: as plain data if possible, and with a warning if only pickle can read them.
+Read files that other people wrote: as plain data if possible, or with a warning if only pickle can read them.
 
 docs/guide/trust.md says which command trusts which file.
 """
@@ -12,8 +12,8 @@ from typing import Any
 
 import yaml
 
-# Plain data are numbers with arithmetic as in 1/75, text, lists, dict(...), float("inf"), and the layers of torch.nn by
-# name.
+# Plain data are numbers with arithmetic as in 1/75, strings, lists, dict(...), float("inf"), and the layers of torch.nn
+# by name.
 _PLAIN_NODES = (
     ast.Expression, ast.Constant, ast.Tuple, ast.List, ast.Dict, ast.UnaryOp, ast.USub, ast.BinOp, ast.Add, ast.Sub,
     ast.Mult, ast.Div, ast.Load, ast.keyword,
@@ -21,7 +21,7 @@ _PLAIN_NODES = (
 
 
 def say_what_is_trusted(*paths: str | os.PathLike[str]) -> None:
-    """Warn that loading the models in these files or folders can run code; call it before they are loaded."""
+    """Warn that loading the models in these files or folders can run code; call this function before loading them."""
     if not paths:
         return
     names = ", ".join(os.fspath(path) for path in paths[:3]) + f" and {len(paths) - 3} more" * (len(paths) > 3)
@@ -54,10 +54,10 @@ for _tag, _construct in (
 
 def check_plain(text: str, where: str) -> None:
     """
-    Raise a ``ValueError`` if a text in Python's notation is more than plain data; call it before the text is evaluated.
+    Raise a ``ValueError`` unless a string of Python code is plain data; call this function before evaluating it.
 
-    :param where: Beginning of the message, such as ``"run.json has -params"``.
-    :raises ValueError: if the text calls or names anything else.
+    :param where: Beginning of the error message, such as ``"run.json has -params"``.
+    :raises ValueError: if the string is not plain data.
     """
     try:
         nodes: Iterable[ast.AST] = ast.walk(ast.parse(text.strip(), mode="eval"))
@@ -77,13 +77,13 @@ def _is_plain(node: ast.AST) -> bool:
 
 
 def plain_name(name: Any, where: str) -> str:
-    """Return the name of a file or a folder; raise a ``ValueError`` for a path, which could lead elsewhere."""
+    """Return the name of a file or a folder; raise a ``ValueError`` for a path, which could point to another folder."""
     if not isinstance(name, str) or name in ("", ".", "..") or {"/", "\\", ":", "\0"} & set(name):
         raise ValueError(f"{where} is {name!r}, which must be the name of a folder, without a path")
     return name
 
 
 def refuse_links(folder: Path) -> None:
-    """Raise a ``ValueError`` if a folder contains a symbolic link, which could publish any file."""
+    """Raise a ``ValueError`` if a folder contains a symbolic link, through which any file could be published."""
     if link := next((path for path in sorted(folder.rglob("*")) if path.is_symlink()), None):
         raise ValueError(f"{link} is a symbolic link, which is not followed: put a copy of the file there")
