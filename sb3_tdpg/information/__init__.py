@@ -1,7 +1,7 @@
 """
 Estimators of mutual information and bounds on it, independent of Stable-Baselines3.
 
-To add an estimator, add a file here and a row to :data:`ESTIMATORS`.
+To add an estimator, add a file here and an entry to :data:`ESTIMATORS`.
 """
 
 import pkgutil

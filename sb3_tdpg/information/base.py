@@ -23,7 +23,7 @@ class InformationBatch(NamedTuple):
     stds: th.Tensor  # (T, N, Z)
     alive: th.Tensor | None = None  # (T, N) bool; None: every episode lasts for all T steps
     prev_trvs: th.Tensor | None = None  # (T, N, Z), x~_{t-1}, for estimators of the directed information
-    episode: th.Tensor | None = None  # (T, N), episode of each sample; None: each sample has its own
+    episode: th.Tensor | None = None  # (T, N), episode of each sample; None: each sample has its own episode
 
     @property
     def living(self) -> th.Tensor:
@@ -31,7 +31,7 @@ class InformationBatch(NamedTuple):
         return self.trvs.new_ones(self.trvs.shape[:2], dtype=th.bool) if self.alive is None else self.alive
 
     def at(self, t: int) -> InformationBatch:
-        """Select step t and its living episodes: ``(1, n, ...)``."""
+        """Select step t of the n episodes that are alive then: ``(1, n, ...)``."""
         keep = slice(None) if self.alive is None else self.alive[t]
         return self._each(lambda x: x[t, keep][None])
 
@@ -41,11 +41,11 @@ class InformationBatch(NamedTuple):
         return self._each(lambda x: x[:, episodes])._replace(alive=alive)
 
     def pooled(self) -> InformationBatch:
-        """Pool the living steps of all times as samples of one variable: ``(1, n, ...)``."""
+        """Pool the steps of all times, up to the end of each episode, as samples of one variable: ``(1, n, ...)``."""
         return self._each(lambda x: x[self.living][None])
 
     def _each(self, take: Callable[[th.Tensor], th.Tensor]) -> InformationBatch:
-        """Apply a selection to all fields; all samples of the result are alive."""
+        """Apply a selection to all fields except ``alive``, which becomes ``None``."""
         prev_trvs, episode = (None if x is None else take(x) for x in (self.prev_trvs, self.episode))
         states, trvs, means, stds = map(take, self[:4])
         return InformationBatch(states, trvs, means, stds, None, prev_trvs, episode)
@@ -70,16 +70,16 @@ class InformationEstimator(nn.Module):
         self.trv_dim = trv_dim
 
     def fit(self, batch: InformationBatch) -> dict[str, float]:
-        """Fit the estimator, if it has parameters, to detached samples, and return diagnostics for the log."""
+        """Fit the parameters of the estimator, if any, to samples without gradients; return diagnostics for the log."""
         return {}
 
     def forward(self, batch: InformationBatch) -> th.Tensor:
         """
-        Estimate I[x_t; x~_t], differentiable in ``trvs``, ``means`` and ``stds``.
+        Estimate I[x_t; x~_t] with gradients for ``trvs``, ``means`` and ``stds``.
 
         The estimate is 0 at steps with too few living episodes, see :meth:`has_enough`.
 
-        :return: ``(T,)``, nats
+        :return: the estimate for each step in nats, ``(T,)``
         """
         has_enough = self.has_enough(batch).tolist()
         if batch.alive is None and all(has_enough):

@@ -1,7 +1,7 @@
 """
 The base class of the estimators with a trained critic F^theta.
 
-Dimension key: T time steps, N episodes, B minibatch, K marginal samples for each state, X state, Z TRVs.
+Dimension key: T time steps, N episodes, B minibatch size, K marginal samples for each state, X state, Z TRVs.
 """
 
 from __future__ import annotations
@@ -38,29 +38,29 @@ def derange(n: int, device: th.device) -> th.Tensor:
 
 class CriticEstimator(InformationEstimator):
     """
-    T critics F^theta_t(x_t, x~_t) as one batched network (Algorithm 1), fitted to each epoch's rollouts.
+    T critics F^theta_t(x_t, x~_t) in one batched network, fitted to each epoch's rollouts (Algorithm 1).
 
     A subclass defines the bound (:meth:`_bound`), and the critics' objective (:meth:`_objective`) if it differs from
     the bound.
 
-    :param hidden_sizes: Hidden layers of each critic.
+    :param hidden_sizes: Sizes of the hidden layers of each critic.
     :param activation_fn: Nonlinearity of the critics.
     :param learning_rate: Adam's learning rate.
     :param batch_size: Minibatch size B. It is reduced to at most half of the episodes, because the joint and the
-        marginal samples of an optimiser step come from different episodes, and to a quarter if some episodes end before
-        others.
-    :param gradient_steps: Optimiser steps ("MINE epochs") in each policy epoch.
-    :param warmup_gradient_steps: Optimiser steps in the first policy epoch.
-    :param refit_below: Limit in nats: a critic has diverged if its estimate on the batch is lower or not finite. It is
-        then fitted from new weights for ``refit_gradient_steps`` steps. Without this guard a policy can exploit a
-        frozen critic, whose bound has no lower limit.
-    :param refit_above: Upper limit in nats: a critic has also diverged if its estimate is higher.
-    :param refit_gradient_steps: Optimiser steps of such a refit.
+        marginal samples of an optimiser step come from different episodes. If some episodes end before others, it is
+        reduced to at most a quarter.
+    :param gradient_steps: Number of optimiser steps ("MINE epochs") in each policy epoch.
+    :param warmup_gradient_steps: Number of optimiser steps in the first policy epoch.
+    :param refit_below: Lower limit in nats: a critic has diverged if its estimate on the batch is below this limit or
+        not finite. A diverged critic is fitted from new weights for ``refit_gradient_steps`` steps. Without this guard
+        a policy can exploit a frozen critic, whose bound has no lower limit.
+    :param refit_above: Upper limit in nats: a critic has also diverged if its estimate is above this limit.
+    :param refit_gradient_steps: Number of optimiser steps of such a refit.
     :param reset_moments: Whether Adam's moments start from zero in each epoch, since the data have changed.
     :param standardize: Whether to standardise each component of the state at each time step.
-    :param held_out: Share of the episodes, drawn in each fit, that the critics are not trained on. :meth:`fit` reports
-        the estimates on both groups of episodes, summed over time, as ``"held_out"`` and ``"trained_on"``. A large gap
-        means overfitting.
+    :param held_out: Share of the episodes on which the critics are not trained; each fit draws these episodes anew.
+        :meth:`fit` reports the estimates on these and on the other episodes, summed over time, as ``"held_out"`` and
+        ``"trained_on"``. A large gap between the two estimates means overfitting.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class CriticEstimator(InformationEstimator):
         self.standardize = standardize
         self.held_out = held_out
         self.critic = BatchedMLP(horizon, self.sizes, activation_fn)
-        # The moments of Adam; all zero is a fresh start.
+        # The moments of Adam; zeros mean a fresh start.
         shapes = (flatten_parameters(self.critic).shape,) * 2 + (th.Size(),)
         for name, shape in zip(MOMENTS, shapes, strict=True):
             self.register_buffer(name, th.zeros(shape))
@@ -124,10 +124,10 @@ class CriticEstimator(InformationEstimator):
     @property
     def recommended_episodes(self) -> int:
         """
-        Number of recommended episodes: ten for each input of a critic.
+        Recommended number of episodes: ten for each input of a critic.
 
-        With this many episodes and no information, the critics still report 0.5 to 1 nat at each step. With 2 episodes
-        they report 10 to 200 nats.
+        If the TRVs carry no information, the critics still report 0.5 to 1 nat at each step with this many episodes.
+        With 2 episodes, they report 10 to 200 nats.
         """
         return 10 * (self.state_dim + self.trv_dim)
 
@@ -139,13 +139,13 @@ class CriticEstimator(InformationEstimator):
         """
         Compute the critics' objective, which is maximised: ``(T,)``.
 
-        :param scores: scores of a minibatch at the time steps in ``steps``
+        :param scores: scores of a minibatch at the time steps ``steps``
         :param steps: indices of these time steps
         """
         return self._bound(scores)
 
     def _pair(self, states: th.Tensor, trvs: th.Tensor, other_trvs: th.Tensor) -> th.Tensor:
-        """Pair states ``(..., B, X)`` with their TRVs, then with TRVs of others: ``(..., B + B * K, X + Z)``."""
+        """Pair states ``(..., B, X)`` with their TRVs, then with the TRVs of others: ``(..., B + B * K, X + Z)``."""
         return th.cat([th.cat([states, trvs], -1), th.cat([states, other_trvs], -1)], dim=-2)
 
     def _split(self, values: th.Tensor, n: int) -> Scores:
@@ -183,7 +183,7 @@ class CriticEstimator(InformationEstimator):
         return report
 
     def make_optimizer(self, critic: BatchedMLP) -> th.optim.Adam:
-        """Make an Adam optimiser that updates a network's parameters as one vector, which is much faster."""
+        """Make an Adam optimiser that updates all parameters as one vector, which is much faster than one by one."""
         return th.optim.Adam([flatten_parameters(critic)], lr=self.learning_rate, fused=True)
 
     def _hold_out(self, batch: InformationBatch) -> tuple[InformationBatch, InformationBatch | None]:
@@ -206,7 +206,7 @@ class CriticEstimator(InformationEstimator):
         return batch.select(~is_held_out), batch.select(is_held_out)
 
     def _total(self, batch: InformationBatch, steps: th.Tensor) -> float:
-        """Sum the estimates over those of the given steps that have enough living episodes."""
+        """Sum the estimates over the given steps, without the steps that have too few living episodes."""
         living = ((t, batch.at(t)) for t in steps.tolist())
         return float(sum(self._estimate(at, t).item() for t, at in living if at.trvs.shape[1] >= MIN_EPISODES))
 
@@ -214,9 +214,9 @@ class CriticEstimator(InformationEstimator):
     def _ascend(
         self, critic: BatchedMLP, optimizer: th.optim.Optimizer, batch: InformationBatch, steps: th.Tensor, n_steps: int
     ) -> None:
-        """Maximise the objective; ``critic`` has one network for each row of the batch."""
+        """Maximise the objective; ``critic`` has one network for each time step in the batch."""
         n_rows, n = batch.trvs.shape[0], self._minibatch_size(batch)
-        # In a refit the rows are those of `steps`; otherwise `steps` selects rows.
+        # In a refit the batch has only the time steps in `steps`; otherwise `steps` selects rows of the batch.
         rows = slice(None) if len(steps) == n_rows else steps
         for inputs in self._minibatches(batch, n, n_steps):
             optimizer.zero_grad(set_to_none=False)
@@ -245,11 +245,11 @@ class CriticEstimator(InformationEstimator):
             yield from self._pair(states[..., :n, :], trvs[..., :n, :], trvs[..., n:, :])
 
     def _n_pairs(self, n: int) -> int:
-        """Return the number of the critic's inputs for a minibatch of n."""
+        """Return the number of inputs that a critic gets for a minibatch of n samples."""
         return 2 * n
 
     def _objective_gradient(self, values: th.Tensor, n: int, rows: slice | th.Tensor, steps: th.Tensor) -> th.Tensor:
-        """Return the gradient of the negative objective of the time steps ``steps`` by the critic's outputs."""
+        """Return the gradient of the negative objective at the steps ``steps`` with respect to the critics' outputs."""
         with th.enable_grad():
             values = values.requires_grad_()
             scores = self._split(values, n)
@@ -257,7 +257,7 @@ class CriticEstimator(InformationEstimator):
             return th.autograd.grad(loss, values)[0]
 
     def _refit(self, batch: InformationBatch, broken: th.Tensor) -> None:
-        """Fit the critics of the steps ``broken`` from new weights."""
+        """Fit the critics of the steps in ``broken`` from new weights."""
         fresh = BatchedMLP(len(broken), self.sizes, self.activation_fn).to(batch.trvs)
         self._forget(broken)
         for name in MOMENTS:  # the old moments may not be finite, either
@@ -269,7 +269,7 @@ class CriticEstimator(InformationEstimator):
             parameter[broken] = fresh_parameter
 
     def _forget(self, steps: th.Tensor) -> None:
-        """Reset what a subclass stores for these steps in addition to the weights."""
+        """Reset the values that a subclass stores for these steps in addition to the weights."""
 
     def _update_scaling(self, batch: InformationBatch) -> None:
         weight = batch.living[..., None].float()
@@ -284,7 +284,7 @@ class CriticEstimator(InformationEstimator):
         return (states - self.state_mean[rows]) / self.state_std[rows]
 
     def _minibatch_size(self, batch: InformationBatch) -> int:
-        """Return B, limited so that a gradient step has 2 B living episodes."""
+        """Return the minibatch size B, limited so that a gradient step has 2 B living episodes."""
         return max(1, min(self.batch_size, batch.trvs.shape[1] // (2 if batch.alive is None else 4)))
 
     def min_episodes(self, n_episodes: int) -> int:
@@ -292,7 +292,7 @@ class CriticEstimator(InformationEstimator):
         return MIN_EPISODES
 
     def has_enough(self, batch: InformationBatch) -> th.Tensor:
-        """Return for each step whether the critic was trained and two or more episodes live: ``(T,)`` bool."""
+        """Return for each step whether the critic was trained and two or more episodes are alive: ``(T,)`` bool."""
         return self.is_trained & super().has_enough(batch)
 
     def _estimate(self, batch: InformationBatch, t: int | None) -> th.Tensor:

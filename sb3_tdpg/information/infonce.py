@@ -12,7 +12,7 @@ from sb3_tdpg.information.critic import CriticEstimator, Scores
 
 class InfoNCE(CriticEstimator):
     r"""
-    The contrastive bound, which distinguishes each state's TRVs from those of the other states in a minibatch:
+    The contrastive bound, whose critic distinguishes each state's TRVs from those of the other states in a minibatch:
 
     .. math::
         E\left[F(x_i, \tilde x_i) - \log \frac{1}{B} \sum_j e^{F(x_i, \tilde x_j)}\right].

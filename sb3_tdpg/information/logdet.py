@@ -9,7 +9,7 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 class LogDet(InformationEstimator):
     r"""
-    Bound the information by the entropy of a Gaussian, which is the largest for a given covariance.
+    Bound the information with the entropy of a Gaussian, the largest entropy for a given covariance.
 
     With the encoder's input e_t = (x~_{t-1}, y_t),
 
@@ -17,9 +17,9 @@ class LogDet(InformationEstimator):
         I[x_t; \tilde x_t] \le I[e_t; \tilde x_t] = h(\tilde x_t) - h(\tilde x_t | e_t)
         \le \tfrac12 \log\det \mathrm{Cov}(\tilde x_t) - E[\textstyle\sum_i \log \sigma_i(e_t)].
 
-    The first step is the data-processing inequality. The second step is exact for a Gaussian x~_t, and loose for a
-    distribution with several modes. The covariance follows from the law of total covariance,
-    ``Cov(mean) + E[diag(std^2)]``. It therefore has no sampling noise of the TRVs and is never singular.
+    The first inequality is the data-processing inequality. The second inequality is exact for a Gaussian x~_t, and
+    loose for a distribution with several modes. The covariance is computed as ``Cov(mean) + E[diag(std^2)]`` (law of
+    total covariance). It therefore contains no sampling noise of the TRVs and is never singular.
     """
 
     bound = "upper"

@@ -11,15 +11,15 @@ from sb3_tdpg.information.base import InformationBatch, InformationEstimator
 
 class LeaveOneOut(InformationEstimator):
     r"""
-    Bound the information with the mixture of the *other* episodes' encoder densities in place of the marginal q(x~_t).
+    Bound the information; the mixture of the *other* episodes' encoder densities replaces the marginal q(x~_t).
 
     .. math::
         I[x_t; \tilde x_t] \le I[e_t; \tilde x_t] \le E\left[\frac1N \sum_i \log
         \frac{q(\tilde x_i | e_i)}{\frac{1}{N-1} \sum_{j \ne i} q(\tilde x_i | e_j)}\right],
         \qquad e_t = (\tilde x_{t-1}, y_t).
 
-    This is an upper bound in expectation, for any shape of q(x~_t). It is loose above about ln N. If the steps of an
-    episode are pooled, the mixture leaves out all steps of the same episode.
+    This is an upper bound in expectation, for any shape of q(x~_t). It is loose if the information exceeds about ln N.
+    If the steps of all times are pooled, the mixture for a sample leaves out all steps of its own episode.
     """
 
     bound = "upper"
@@ -49,7 +49,7 @@ def own_sample_bound(batch: InformationBatch) -> th.Tensor:
     The bound is InfoNCE with the optimal critic, and is at most ln N. If the encoder's input is a function of the state
     (no memory, T = 1, and no sensor noise), it is also a lower bound on :math:`I[x_t; \tilde x_t]`.
 
-    :return: ``(T,)``, nats
+    :return: the bound for each step in nats, ``(T,)``
     """
     log_density = log_density_matrix(batch)
     own = log_density.diagonal(dim1=1, dim2=2)
@@ -58,7 +58,7 @@ def own_sample_bound(batch: InformationBatch) -> th.Tensor:
 
 def log_density_matrix(batch: InformationBatch) -> th.Tensor:
     """
-    Return log q(x~_i | e_j) of every sample for every episode, up to a constant: ``(T, i, j)``.
+    Return log q(x~_i | e_j) for every sample i and every episode j, up to a constant: ``(T, i, j)``.
 
     :param batch: A batch whose episodes are all alive.
     """

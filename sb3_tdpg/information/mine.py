@@ -20,13 +20,14 @@ class Mine(CriticEstimator):
     r"""
     The Donsker-Varadhan bound :math:`E_p[F] - \log E_{p \times q}[e^F]` (Equation 8).
 
-    For a fixed critic and *fresh* samples the estimate is a lower bound, except for the upward bias of the logarithm of
-    a mean, which is small for many samples. On the samples that the critic was fitted to, it tends to be too high.
+    For a fixed critic and *fresh* samples the estimate is a lower bound, except for an upward bias. The bias comes from
+    the logarithm of a mean and is small for many samples. On the samples to which the critic was fitted, the estimate
+    tends to be too high.
 
-    :param ema_decay: Weight **on the past** of an exponential moving average over gradient steps, which replaces the
-        denominator of the critic's gradient (Equation 10) to reduce the bias of minibatches. A value of 0.99 averages
-        over about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging. ``None``
-        uses the mean of each minibatch.
+    :param ema_decay: Weight **on the past** of an exponential moving average over gradient steps. The average replaces
+        the denominator of the critic's gradient (Equation 10) to reduce the bias of minibatches. A value of 0.99
+        averages over about 100 steps. The paper's footnote puts alpha = 5e-5 on the past, which is almost no averaging.
+        ``None``: no moving average, but the mean of each minibatch.
     :param kwargs: See :class:`~sb3_tdpg.information.critic.CriticEstimator`.
     :raises ValueError: if ``ema_decay`` is not in [0, 1).
     """

@@ -11,8 +11,8 @@ class Nwj(CriticEstimator):
     r"""
     The bound :math:`E_p[F] - e^{-1} E_{p \times q}[e^F]`.
 
-    For a fixed critic and fresh samples the estimate is a lower bound. Unlike MINE it has no logarithm of a mean. It
-    therefore has no bias on minibatches, but more variance.
+    For a fixed critic and fresh samples the estimate is a lower bound. Unlike MINE, it has no logarithm of a mean. It
+    therefore has no bias on minibatches, but more variance than MINE.
     """
 
     bound = "lower"

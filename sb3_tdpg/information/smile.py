@@ -13,7 +13,7 @@ from sb3_tdpg.information.mine import log_mean_exp
 
 class Smile(CriticEstimator):
     r"""
-    The Donsker-Varadhan estimate with the scores clipped to ``[-clip, clip]`` in the partition term.
+    The Donsker-Varadhan estimate, with the scores of the marginal samples clipped to ``[-clip, clip]``.
 
     The critic is trained on the stable Jensen-Shannon objective, whose optimum is the log density ratio. Clipping
     reduces the variance; the result is neither a lower nor an upper bound.

@@ -25,8 +25,9 @@ class VariationalBottleneck(InformationEstimator):
         \le E\, D[q(\tilde x_t | e_t) \,\|\, r_t].
 
     The prior r_t of each time step is a mixture of K diagonal Gaussians :math:`w_k N_k`, fitted to each epoch's
-    rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form. The estimate is an upper
-    bound on it by Jensen's inequality, which needs no samples (Hershey and Olsen, 2007):
+    rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form. The estimate is
+    therefore an upper bound on this divergence, which follows from Jensen's inequality and needs no samples (Hershey
+    and Olsen, 2007):
 
     .. math::
         D[q \,\|\, r_t] \le -\log \sum_k w_k e^{-D[q \| N_k]}.
@@ -36,8 +37,8 @@ class VariationalBottleneck(InformationEstimator):
     is fitted by expectation-maximisation; the responsibility of a component for an episode is proportional to
     :math:`w_k e^{-D[q \| N_k]}`.
 
-    Before the first fit the prior is the standard normal. On the samples of the fit, the estimate is about d / N nats
-    too low for d TRVs, per component.
+    Before the first fit the prior is the standard normal. On the samples to which the prior was fitted, the estimate is
+    too low by about Z / N nats per component, for Z TRVs and N episodes.
 
     :param n_components: Number of Gaussians K in the prior of a time step.
     :raises ValueError: if ``n_components`` is not an integer of at least 1.
@@ -79,7 +80,7 @@ class VariationalBottleneck(InformationEstimator):
         return {}
 
     def _slices(self, means: th.Tensor, alive: th.Tensor) -> th.Tensor:
-        """Cut the episodes into K slices of equal size along the direction of most variance: ``(T, N, K)``."""
+        """Divide the episodes into K groups of equal size along the direction of largest variance: ``(T, N, K)``."""
         weight = alive[:, :, None].to(means.dtype)
         centred = (means - (weight * means).sum(1, keepdim=True) / weight.sum(1, keepdim=True)) * weight
         direction = th.linalg.eigh(centred.mT @ centred).eigenvectors[:, :, -1:]  # (T, Z, 1)
@@ -104,12 +105,12 @@ def _log_joint(means: th.Tensor, variances: th.Tensor, prior: Prior) -> th.Tenso
 
 def _moments(means: th.Tensor, variances: th.Tensor, responsibility: th.Tensor, pseudo: Prior | None = None) -> Prior:
     """
-    Fit the moments of each component to its densities by the law of total variance.
+    Fit the moments of each component to the densities that it is responsible for, by the law of total variance.
 
-    :param responsibility: ``(T, N, K)``
-    :param pseudo: A Gaussian that counts as an additional episode of every component, so that none is empty.
+    :param responsibility: responsibility of each component for each episode, ``(T, N, K)``
+    :param pseudo: A Gaussian that counts as an additional episode of every component, so that no component is empty.
     """
-    # The moments are around the mean of the living episodes, because second moments lose digits far from it.
+    # The moments are taken around the mean of the living episodes, because second moments lose digits far from it.
     weight = responsibility.sum(2, keepdim=True)
     origin = (weight * means).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
     centred = means - origin
