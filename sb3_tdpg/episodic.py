@@ -1,7 +1,7 @@
 """
 On-policy learning from whole episodes: environments, ``learn``, saving, resuming and exporting.
 
-The method of :class:`~sb3_tdpg.TDPG` is in :mod:`sb3_tdpg.tdpg`; its base class here holds everything else.
+The method of :class:`~sb3_tdpg.TDPG` is in :mod:`sb3_tdpg.tdpg`; this module has the base class with everything else.
 
 Dimension key: T horizon, N episodes of an epoch, E environments, X state, Z task-relevant variables (TRVs).
 """
@@ -45,7 +45,7 @@ HARDLY_ANY = 0.1  # nats per episode, a seventh of a bit
 
 
 class TrainingDivergedError(ValueError):
-    """Raised if a loss is NaN or infinite. The model keeps the last good parameters."""
+    """Raised if a loss is NaN or infinite. The model keeps the parameters of the last successful update."""
 
 
 class EpisodicAlgorithm(OnPolicyAlgorithm):
@@ -145,7 +145,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         self._set_problem(problem, wrapped)
 
     def _with_nuisance(self, env: VecEnv) -> VecEnv:
-        """Wrap an environment, which may come from another model, in the declared nuisance."""
+        """Wrap an environment in the declared nuisance; the environment may come from another model."""
         from sb3_tdpg.robustness.nuisance import with_nuisance  # the algorithm itself needs no perturbations
 
         return with_nuisance(env, self.nuisance)
@@ -153,7 +153,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     # -- what the rollouts need ----------------------------------------------------------------------------------
 
     def _clipped(self, actions: np.ndarray) -> np.ndarray:
-        """Return the actions in the shape of the space and within its bounds: ``(E, *action)``."""
+        """Return the actions in the shape of the action space, clipped to its bounds: ``(E, *action)``."""
         actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
         if isinstance(self.action_space, spaces.Box):
             return np.clip(actions, self.action_space.low, self.action_space.high)
@@ -167,7 +167,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self._last_obs
 
     def _steps_of_this_epoch(self) -> int:
-        """Return the steps of this epoch: those left, at most a whole epoch, and at least about a tenth of one."""
+        """Return the length of this epoch: the remaining steps, but at most an epoch and at least about a tenth of one."""
         size = self.epoch_size
         if self.epoch == 0:
             return size
@@ -183,7 +183,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         super().dump_logs(iteration)
 
     def _check_finite(self, name: str, value: th.Tensor) -> None:
-        """Raise a ``TrainingDivergedError`` if the value is not finite, before the parameters change."""
+        """Raise a ``TrainingDivergedError`` before the parameters change if the value is not finite."""
         if bool(th.isfinite(value).all()):
             return
         self._last_obs = None
@@ -213,8 +213,9 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
         :param total_timesteps: Number of environment steps. Default: 400 policy epochs for vectors over a short horizon
             (a million steps on Lava), 75 for images, and 100 for depth images and for vectors over a horizon of 50 or
-            more. Epochs consist of whole episodes, so the training can take more steps: with ``n_episodes`` up to one
-            epoch more, with ``epoch_steps`` up to one episode of each environment or a tenth of an epoch more.
+            more. Epochs consist of whole episodes, so the training can take more steps. With ``n_episodes``, it takes
+            up to one epoch more. With ``epoch_steps``, it takes up to one episode of each environment or a tenth of an
+            epoch more.
         :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
         """
         if total_timesteps is None:
@@ -235,7 +236,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         """Describe the information of the last epoch if it was penalised, and say if there is hardly any."""
         if self.auto_weight is not None:
             return self.auto_weight.kept()
-        if self.information is None or not self.rollout_buffer.full:  # a callback has stopped within an epoch
+        if self.information is None or not self.rollout_buffer.full:  # a callback has stopped it within an epoch
             return None
         nats = float(self.information.sum())
         text = f"{nats:.3g} nats kept, at a cost of {self.rollout_buffer.episode_costs.mean():.3g}"
@@ -291,7 +292,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         """
         Save the model between two epochs, with the state of all random number generators.
 
-        The environments are reset here and after loading, so that their generators are their whole state. See
+        The environments are reset here and after loading, so that only their generators have to be saved. See
         :class:`~sb3_tdpg.TrainingCheckpointCallback`.
         """
         assert self.env is not None
@@ -333,7 +334,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         """
         Load a saved model; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.load`.
 
-        :param kwargs: Arguments to change, for instance ``beta=1 / 75`` to continue from a policy-gradient model.
+        :param kwargs: Arguments of TDPG to change, for instance ``beta=1 / 75`` to continue from a policy-gradient
+            model.
         :raises ValueError: if the file is damaged or TDPG did not save it.
         """
         kwargs |= implied(kwargs)  # as in the constructor
@@ -344,7 +346,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except Exception as e:
-            # A damaged file can raise any error, but this call's arguments raise none while the file is read.
+            # A damaged file can raise any error. The arguments of this call cannot raise one while the file is read.
             names = [frame.f_code.co_name for frame, _ in traceback.walk_tb(e.__traceback__)]
             is_read = "load_from_zip_file" in names or ("set_parameters" in names and not kwargs)
             changed = [
@@ -366,14 +368,14 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     def export(self, path: str | os.PathLike[str], *, format: str | None = None) -> Path:
         """
-        Write one step of the policy to a file that runs without this package; see
+        Export the policy's computation for one step to a file that runs without this package. See
         :func:`~sb3_tdpg.deployment.export.export_policy`.
 
         If the model's environment has a ``VecNormalize``, the file includes its normalisation of the observations.
 
-        :param path: The file, ``.onnx`` or ``.pt``.
-        :param format: ``"onnx"`` or ``"torchscript"``; default: from the file's suffix.
-        :return: the file
+        :param path: Path of the file, ``.onnx`` or ``.pt``.
+        :param format: ``"onnx"`` or ``"torchscript"``; default: chosen by the file's suffix.
+        :return: path of the file
         :raises ValueError: if the training used a ``VecNormalize``, and the model has none.
         """
         from sb3_tdpg.deployment.export import export_trained

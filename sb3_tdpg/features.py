@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 from sb3_tdpg.common.running_norms import RunningNorm
 
 MIN_SIDE = 12  # pixels, the minimum for the paper's two convolutions
-LEAST_MAP = 3  # side of the smallest map in which a position is meaningful
+LEAST_MAP = 3  # pixels, side of the smallest feature map in which a position is meaningful
 
 
 def observation_kind(space: spaces.Space | None, *, normalize_images: bool = True) -> str:
@@ -25,7 +25,8 @@ def observation_kind(space: spaces.Space | None, *, normalize_images: bool = Tru
     Return the kind of an observation, on which the defaults depend.
 
     :param space: The observation space.
-    :param normalize_images: Whether bytes are divided by 255; if not, images of floats in [0, 1] are accepted, too.
+    :param normalize_images: Whether the policy divides bytes by 255; if not, images of floats in [0, 1] are also
+        accepted.
     :return: ``"image"``: uint8, channels first or last; ``"depth"``: a ``Box`` of floats, ``(1, H, W)`` with at least
         12 pixels a side; ``"vector"``: anything else. A ``Dict`` with images has the kind of its images.
     """
@@ -73,12 +74,12 @@ class SpatialSoftmax(nn.Module):
 
     The sum is over the pixels i, with positions from -1 to 1. The activations :math:`z_{ci}` are standardised over the
     image, and the factor :math:`\alpha_c` is learned. A keypoint moves in proportion to its object in the image, also
-    to places that were not seen in training. The layer follows Levine et al. (2016), End-to-end training of deep
-    visuomotor policies, who do not standardise the activations.
+    to places that were not seen in training. The layer follows Levine et al. (2016, "End-to-end training of deep
+    visuomotor policies"), who do not standardise the activations.
 
-    :param channels: C
-    :param height: H
-    :param width: W
+    :param channels: Number of channels C.
+    :param height: Height H of a feature map in pixels.
+    :param width: Width W of a feature map in pixels.
     """
 
     def __init__(self, channels: int, height: int, width: int) -> None:
@@ -90,7 +91,7 @@ class SpatialSoftmax(nn.Module):
         self.register_buffer("positions", th.stack([x.flatten(), y.flatten()], dim=1), persistent=False)
 
     def forward(self, maps: th.Tensor) -> th.Tensor:
-        """Return x and y of the first channel's keypoint, then of the second, ...: ``(N, C, H, W) -> (N, 2 C)``."""
+        """Return x and y of each channel's keypoint, channel after channel: ``(N, C, H, W) -> (N, 2 C)``."""
         weights = th.softmax(self.norm(maps.flatten(2)) * self.log_factor.exp(), dim=2)
         return (weights @ self.positions).flatten(1)
 
@@ -101,18 +102,17 @@ class TRVCnn(BaseFeaturesExtractor):
     flattened.
 
     With ``pool``, every square of ``pool x pool`` pixels is first replaced by its mean. Otherwise a layer of stride 2
-    would turn textures that are finer than its step into coarse ones (aliasing), and unseen textures would then change
-    the features most.
+    would turn fine textures into coarse ones (aliasing). Unseen textures would then change the features most.
 
-    With ``keypoints``, the features are the positions at which the last layer's maps are active
-    (:class:`~sb3_tdpg.features.SpatialSoftmax`), without that layer's nonlinearity. They describe where an object is
-    and not how it looks.
+    With ``keypoints``, a :class:`~sb3_tdpg.features.SpatialSoftmax` replaces the nonlinearity of the last layer. The
+    features are then the positions at which that layer's maps are active. They describe where an object is and not how
+    it looks.
 
     Images of floats, such as depth in m, are first scaled from the bounds of their space to [-1, 1] if the bounds are
     finite.
 
     :param observation_space: An image space with channels first.
-    :param layers: Output channels, kernel size and stride of each layer, in pixels.
+    :param layers: Number of output channels, kernel size and stride of each layer; the last two in pixels.
     :param activation_fn: Nonlinearity after each layer.
     :param features_dim: Number of outputs of a last linear layer, as in SB3's ``NatureCNN``; None: no such layer.
     :param layer_norm: Whether the outputs of the linear layer are standardised for each image before the nonlinearity.
@@ -159,7 +159,7 @@ class TRVCnn(BaseFeaturesExtractor):
             self._features_dim = features_dim
 
     def pooled(self, images: th.Tensor) -> th.Tensor:
-        """Average images that are not pooled yet over squares: ``(N, C, H, W) -> (N, C, H / pool, W / pool)``."""
+        """Average images over squares, unless already pooled: ``(N, C, H, W) -> (N, C, H / pool, W / pool)``."""
         if self.pool == 1 or images.shape[2:] != self.image_size:
             return images
         if self.pool == 2 and images.dtype == th.uint8 and images.is_contiguous() and images.shape[3] % 2 == 0:
@@ -220,7 +220,7 @@ class ObservationNorm(nn.Module):
         Update the statistics with an epoch's observations.
 
         :param observations: ``(T, N, *obs)``, or a dict of such tensors
-        :param alive: ``(T, N)``
+        :param alive: 1 while an episode runs, then 0, ``(T, N)``
         """
         for key, norm in self.norms.items():
             x = observations[key] if isinstance(observations, dict) else observations

@@ -13,13 +13,14 @@ def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.T
     """
     Return a surrogate loss whose gradient is that of the expected cost (Equations 12 and 13).
 
-    The paper multiplies every log-probability with the cost of the whole episode. Subtracting a term that does not
-    depend on the sample at t, such as past costs or a baseline of the state, leaves the expected gradient unchanged.
+    The paper multiplies every log-probability by the cost of the whole episode. Subtracting a term that does not depend
+    on the sample at t, such as past costs or a baseline of the state, leaves the expected gradient unchanged.
 
     :param log_prob: log-probabilities at the *stored* samples, ``(T, N)``
-    :param advantages: of costs, not rewards: positive values are worse than expected, ``(T, N)``
-    :param alive: ``(T, N)``
-    :return: scalar
+    :param advantages: advantages of costs, not of rewards; a positive value means a higher cost than expected,
+        ``(T, N)``
+    :param alive: 1 while an episode runs, then 0, ``(T, N)``
+    :return: the loss, a scalar
     """
     assert log_prob.shape == advantages.shape == alive.shape, (log_prob.shape, advantages.shape, alive.shape)
     return (alive * advantages.detach() * log_prob).sum(dim=0).mean()
@@ -29,18 +30,19 @@ def clipped_policy_loss(
     log_prob: th.Tensor, old_log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor, clip_range: float
 ) -> th.Tensor:
     """
-    Return PPO's surrogate loss (Schulman et al., 2017) for costs: the maximum of its plain and its clipped term.
+    Return PPO's surrogate loss (Schulman et al., 2017) for costs: the maximum of its unclipped and its clipped term.
 
     At ``log_prob == old_log_prob`` its gradient is that of :func:`policy_gradient_loss`. It allows several updates on
-    the same rollouts, because a sample has no gradient once its ratio has left ``[1 - clip_range, 1 + clip_range]`` in
-    the direction that lowers the loss.
+    the same rollouts: a sample has no gradient once its probability ratio has left the clip range in the direction that
+    lowers the loss. The clip range is ``[1 - clip_range, 1 + clip_range]``.
 
     :param log_prob: log-probabilities under the current policy, ``(T, N)``
     :param old_log_prob: log-probabilities under the policy of the rollouts, ``(T, N)``
-    :param advantages: of costs, not rewards: positive values are worse than expected, ``(T, N)``
-    :param alive: ``(T, N)``
-    :param clip_range: Largest change of the probability ratio.
-    :return: scalar
+    :param advantages: advantages of costs, not of rewards; a positive value means a higher cost than expected,
+        ``(T, N)``
+    :param alive: 1 while an episode runs, then 0, ``(T, N)``
+    :param clip_range: Largest change of the probability ratio from 1.
+    :return: the loss, a scalar
     """
     shapes = {log_prob.shape, old_log_prob.shape, advantages.shape, alive.shape}
     assert len(shapes) == 1, shapes
@@ -55,14 +57,14 @@ def policy_distance(
     log_prob: th.Tensor, old_log_prob: th.Tensor, alive: th.Tensor, clip_range: float
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    Measure the distance of the policy from that of the rollouts, as SB3's PPO does.
+    Measure the distance of the policy from the policy of the rollouts, as SB3's PPO does.
 
-    :param log_prob: ``(T, N)``
-    :param old_log_prob: ``(T, N)``
-    :param alive: ``(T, N)``
+    :param log_prob: log-probabilities under the current policy, ``(T, N)``
+    :param old_log_prob: log-probabilities under the policy of the rollouts, ``(T, N)``
+    :param alive: 1 while an episode runs, then 0, ``(T, N)``
     :param clip_range: See :func:`clipped_policy_loss`.
-    :return: approximate Kullback-Leibler divergence (http://joschu.net/blog/kl-approx.html), and the share of clipped
-        samples; scalars
+    :return: approximate Kullback-Leibler divergence in nats (http://joschu.net/blog/kl-approx.html), and share of
+        clipped samples; both are scalars
     """
     log_ratio = th.where(alive > 0, log_prob - old_log_prob, 0.0)
     n = alive.sum()
@@ -76,12 +78,12 @@ def normalized(
     """
     Normalise advantages to mean 0 and variance 1 over all steps of running episodes.
 
-    :param advantages: ``(T, N)``
-    :param alive: ``(T, N)``
-    :param negligible: Standard deviations up to this value count as rounding errors; the advantages are not divided by
-        them.
-    :return: the advantages, ``(T, N)``, and the standard deviation that they were divided by; divide the other terms of
-        the loss by it, too, to keep their weight
+    :param advantages: advantages of costs, ``(T, N)``
+    :param alive: 1 while an episode runs, then 0, ``(T, N)``
+    :param negligible: Largest standard deviation that counts as a rounding error; the advantages are then not divided
+        by it.
+    :return: the normalised advantages, ``(T, N)``, and their divisor; divide the other terms of the loss by it, too, so
+        that they keep their weight
     """
     n = alive.sum()
     mean = (alive * advantages).sum() / n
@@ -94,11 +96,11 @@ def information_loss(information: th.Tensor) -> th.Tensor:
     """
     Return the penalty of Equation 3: the sum over time of I[x_t; x~_t], with each term clamped at zero.
 
-    Mutual information is never negative. The bound of a frozen critic, however, has no lower limit. Without the clamp,
-    the policy would exploit this.
+    Mutual information is never negative, but the bound of a frozen critic has no lower limit. Without the clamp, the
+    policy would exploit such a critic.
 
     :param information: estimates in nats, ``(T,)``
-    :return: scalar
+    :return: the loss, a scalar
     """
     assert information.dim() == 1, information.shape
     return information.clamp(min=0.0).sum()
@@ -108,8 +110,8 @@ def cost_to_go(costs: th.Tensor, gamma: float = 1.0) -> th.Tensor:
     """
     Sum the discounted costs from each step to the end.
 
-    :param costs: ``(T, N)``, zero after the end of an episode
-    :return: ``(T, N)``
+    :param costs: cost of each step, ``(T, N)``, zero after the end of an episode
+    :return: costs-to-go, ``(T, N)``
     """
     result = th.empty_like(costs)
     running = th.zeros_like(costs[0])
