@@ -49,43 +49,44 @@ class TRVPolicy(BasePolicy):
     Policy with encoder :math:`q^\phi(\tilde x_t | \tilde x_{t-1}, y_t)` and action head
     :math:`\pi^\psi(u_t | \tilde x_t)`.
 
-    Encoder and action head are diagonal Gaussians; for a discrete action space the head is SB3's distribution. The
-    action head gets only the TRVs. At the first step of an episode the previous TRVs are zero.
+    The encoder and the action head are diagonal Gaussians; for a discrete action space the head is SB3's distribution.
+    The action head gets only the TRVs. At the first step of an episode the previous TRVs are zero.
 
     ``predict`` takes and returns the memory as ``state=(trv, t)``: the last TRVs, ``(n_envs, Z)``, and the index of the
     next time step, ``(n_envs,)``.
 
     The defaults depend on the preset: "vector", "image" (uint8), "depth" (images of floats) or "long" (vectors over a
-    long horizon). See the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The network sizes
-    of "vector" and "depth" are the paper's. The preset "paper" has the network sizes of the paper's ball catching.
+    long horizon). See the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. "vector" and
+    "depth" have the paper's network sizes. The preset "paper" has the network sizes of the paper's ball catching.
 
     :param observation_space: Vectors, images with channels first, ``Discrete``, or a ``Dict`` of these.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
     :param lr_schedule: Learning rate schedule.
     :param horizon: Number of time steps T; the algorithm passes the environment's horizon.
-    :param preset: Name of the defaults; the algorithm passes the problem's preset. ``None``: chosen by the observation
-        alone.
+    :param preset: Name of the defaults; the algorithm passes the problem's preset. ``None``: the observation space
+        alone determines the defaults.
     :param trv_dim: Number of TRVs Z.
-    :param net_arch: Hidden layers, ``dict(encoder=[...], action_head=[...])``.
+    :param net_arch: Sizes of the hidden layers, ``dict(encoder=[...], action_head=[...])``.
     :param activation_fn: Nonlinearity of the hidden layers.
     :param time_varying: Whether each time step has its own weights. The feature extractor is always shared.
-    :param skip: Whether the features are added to the means of the first TRVs, so that the encoder need not learn to
-        store an observation before the action head can use it.
-    :param skip_changes: Whether the change of the features since the last step is added to the means of the following
-        TRVs, in proportion to the information that it adds to the features
+    :param skip: Whether the features are added to the means of the first TRVs. The encoder then need not learn to store
+        an observation before the action head can use it.
+    :param skip_changes: Whether the changes of the features since the last step are added to the means of the next
+        TRVs, after those of ``skip``. Each change is scaled by the information that it adds to the features
         (:class:`~sb3_tdpg.common.running_norms.Changes`). Such changes reveal hidden velocities.
     :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all
         vectors seen in training, as in SB3's ``VecNormalize``.
-    :param scale_actions: Whether the head's outputs are relative to the bounds of the action space: 0 is the middle, 1
-        is the upper bound, and a standard deviation of 1 is half of the distance between the bounds.
-    :param shared_action_noise: Whether the variance of each action is one parameter, as in SB3's PPO, instead of an
-        output of the head, which depends on the TRVs (Box actions).
+    :param scale_actions: Whether the head's outputs are relative to the bounds of the action space: a mean of 0 is the
+        middle, and a mean of 1 is the upper bound. A standard deviation of 1 is half of the distance between the
+        bounds.
+    :param shared_action_noise: Whether the variance of each action is a single parameter, as in SB3's PPO (Box
+        actions). Otherwise it is an output of the head and depends on the TRVs.
     :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
         Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen.
     :param gate: Whether the encoder also outputs a gate g in [0, 1] for each TRV, like the update gate of a GRU. The
         gate decides how much of the last TRVs is kept: ``mean = g * candidate + (1 - g) * last TRVs``, where the
-        candidate is the mean without a gate. The policy can then remember over many steps. It cannot be combined with
-        ``skip``.
+        candidate is the mean without a gate. The policy can then remember over many steps. ``gate`` cannot be combined
+        with ``skip``.
     :param action_mean_init: Mean action before training, ``(U,)``, in the units of the head's outputs; default: near 0
         (Box actions).
     :param encoder_log_var_init: Constant added to the encoder's log-variance, which starts near 0.
@@ -204,7 +205,7 @@ class TRVPolicy(BasePolicy):
             self.register_buffer("action_range", half, persistent=False)
         self.optimizer = self.optimizer_class(
             self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]  # the base class takes none, every optimiser does
+            lr=lr_schedule(1),  # type: ignore[call-arg]  # the base class has no lr, every optimiser has one
             **self.optimizer_kwargs,
         )
 
@@ -231,11 +232,11 @@ class TRVPolicy(BasePolicy):
         self, parameters: th.Tensor, features: th.Tensor, prev_trv: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
-        Return mean and standard deviation of q, ``(..., Z)`` each.
+        Return the mean and the standard deviation of q(x~_t | x~_{t-1}, y_t), ``(..., Z)`` each.
 
-        :param parameters: the encoder's outputs, ``(..., 2 Z)``, with a gate ``(..., 3 Z)``
-        :param features: ``(..., F)``
-        :param prev_trv: x~_{t-1}, ``(..., Z)``
+        :param parameters: the encoder's outputs, ``(..., 2 Z)``, or ``(..., 3 Z)`` with a gate
+        :param features: features of the observations, ``(..., F)``
+        :param prev_trv: previous TRVs x~_{t-1}, ``(..., Z)``
         """
         mean, log_var, *gates = parameters.chunk(3 if self.gate else 2, dim=-1)
         if self.skip:
@@ -261,7 +262,7 @@ class TRVPolicy(BasePolicy):
         return self.action_dist.proba_distribution(parameters)
 
     def action_gaussian(self, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return mean and log standard deviation of Box actions, ``(n, U)`` each, from the head's outputs."""
+        """Return the mean and log standard deviation of Box actions, ``(n, U)`` each, from the head's outputs."""
         shared = self.shared_action_noise
         mean, log_var = (parameters, self.action_log_var) if shared else parameters.chunk(2, dim=-1)
         variance = bounded_variance(log_var + self.action_log_var_init, MAX_ACTION_VAR, self.action_var_floor)
@@ -279,16 +280,16 @@ class TRVPolicy(BasePolicy):
         """
         Choose the actions of one step.
 
-        :param observation: y_t, ``(N, *obs)``
-        :param prev_trv: x~_{t-1}, ``(N, Z)``; zero at the start of an episode
+        :param observation: observations y_t, ``(N, *obs)``
+        :param prev_trv: previous TRVs x~_{t-1}, ``(N, Z)``; zero at the start of an episode
         :param t: time step of each episode, ``(N,)``
-        :param deterministic: Use the means of the TRVs and of the action instead of samples.
+        :param deterministic: Whether to use the means of the TRVs and of the action instead of samples.
         """
         mean, std = self.encoder_density(observation, prev_trv, t)
         noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
         trv = mean + std * noise
         parameters = self.action_head.at_times(trv, t)
-        if isinstance(self.action_dist, DiagGaussianDistribution):  # takes a fifth of the time of a distribution
+        if isinstance(self.action_dist, DiagGaussianDistribution):  # takes a fifth of the time of a Distribution
             actions, log_std = self.action_gaussian(parameters)
             if not deterministic:
                 actions = actions + log_std.exp() * th.randn_like(actions)
@@ -300,10 +301,10 @@ class TRVPolicy(BasePolicy):
         self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray
     ) -> tuple[th.Tensor, th.Tensor]:
         """
-        Return mean and standard deviation of q(x~_t | x~_{t-1}, y_t), ``(N, Z)`` each.
+        Return the mean and the standard deviation of q(x~_t | x~_{t-1}, y_t), ``(N, Z)`` each.
 
-        :param observation: y_t, ``(N, *obs)``
-        :param prev_trv: x~_{t-1}, ``(N, Z)``; zero at the start of an episode
+        :param observation: observations y_t, ``(N, *obs)``
+        :param prev_trv: previous TRVs x~_{t-1}, ``(N, Z)``; zero at the start of an episode
         :param t: time step of each episode, ``(N,)``
         """
         features = self._features(observation)
@@ -320,15 +321,15 @@ class TRVPolicy(BasePolicy):
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
         """
-        Return pi(u_t | x~_t). The next call overwrites the returned distribution.
+        Return the distribution pi(u_t | x~_t) of the actions, which the next call overwrites.
 
-        :param trv: x~_t, ``(N, Z)``
+        :param trv: TRVs x~_t, ``(N, Z)``
         :param t: time step of each episode, ``(N,)``
         """
         return self._action_distribution(self.action_head.at_times(trv, t))
 
     def update_statistics(self, batch: EpisodeBatch) -> None:
-        """Update the statistics of observations and changes, if there are any, with an epoch."""
+        """Update the statistics of observations and feature changes with an epoch, if the policy uses them."""
         if self.norm is not None:
             self.norm.update(batch.observations, batch.alive)
         if self.changes is not None:
@@ -343,16 +344,17 @@ class TRVPolicy(BasePolicy):
         return self._features(flat).unflatten(0, batch.alive.shape)
 
     def episode_action_density(self, trvs: th.Tensor) -> Distribution:
-        """Return pi(u_t | x~_t), ``(T * N, U)``, given the TRVs, ``(T, N, Z)``; the next call overwrites it."""
+        """Return pi(u_t | x~_t) for TRVs ``(T, N, Z)``, as T * N distributions; the next call overwrites them."""
         return self._action_distribution(self.action_head(trvs).flatten(0, 1))
 
     def trv_log_prob(self, features: th.Tensor, batch: EpisodeBatch) -> th.Tensor:
         """
-        Compute log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score path (Equation 13).
+        Compute log q(x~_t | x~_{t-1}, y_t) at the *stored* TRVs, for the score gradient (Equation 13).
 
-        The stored TRVs are constants: ``Normal.log_prob(rsample())`` without a detach has zero gradient in the mean.
+        The TRVs must be constants. With reparameterised samples that are not detached, as in
+        ``Normal.log_prob(rsample())``, the gradient with respect to the mean would be zero.
 
-        :return: ``(T, N)``
+        :return: log-probabilities, ``(T, N)``
         """
         parameters = self.encoder(th.cat([batch.prev_trvs, features], dim=-1))
         density = Normal(*self._encoder_density(parameters, features, batch.prev_trvs), validate_args=False)
@@ -362,8 +364,9 @@ class TRVPolicy(BasePolicy):
         """
         Compute log pi(u_t | x~_t) at the stored actions (Equation 12).
 
-        :param trvs: ``(T, N, Z)``: the stored TRVs for the score path, or the rebuilt TRVs for the pathwise gradient.
-        :return: ``(T, N)``
+        :param trvs: ``(T, N, Z)``: the stored TRVs for the score gradient, or the rebuilt TRVs for the pathwise
+            gradient.
+        :return: log-probabilities, ``(T, N)``
         """
         actions = batch.actions.flatten(0, 1)
         if isinstance(self.action_space, spaces.Discrete):
@@ -372,9 +375,10 @@ class TRVPolicy(BasePolicy):
 
     def stored_log_prob(self, batch: EpisodeBatch, encoder_gradient: str) -> th.Tensor:
         """
-        Compute the log-probability of :meth:`evaluate_episodes` for the policy of the rollouts, from stored densities.
+        Compute the log-probability of :meth:`evaluate_episodes` under the policy of the rollouts, from stored
+        densities.
 
-        :return: ``(T, N)``
+        :return: log-probabilities, ``(T, N)``
         """
         log_prob = self.action_log_prob(batch.trvs, batch)
         if encoder_gradient == "pathwise":
@@ -385,9 +389,9 @@ class TRVPolicy(BasePolicy):
         """
         Unroll Equation 15, ``x~_t = mean + std * eps_t``, with the stored noise.
 
-        Episodes start from zero, segments from the stored TRVs of the step before, without a gradient.
+        Episodes start from TRVs of zero. Segments start from the stored TRVs of the step before, which are constants.
 
-        :param features: ``(T, N, F)``
+        :param features: features of the observations, ``(T, N, F)``
         :param batch: the rollouts, ``(T, N, ...)``
         """
         trv, noise = batch.prev_trvs[0], batch.noise
@@ -404,7 +408,7 @@ class TRVPolicy(BasePolicy):
         self, batch: EpisodeBatch, encoder_gradient: str, rebuild: bool = False
     ) -> tuple[th.Tensor, RebuiltTRVs | None]:
         """
-        Compute the log-probability whose gradient trains encoder and head.
+        Compute the log-probability whose gradient trains the encoder and the action head.
 
         :param batch: whole episodes, or segments of them
         :param encoder_gradient: ``"score"`` or ``"pathwise"``, see :class:`~sb3_tdpg.TDPG`.
@@ -437,9 +441,9 @@ class TRVPolicy(BasePolicy):
 
         :param observation: one observation, or one per environment
         :param state: the memory that the last call returned; ``None`` at the start
-        :param episode_start: ``(n_envs,)`` bool; clears the memory where True
-        :param deterministic: Use means instead of samples. This removes the noise through which the bottleneck acts, so
-            the resulting policy is not the one that was trained (the first such call warns). The paper's tables use
+        :param episode_start: ``(n_envs,)`` bool; the memory is cleared where it is True
+        :param deterministic: Whether to use means instead of samples. Without the noise, through which the bottleneck
+            acts, the policy is not the one that was trained. The first such call warns. The paper's tables use
             ``False``.
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.

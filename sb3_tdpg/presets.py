@@ -13,7 +13,7 @@ from torch import nn
 from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import TRVCnn, least_side, observation_kind
 
-# A problem over at least this horizon counts as ordinary reinforcement learning, not as one of the paper's kind.
+# A problem over at least this horizon counts as ordinary reinforcement learning, not as a problem like the paper's.
 LONG_HORIZON = 50
 EPOCH_STEPS = 2000
 
@@ -31,8 +31,8 @@ class Defaults(NamedTuple):
     clip_range: float = float("inf")
     normalize_advantage: bool = False
     encoder_gradient: str = "pathwise"
-    # On vectors, MINE takes 2.5 times as long and is no more robust (docs/results/pays.md). On images, MINE takes no
-    # longer, but a penalty on its estimate removes less information (docs/guide/algorithm.md).
+    # On vectors, MINE takes 2.5 times as long as logdet and is no more robust (docs/results/pays.md). On images, MINE
+    # takes no longer, but a penalty on its estimate removes less information (docs/guide/algorithm.md).
     mi_estimator: str = "logdet"
     n_threads: int | None = 1
     total_epochs: int = 100  # policy epochs
@@ -61,8 +61,8 @@ VECTOR = Defaults(
 )
 
 # Images are expensive. An epoch therefore has few episodes and several passes, as in PPO, with the pathwise gradient,
-# which has the least variance. An untrained policy costs a hundred times as much as a trained one, so a policy with 95
-# % of the improvement would be bad.
+# which has the least variance. An untrained policy costs a hundred times as much as a trained one, so a policy with
+# 95 % of the improvement would be bad.
 IMAGE = Defaults(
     beta="auto",
     share="99.8%",
@@ -83,7 +83,7 @@ DEPTH = IMAGE._replace(
     share="95%", n_episodes=400, batch_episodes=200, total_epochs=100, baseline="regression", target_kl=0.05
 )
 
-# Ordinary environments use PPO's update, with minibatches of short segments and a value network.
+# Problems over a long horizon use PPO's update, with minibatches of short segments and a value network.
 LONG = Defaults(
     beta=float("inf"),
     learning_rate="lin_1e-3_1e-4",
@@ -169,13 +169,13 @@ def preset_of(observation_space: spaces.Space | None, horizon: int | None, **key
 
 
 def discount_of(horizon: int) -> float:
-    """Return the default discount for a long horizon T: it looks T / 8 steps ahead, but at least 10 and at most 200."""
+    """Return the default discount factor gamma for a long horizon T: 1 / (1 - gamma) = T / 8, limited to [10, 200]."""
     return min(max(1 - 8 / horizon, 0.9), 0.995)
 
 
 def implied(given: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the arguments that given arguments imply, unless they are given, too.
+    Return the arguments that the given arguments imply, except those that are given themselves.
 
     A ``cost_limit`` implies ``beta="auto"``, and any other ``beta`` implies no ``cost_limit``. Each of ``n_episodes``
     and ``epoch_steps`` implies that the other is ``None``.
@@ -202,8 +202,8 @@ def fill_in(
     Replace arguments that are ``None`` by their defaults.
 
     :param given: Arguments by name.
-    :param preset: See :func:`preset_of`.
-    :param cost_limit: See :func:`implied`.
+    :param preset: Name of the defaults, see :func:`preset_of`.
+    :param cost_limit: The argument ``cost_limit``, see :func:`implied`.
     :param n_envs: Number of environments; the default of ``n_episodes`` is a multiple of it.
     :param horizon: Horizon T; the default of ``gamma`` depends on it.
     """
@@ -245,7 +245,7 @@ def fill_in_trvs(
 
     :param defaults: Defaults of the preset.
     :param n_features: Number of features of an observation.
-    :raises ValueError: if there are fewer TRVs than features and changes to add to them.
+    :raises ValueError: if there are fewer TRVs than features and changes that are added to them.
     """
     if trv_dim is not None:
         check_count("policy_kwargs: trv_dim", trv_dim)

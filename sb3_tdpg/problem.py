@@ -32,9 +32,10 @@ class Problem:
     """
     A finite-horizon problem as the algorithm sees it.
 
-    :param horizon: Number of controls T in an episode.
+    :param horizon: Number of actions T in an episode.
     :param state_dim: Dimension X of the state.
-    :param state_is_observation: Whether the observation stands in for the state, which the environment does not report.
+    :param state_is_observation: Whether the observation stands in for the state, because the environment does not
+        report its state.
     :param state_names: Names of the X components: the environment's ``state_names``, or ``x0``, ``x1``, ...
     """
 
@@ -82,7 +83,7 @@ def unperturbed(env: VecEnv, obs: Any) -> Any:
 
 def read_problem(env: VecEnv, **keywords: bool) -> Problem:
     """
-    Read the horizon and the state's dimension of an environment without a step; a ``ValueError`` says what is missing.
+    Read the horizon and the state's dimension of an environment without a step, or raise a ``ValueError``.
 
     :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """
@@ -98,7 +99,7 @@ def read_problem(env: VecEnv, **keywords: bool) -> Problem:
             "attribute `horizon`, or wrap it in gymnasium.wrappers.TimeLimit and register it with max_episode_steps"
         )
     state_space = attribute_of(env, "state_space")
-    # POPGym's environments, which have this attribute, declare the space of their state but do not report the state.
+    # POPGym's environments (with observability_level) declare the space of their state but do not report the state.
     is_observation = state_space is None or env.has_attr("observability_level")
     if is_observation and observation_kind(env.observation_space, **keywords) != "vector":
         raise ValueError(
@@ -144,11 +145,11 @@ def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, 
     """
     Check the values that environments returned, before they reach a network.
 
-    :param what: "observation", "state" or "reward".
-    :param values: ``(E, *shape)``
+    :param what: Name of the values in the error message: "observation", "state" or "reward".
+    :param values: the values of all environments, ``(E, *shape)``
     :param shape: Expected shape for one environment.
     :param t: time step of each environment, ``(E,)``
-    :raises ValueError: if the shape differs, or a number is NaN, infinite or larger than 1e18.
+    :raises ValueError: if the shape differs, or a number is NaN, infinite or larger than 1e18 in absolute value.
     """
     if values.shape[1:] != shape:
         raise ValueError(
@@ -175,7 +176,7 @@ def check_observations(space: spaces.Space, observations: Any, t: np.ndarray) ->
 
 @contextmanager
 def named_shapes(env: VecEnv) -> Iterator[None]:
-    """Replace NumPy's error for an observation of a wrong shape in an SB3 ``VecEnv`` by one that names the shape."""
+    """Replace NumPy's error for a wrongly shaped observation in an SB3 ``VecEnv`` by an error that names the shape."""
     try:
         yield
     except ValueError as e:

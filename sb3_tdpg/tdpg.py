@@ -52,8 +52,8 @@ class TDPG(EpisodicAlgorithm):
     .. math:: E[c(\tau)] + \frac1\beta \sum_t I[x_t; \tilde x_t]
 
     One policy epoch rolls out ``n_episodes`` episodes, fits the mutual-information critics to them
-    (:class:`~sb3_tdpg.MINECallback`), and updates the policy: once, as in the paper, or with several clipped passes, as
-    PPO does. ``beta=inf`` is plain policy gradient with the same policy.
+    (:class:`~sb3_tdpg.MINECallback`), and updates the policy. The policy is updated once, as in the paper, or in
+    several clipped passes, as in PPO. ``beta=inf`` is plain policy gradient with the same policy.
 
     The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). It reports
     the true state as ``info["state"]`` in ``reset`` and ``step``, and declares its space in an attribute
@@ -66,13 +66,13 @@ class TDPG(EpisodicAlgorithm):
     :param policy: ``"TRVPolicy"`` or a subclass of :class:`~sb3_tdpg.TRVPolicy`.
     :param env: A registered id, an environment or a ``VecEnv``.
     :param beta: Weight of the cost against the information: a positive number, a function of the remaining progress (1
-        to 0), or a text such as ``"lin_0.5_0.02"``, which falls linearly. ``inf``: no penalty. ``"auto"``: minimise the
-        information subject to E[cost] <= ``cost_limit`` (:class:`~sb3_tdpg.auto_weight.AutoWeight`). Default with a
-        ``cost_limit``: ``"auto"``.
+        to 0), or a string such as ``"lin_0.5_0.02"`` (linear from 0.5 to 0.02). ``inf``: no penalty. ``"auto"``:
+        minimise the information subject to E[cost] <= ``cost_limit`` (:class:`~sb3_tdpg.auto_weight.AutoWeight`).
+        Default with a ``cost_limit``: ``"auto"``.
     :param cost_limit: Limit for ``beta="auto"``: a cost, or the share of the improvement over training that is to be
         kept, such as ``"90%"``.
-    :param learning_rate: Learning rate of the policy: a number, a schedule, or a text such as ``"lin_1e-3_1e-5"``,
-        which falls linearly.
+    :param learning_rate: Learning rate of the policy: a number, a schedule, or a string such as ``"lin_1e-3_1e-5"``
+        (linear from 1e-3 to 1e-5).
     :param n_episodes: Number of episodes N of a policy epoch.
     :param epoch_steps: Number of steps of a policy epoch, instead of ``n_episodes``: no episode begins after that many
         steps.
@@ -81,42 +81,43 @@ class TDPG(EpisodicAlgorithm):
         :class:`~sb3_tdpg.information.InformationEstimator`.
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: Variance reduction of the gradient. ``"regression"``: subtract a regression of the cost-to-go on
-        the true state at each step; ``"value"``: a network of the true state and the time left
-        (:class:`~sb3_tdpg.advantages.ValueFunction`); ``"mean"``: the batch mean of the episode cost, as in the paper.
-    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper;
+        the true state at each step. ``"value"``: subtract the output of a network that gets the true state and the
+        remaining time (:class:`~sb3_tdpg.advantages.ValueFunction`). ``"mean"``: subtract the mean cost of the
+        episodes, as in the paper.
+    :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper.
         ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both gradients are unbiased; the
         pathwise gradient has less variance.
-    :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons; the time
-        steps must share their weights (``time_varying=False``). Default: 5 for vectors over a horizon of 50 or more
-        steps, otherwise whole episodes. A value of T gives whole episodes.
-    :param n_epochs: Passes over the rollouts of a policy epoch, as in PPO.
-    :param batch_size: Minibatch size in steps, as in PPO. Minibatches are made of whole episodes, or of segments of
-        them with ``bptt_steps``.
+    :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons. The time
+        steps must then share their weights (``time_varying=False``). Default: 5 for vectors over a horizon of 50 or
+        more steps, otherwise whole episodes. A value of T gives whole episodes.
+    :param n_epochs: Number of passes over the rollouts of a policy epoch, as in PPO.
+    :param batch_size: Minibatch size in steps, as in PPO. A minibatch consists of whole episodes or, with
+        ``bptt_steps``, of segments.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
-    :param target_kl: Limit on the Kullback-Leibler divergence in nats per step, as in PPO: the passes of an epoch end
-        when the policy has moved by 1.5 times this value; ``inf``: no limit.
+    :param target_kl: Limit on the Kullback-Leibler divergence in nats per step, as in PPO. The passes of an epoch end
+        when the divergence exceeds 1.5 times this value. ``inf``: no limit.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning.
     :param gamma: Discount factor; the paper has none.
-    :param gae_lambda: Bias-variance trade-off of the advantages: 1 uses the observed costs, 0 the predicted value of
-        the next state; unused with ``baseline="mean"``.
+    :param gae_lambda: Bias-variance trade-off of the advantages. 1: observed costs; 0: predicted value of the next
+        state. Unused with ``baseline="mean"``.
     :param max_grad_norm: Maximum norm of the policy's gradient, ``inf``: no clipping.
     :param nuisance: Perturbations of the rollouts that the policy should learn to ignore. ``"auto"``: random colours,
-        patterns, contrasts and noise for images, noise and dropped pixels for depth images, no changes for vectors.
-        ``None``: no changes. For a dict of perturbations and severities, a function and other declarations see
-        :class:`~sb3_tdpg.robustness.families.Family`. The model's environment is wrapped accordingly.
+        patterns, contrasts and noise for images; noise and dropped pixels for depth images; no changes for vectors.
+        ``None``: no changes. :class:`~sb3_tdpg.robustness.families.Family` describes the other values, such as a
+        function, or a dict of perturbations and severities. TDPG wraps the model's environment accordingly.
     :param stats_window_size: Number of episodes that ``rollout/ep_rew_mean`` averages over.
     :param tensorboard_log: Folder of the TensorBoard log.
     :param policy_kwargs: Keywords of the policy, see :class:`~sb3_tdpg.TRVPolicy`.
     :param verbose: 0: no output; 1: a table per epoch; 2: debug messages.
     :param seed: Seed of all random number generators. The episodes also depend on the number of environments.
-    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``: a GPU, if there is one, for images; for vectors the CPU, which
-        is faster.
+    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``. ``"auto"`` uses a GPU, if there is one, for images, and the CPU
+        for vectors, because it is faster for them.
     :param n_threads: Number of threads of torch and of NumPy's linear algebra during ``learn``. Default: torch's
-        setting for images, otherwise 1, which is fastest for small networks and gives the same numbers on any number of
-        cores.
+        setting for images, otherwise 1. One thread is fastest for small networks and gives the same numbers on any
+        number of cores.
     :param _init_setup_model: Whether to build the networks in the constructor.
-    :raises ValueError: if an argument is out of range or does not fit the environment. Nothing has been trained then.
+    :raises ValueError: if an argument is out of range or does not fit the environment.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TRVPolicy": TRVPolicy}
@@ -244,7 +245,7 @@ class TDPG(EpisodicAlgorithm):
 
     @property
     def pools_information(self) -> bool:
-        """Whether one estimate pools the steps of all times; true if they share the policy's weights."""
+        """Whether one estimate pools the steps of all times; true if all steps share the policy's weights."""
         return not self.policy.time_varying
 
     def _setup_beta(self) -> None:
@@ -291,7 +292,7 @@ class TDPG(EpisodicAlgorithm):
         :param callback: Called at each step, and at the beginning and the end of the rollout.
         :param rollout_buffer: Receives the episodes.
         :param n_rollout_steps: Unused: the length of an epoch is ``n_episodes`` or ``epoch_steps``.
-        :return: False if a callback asked to stop.
+        :return: False if a callback asked to stop the training.
         """
         assert self._problem is not None, "the model has no environment: set_env() first"
         callback.on_rollout_start()
@@ -362,7 +363,7 @@ class TDPG(EpisodicAlgorithm):
 
     def train(self) -> None:
         """
-        Update encoder and action head from the rollouts (line 6 of Algorithm 2).
+        Update the encoder and the action head from the rollouts (line 6 of Algorithm 2).
 
         :raises TrainingDivergedError: if a cost, the loss or a gradient is NaN or infinite; the parameters keep their
             values from before that step.
@@ -431,7 +432,7 @@ class TDPG(EpisodicAlgorithm):
             self.logger.record_mean("train/policy_loss", policy_loss.item())
             self.logger.record_mean("train/loss", loss.item())
             self.logger.record_mean("train/grad_norm", grad_norm.item())
-        # The update comes last, so that the rollouts and all of their gradients use the same statistics.
+        # The statistics are updated last, so that the rollouts and all of their gradients use the same statistics.
         self.policy.update_statistics(whole)
 
         self.epoch += 1

@@ -35,9 +35,10 @@ class BatchedVecEnv(VecEnv):
     """
     An SB3 ``VecEnv`` that steps N episodes of one environment in a single NumPy call.
 
-    It calls the same methods as the environment from ``gymnasium.make``, with a leading dimension of N instead of 1, so
-    that the dynamics cannot differ. All episodes run in lockstep. As in every SB3 ``VecEnv``, a new episode begins at
-    once when one has finished. As with ``Monitor``, ``info["episode"]`` reports return and length.
+    It calls the same methods as the environment from ``gymnasium.make``, so the dynamics cannot differ. Only the
+    leading dimension is N instead of 1. All episodes run in lockstep. As in every SB3 ``VecEnv``, a new episode begins
+    at once when an episode has finished. As with ``Monitor``, ``info["episode"]`` reports the return and the length of
+    an episode.
 
     :param env: The environment, without wrappers.
     :param n_envs: Number of episodes N.
@@ -166,12 +167,12 @@ def batched_class(env_id: str) -> type[POMDPEnv] | None:
 
 
 def _default_n_envs(env: gym.Env, n_episodes: int | None, epoch_steps: int | None, *, batched: bool) -> int:
-    """Return the default number of environments for the given length of an epoch, or else for TDPG's default length."""
+    """Return the default number of environments for an epoch of the given length or of TDPG's default length."""
     horizon = horizon_of(env)
     if not n_episodes and not epoch_steps:
         defaults = DEFAULTS[preset_of(env.observation_space, horizon)]
         n_episodes, epoch_steps = defaults.n_episodes, defaults.epoch_steps
-    if n_episodes is None:  # so that an epoch of full episodes has at most epoch_steps
+    if n_episodes is None:  # so that an epoch of full episodes has at most epoch_steps steps
         assert epoch_steps is not None
         return max(1, min(epoch_steps // (horizon or 1), epoch_steps if batched else 10))
     # Each environment runs the same number of episodes.
@@ -188,9 +189,9 @@ def made_env(env: GymEnv | str | None, n_envs: int | None, **sizes: Any) -> GymE
     Return the environment that a model was given, or make it from its id.
 
     :param env: A registered id, an environment or a ``VecEnv``.
-    :param n_envs: Number of environments, for an id.
-    :param sizes: ``n_episodes`` and ``epoch_steps``.
-    :raises ValueError: if a given environment does not have ``n_envs`` environments, or its action space is not
+    :param n_envs: Number of environments to make if ``env`` is an id.
+    :param sizes: Length of an epoch: ``n_episodes`` and ``epoch_steps``.
+    :raises ValueError: if ``env`` has another number of environments than ``n_envs``, or its action space is not
         supported.
     """
     if isinstance(env, str):
@@ -218,7 +219,7 @@ def make_episodes_env(
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     :param n_envs: Number of environments. Default: ``n_episodes`` for a :class:`BatchedVecEnv`, else the largest
         divisor of ``n_episodes`` up to 50. With ``epoch_steps`` the default is the number of whole episodes that fit
-        into an epoch, but at most 10 unless the result is a :class:`BatchedVecEnv`.
+        into an epoch; for any other environment than a :class:`BatchedVecEnv`, it is at most 10.
     :param n_episodes: Number of episodes per epoch; default: TDPG's default.
     :param epoch_steps: Number of steps per epoch, instead of ``n_episodes``.
     :param env_kwargs: Keywords for the environment's constructor.
@@ -247,8 +248,8 @@ def make_episodes_env(
     if n_envs is None:
         with contextlib.closing(gym.make(env_id, **env_kwargs)) as probe:
             n_envs = _default_n_envs(probe, n_episodes, epoch_steps, batched=False)
-    # For an id, make_vec_env requests rendering, and an environment without rendering then warns. For a function it
-    # does not.
+    # Given an id, make_vec_env requests rendering, and an environment without rendering then warns. Given a function,
+    # make_vec_env does not request rendering.
     modes = getattr(_creator(spec), "metadata", {"render_modes": ["rgb_array"]}).get("render_modes", ())
     make = env_id if "rgb_array" in modes else functools.partial(gym.make, env_id)
     return make_vec_env(make, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
