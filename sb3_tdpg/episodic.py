@@ -167,7 +167,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self._last_obs
 
     def _steps_of_this_epoch(self) -> int:
-        """Return the length of this epoch: the remaining steps, but at most an epoch and at least about a tenth of one."""
+        """Return the steps of this epoch: all that remain, but at most an epoch and at least about a tenth of one."""
         size = self.epoch_size
         if self.epoch == 0:
             return size

@@ -1,4 +1,4 @@
-"""Unblock Ctrl-C in the fork server of ``process_pool``, which starts with Ctrl-C blocked and imports this file last."""
+"""Unblock Ctrl-C in the fork server of ``process_pool``: it starts with Ctrl-C blocked and imports this file last."""
 
 import signal
 
