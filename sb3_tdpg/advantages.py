@@ -44,13 +44,14 @@ def regression_advantages(
     """
     Estimate advantages (GAE, Schulman et al., 2016) with regressions of the cost-to-go on the true state.
 
-    Up to a horizon of 50 steps, each time step has its own regression. Above it, all time steps share one regression on
-    the state and the remaining horizon, because a few long episodes have many samples in total but few at each step.
+    Up to a horizon of 50 steps, each time step has its own regression. For longer horizons, all time steps share one
+    regression on the state and the remaining horizon. The reason is that a few long episodes have many samples in total
+    but few at each step.
 
     With ``gae_lambda=1`` an advantage is the cost-to-go minus the regression's prediction V_t(x_t). The gradient stays
-    unbiased, because only the baseline uses the true state, and x_t does not depend on the noise of step t. The
-    baseline of each half of the episodes comes from a regression on the other half, so the cost of an episode does not
-    enter its own baseline. A smaller ``gae_lambda`` replaces later costs by V. This prediction has less noise than the
+    unbiased, because only the baseline uses the true state, and x_t does not depend on the noise of step t. Each half
+    of the episodes gets its baseline from a regression on the other half, so the cost of an episode does not enter its
+    own baseline. A smaller ``gae_lambda`` replaces later costs by V_t(x_t). This prediction has less noise than the
     costs but ignores the policy's memory. The TRVs (task-relevant variables) then get too little credit for the
     information that they carry from step to step.
 
@@ -180,7 +181,7 @@ class ValueFunction(nn.Module):
 
     @th.no_grad()
     def _rescale(self, targets: th.Tensor) -> None:
-        """Standardise the targets anew without changing the predicted values (van Hasselt et al., 2016)."""
+        """Standardise the targets by new statistics without changing the predictions (van Hasselt et al., 2016)."""
         # After the first fit the change is slow, because the last layer has to adapt.
         rate = 1.0 if self.norm.count < 1.5 * len(targets) else 0.1
         offset = self.offset + rate * (targets.mean() - self.offset)

@@ -44,10 +44,10 @@ class AutoWeight:
 
     If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
     best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs
-    so far. The weight starts when this mean cost has fallen by less than C - best in ten epochs, and at the latest in
-    the middle of the training. An earlier start would change the attainable cost. In the second half of the training
-    the weight grows more and more slowly, so that the last policy has settled. Costs may have either sign. A share
-    implies ``by_slack``.
+    so far. The weight starts when the mean cost of five epochs has fallen by less than C - best in ten epochs, and at
+    the latest in the middle of the training. An earlier start would change the attainable cost. In the second half of
+    the training the weight grows more and more slowly, so that the last policy has settled. Costs may have either sign.
+    A share implies ``by_slack``.
 
     :param cost_limit: Limit C on the expected cost, or a share of the improvement such as ``"95%"``.
     :param by_slack: Whether the scale is the slack, as described above.

@@ -1,5 +1,5 @@
 """
-Containers for the rollouts of one policy epoch, by episode, and for the policy's outputs.
+Store the rollouts of one policy epoch by episode, and the outputs of the policy.
 
 Dimension key: T horizon, N episodes, E environments, X state, Z TRVs.
 """
@@ -113,8 +113,8 @@ class EpisodeBuffer(RolloutBuffer):
     A rollout buffer of ``(T, N, ...)`` arrays, indexed by time step and episode (in SB3: time step and environment).
 
     ``buffer_size`` is the horizon T, and ``n_envs`` is the number of episodes N, independent of the number of
-    environments. N grows if an epoch has more episodes than that. After the end of a short episode the arrays hold
-    zeros (``stds``: ones), and ``alive`` is 0 there.
+    environments. The buffer grows if an epoch has more episodes. After the end of a short episode the arrays hold zeros
+    (``stds``: ones), and ``alive`` is 0 there.
 
     :param state_dim: Number of components X of the state.
     :param trv_dim: Number of TRVs Z.

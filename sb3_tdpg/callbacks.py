@@ -84,7 +84,7 @@ class Candidate(NamedTuple):
 
     @classmethod
     def from_json(cls, text: str) -> Candidate:
-        """Create a candidate from the text that :meth:`to_json` returned."""
+        """Create a candidate from the string that :meth:`to_json` returned."""
         record = json.loads(text)
         return cls(**{**record, "information": math.inf if record["information"] is None else record["information"]})
 

@@ -281,7 +281,7 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
 
 
 def check_single(observation: Any, space: spaces.Space) -> None:
-    """Raise a ``ValueError`` for a dict if the space is no ``Dict``, and for the tuple that ``reset`` returns."""
+    """Raise a ``ValueError`` for a dict if the space is not a ``Dict``, and for the tuple that ``reset`` returns."""
     if isinstance(observation, dict) and not isinstance(space, spaces.Dict):
         raise ValueError(f"the observation is a dict, but the policy was made for {space}")
     if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):

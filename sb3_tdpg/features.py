@@ -73,9 +73,9 @@ class SpatialSoftmax(nn.Module):
         p_c = \sum_i \mathrm{softmax}_i(\alpha_c z_{ci}) \, (x_i, y_i)
 
     The sum is over the pixels i, with positions from -1 to 1. The activations :math:`z_{ci}` are standardised over the
-    image, and the factor :math:`\alpha_c` is learned. A keypoint moves in proportion to its object in the image, also
-    to places that were not seen in training. The layer follows Levine et al. (2016, "End-to-end training of deep
-    visuomotor policies"), who do not standardise the activations.
+    image, and the factor :math:`\alpha_c` is learned. If an object moves in the image, its keypoint moves in
+    proportion, also to places that were not seen in training. The layer follows Levine et al. (2016, "End-to-end
+    training of deep visuomotor policies"), who do not standardise the activations.
 
     :param channels: Number of channels C.
     :param height: Height H of a feature map in pixels.
@@ -98,11 +98,13 @@ class SpatialSoftmax(nn.Module):
 
 class TRVCnn(BaseFeaturesExtractor):
     """
-    Convolutions in front of the encoder; default: the paper's two layers of 6 channels with stride 2 and ELU,
-    flattened.
+    Convolutional network in front of the encoder.
+
+    By default, it has the paper's two layers (6 channels, stride 2, ELU), and its output is flattened.
 
     With ``pool``, every square of ``pool x pool`` pixels is first replaced by its mean. Otherwise a layer of stride 2
-    would turn fine textures into coarse ones (aliasing). Unseen textures would then change the features most.
+    would turn fine textures into coarse ones (aliasing). Unseen textures would then have the largest effect on the
+    features.
 
     With ``keypoints``, a :class:`~sb3_tdpg.features.SpatialSoftmax` replaces the nonlinearity of the last layer. The
     features are then the positions at which that layer's maps are active. They describe where an object is and not how

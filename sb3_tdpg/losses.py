@@ -11,7 +11,7 @@ import torch as th
 
 def policy_gradient_loss(log_prob: th.Tensor, advantages: th.Tensor, alive: th.Tensor) -> th.Tensor:
     """
-    Return a surrogate loss whose gradient is that of the expected cost (Equations 12 and 13).
+    Return a surrogate loss whose gradient is the gradient of the expected cost (Equations 12 and 13).
 
     The paper multiplies every log-probability by the cost of the whole episode. Subtracting a term that does not depend
     on the sample at t, such as past costs or a baseline of the state, leaves the expected gradient unchanged.

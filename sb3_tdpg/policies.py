@@ -56,8 +56,9 @@ class TRVPolicy(BasePolicy):
     next time step, ``(n_envs,)``.
 
     The defaults depend on the preset: "vector", "image" (uint8), "depth" (images of floats) or "long" (vectors over a
-    long horizon). See the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. "vector" and
-    "depth" have the paper's network sizes. The preset "paper" has the network sizes of the paper's ball catching.
+    long horizon). See the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The presets
+    "vector" and "depth" have the network sizes of the paper. The preset "paper" has the network sizes of the paper's
+    ball catching.
 
     :param observation_space: Vectors, images with channels first, ``Discrete``, or a ``Dict`` of these.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
@@ -321,7 +322,7 @@ class TRVPolicy(BasePolicy):
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
         """
-        Return the distribution pi(u_t | x~_t) of the actions, which the next call overwrites.
+        Return the distribution pi(u_t | x~_t) of the actions; the next call overwrites it.
 
         :param trv: TRVs x~_t, ``(N, Z)``
         :param t: time step of each episode, ``(N,)``
@@ -446,7 +447,8 @@ class TRVPolicy(BasePolicy):
             acts, the policy is not the one that was trained. The first such call warns. The paper's tables use
             ``False``.
         :return: the actions, clipped to their bounds, and the memory for the next call
-        :raises ValueError: if the observation has a wrong shape, or an episode runs beyond the horizon.
+        :raises ValueError: if the observation has a wrong shape, or an episode is longer than the horizon of a
+            time-varying policy.
         """
         check_single(observation, self.observation_space)
         if deterministic and not self._has_warned:

@@ -50,7 +50,7 @@ class Problem:
         return self._states(env, env.unwrapped.reset_infos, obs)
 
     def next_states(self, env: VecEnv, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
-        """Return x_{t+1} after a step, or x_0 of the next episode where one has ended: ``(E, X)``."""
+        """Return x_{t+1} after a step, or x_0 of the next episode if the episode has ended: ``(E, X)``."""
         if dones.any():
             reset_infos = env.unwrapped.reset_infos
             infos = [reset_infos[i] if done else info for i, (done, info) in enumerate(zip(dones, infos, strict=True))]
@@ -83,7 +83,7 @@ def unperturbed(env: VecEnv, obs: Any) -> Any:
 
 def read_problem(env: VecEnv, **keywords: bool) -> Problem:
     """
-    Read the horizon and the state's dimension of an environment without a step, or raise a ``ValueError``.
+    Read the horizon and the state's dimension of an environment without stepping it, or raise a ``ValueError``.
 
     :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """

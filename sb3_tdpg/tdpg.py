@@ -56,8 +56,8 @@ class TDPG(EpisodicAlgorithm):
     several clipped passes, as in PPO. ``beta=inf`` is plain policy gradient with the same policy.
 
     The environment needs a finite horizon: an attribute ``horizon`` or a time limit (``max_episode_steps``). It reports
-    the true state as ``info["state"]`` in ``reset`` and ``step``, and declares its space in an attribute
-    ``state_space``. Without a reported state, a vector observation stands in for it.
+    the true state as ``info["state"]`` in ``reset`` and ``step``, and declares the state's space in an attribute
+    ``state_space``. Without a reported state, a vector observation stands in for the state.
 
     Most defaults depend on the kind of observation: a vector, an image, a depth image (floats), or a vector over a
     horizon of 50 or more steps. See the table in "TDPG: Defaults" of the documentation; the values come from
@@ -112,7 +112,7 @@ class TDPG(EpisodicAlgorithm):
     :param verbose: 0: no output; 1: a table per epoch; 2: debug messages.
     :param seed: Seed of all random number generators. The episodes also depend on the number of environments.
     :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``. ``"auto"`` uses a GPU, if there is one, for images, and the CPU
-        for vectors, because it is faster for them.
+        for vectors, for which it is faster.
     :param n_threads: Number of threads of torch and of NumPy's linear algebra during ``learn``. Default: torch's
         setting for images, otherwise 1. One thread is fastest for small networks and gives the same numbers on any
         number of cores.
@@ -401,7 +401,7 @@ class TDPG(EpisodicAlgorithm):
         for columns in (part for _ in range(self.n_epochs) for part in self._minibatches(passes)):
             part = passes.select(columns)
             log_prob, rebuilt = self.policy.evaluate_episodes(part, self.encoder_gradient, mi_coef > 0.0)
-            vars(self.policy.action_dist).pop("distribution", None)  # with its graph the policy could not be copied
+            vars(self.policy.action_dist).pop("distribution", None)  # its graph would prevent copying the policy
             if old_log_prob is None:
                 policy_loss = losses.policy_gradient_loss(log_prob, part.advantages, part.alive)
             else:

@@ -219,7 +219,7 @@ def make_episodes_env(
     :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
     :param n_envs: Number of environments. Default: ``n_episodes`` for a :class:`BatchedVecEnv`, else the largest
         divisor of ``n_episodes`` up to 50. With ``epoch_steps`` the default is the number of whole episodes that fit
-        into an epoch; for any other environment than a :class:`BatchedVecEnv`, it is at most 10.
+        into an epoch. For any other environment than a :class:`BatchedVecEnv`, this number is at most 10.
     :param n_episodes: Number of episodes per epoch; default: TDPG's default.
     :param epoch_steps: Number of steps per epoch, instead of ``n_episodes``.
     :param env_kwargs: Keywords for the environment's constructor.

@@ -70,7 +70,7 @@ class BatchedMLP(nn.Module):
         return self.through(x, lambda layer, x: layer.at(x, index))
 
     def through(self, x: th.Tensor, apply: Callable[[Any, th.Tensor], th.Tensor]) -> th.Tensor:
-        """Pass inputs through all layers by ``apply(layer, x)``, with the nonlinearity between the layers."""
+        """Pass inputs through all layers with ``apply(layer, x)``, and through the nonlinearity between the layers."""
         *hidden, last = self.layers
         for layer in hidden:
             x = self.activation(apply(layer, x))

@@ -128,7 +128,7 @@ _MISSING = object()  # None is a value
 
 
 def _excerpt(text: str, start: int) -> str:
-    """Return the ``MAX_LENGTH`` characters from ``start`` on; if fewer follow, return the last ``MAX_LENGTH``."""
+    """Return ``MAX_LENGTH`` characters of a text from ``start`` on; if fewer follow, return the last ``MAX_LENGTH``."""
     start = max(0, min(start, len(text) - MAX_LENGTH))
     end = start + MAX_LENGTH
     return f"{'...' * (start > 0)}{text[start:end]}{'...' * (end < len(text))}"
@@ -150,7 +150,7 @@ def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
 
 
 def _command() -> str:
-    """Return the command line, with paths inside the working directory relative to it."""
+    """Return the command line; paths inside the working directory are relative to that directory."""
     here = Path.cwd()
     program, *arguments = as_typed(sys.orig_argv)
     relative = [str(Path(a).relative_to(here)) if Path(a).is_relative_to(here) else a for a in arguments]

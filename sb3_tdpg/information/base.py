@@ -31,7 +31,7 @@ class InformationBatch(NamedTuple):
         return self.trvs.new_ones(self.trvs.shape[:2], dtype=th.bool) if self.alive is None else self.alive
 
     def at(self, t: int) -> InformationBatch:
-        """Select step t of the n episodes that are alive then: ``(1, n, ...)``."""
+        """Select step t of the n episodes that are alive at that step: ``(1, n, ...)``."""
         keep = slice(None) if self.alive is None else self.alive[t]
         return self._each(lambda x: x[t, keep][None])
 

@@ -26,10 +26,10 @@ class DirectedLogDet(LogDet):
         \le \sum_t \tfrac12 \log\det \mathrm{Cov}(\tilde x_t - A_t \tilde x_{t-1})
         - E[\textstyle\sum_i \log \sigma_i(e_t)]
 
-    with the matrix A_t of a linear regression. The last inequality holds for two reasons. A Gaussian has the largest
-    entropy for a given covariance, and the residual of the best linear prediction has at least the variance that the
-    best prediction leaves. A bit that is kept for T steps costs one bit here, and T bits in the sum over time of
-    I[x_t; x~_t]. The estimate is not a bound on that sum.
+    with the matrix A_t of a linear regression. The last inequality holds for two reasons. First, a Gaussian has the
+    largest entropy for a given covariance. Second, the residual of the best linear prediction has at least the variance
+    that the best prediction leaves. A bit that is kept for T steps costs one bit here, and T bits in the sum over time
+    of I[x_t; x~_t]. The estimate is not a bound on that sum.
     """
 
     bound = "neither"  # type: ignore[assignment]  # not the inherited "upper": it bounds another quantity

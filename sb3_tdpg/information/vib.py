@@ -26,8 +26,8 @@ class VariationalBottleneck(InformationEstimator):
 
     The prior r_t of each time step is a mixture of K diagonal Gaussians :math:`w_k N_k`, fitted to each epoch's
     rollouts and frozen in the policy's loss. The divergence from a mixture has no closed form. The estimate is
-    therefore an upper bound on this divergence, which follows from Jensen's inequality and needs no samples (Hershey
-    and Olsen, 2007):
+    therefore an upper bound on this divergence. The bound follows from Jensen's inequality and needs no samples
+    (Hershey and Olsen, 2007):
 
     .. math::
         D[q \,\|\, r_t] \le -\log \sum_k w_k e^{-D[q \| N_k]}.
@@ -105,7 +105,7 @@ def _log_joint(means: th.Tensor, variances: th.Tensor, prior: Prior) -> th.Tenso
 
 def _moments(means: th.Tensor, variances: th.Tensor, responsibility: th.Tensor, pseudo: Prior | None = None) -> Prior:
     """
-    Fit the moments of each component to the densities that it is responsible for, by the law of total variance.
+    Fit the moments of each component to the densities, weighted by its responsibilities (law of total variance).
 
     :param responsibility: responsibility of each component for each episode, ``(T, N, K)``
     :param pseudo: A Gaussian that counts as an additional episode of every component, so that no component is empty.
