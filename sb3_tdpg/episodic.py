@@ -236,7 +236,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         """Describe the information of the last epoch if it was penalised, and say if there is hardly any."""
         if self.auto_weight is not None:
             return self.auto_weight.kept()
-        if self.information is None or not self.rollout_buffer.full:  # a callback has stopped it within an epoch
+        if self.information is None or not self.rollout_buffer.full:  # a callback stopped learn() within an epoch
             return None
         nats = float(self.information.sum())
         text = f"{nats:.3g} nats kept, at a cost of {self.rollout_buffer.episode_costs.mean():.3g}"
