@@ -14,7 +14,7 @@ BESIDE = 9.5  # m, distance between the side view's camera and the line of the r
 
 
 class BulletScene(BulletWorld):
-    """Floor, wall and ball in their own Bullet world."""
+    """Put floor, wall and ball into a separate Bullet world."""
 
     def __init__(self, scene: BallScene, *, gui: bool = False) -> None:
         super().__init__(gui=gui)
@@ -69,7 +69,7 @@ class BulletRenderer(BulletScene):
 
 
 class SideView(BulletScene):
-    """Draw the scene from the side, with a body for the robot, for pictures and PyBullet's window (no observations)."""
+    """Draw a side view with the robot, for pictures and PyBullet's window, not for observations."""
 
     def __init__(self, scene: BallScene, *, gui: bool = False) -> None:
         super().__init__(scene, gui=gui)
@@ -84,7 +84,7 @@ class SideView(BulletScene):
         return self._add(color, 0.0, shapeType=self.client.GEOM_BOX, halfExtents=half_sizes)
 
     def place(self, state: np.ndarray) -> None:
-        """Move robot and ball to their positions in a state, ``(5,)``."""
+        """Move robot and ball to the positions that a state, ``(5,)``, contains."""
         d, ball_x, ball_y = state[:3].tolist()
         height = self.scene.camera_height
         tilt = self.client.getQuaternionFromEuler([0.0, -np.deg2rad(self.scene.camera_pitch), 0.0])
@@ -94,7 +94,7 @@ class SideView(BulletScene):
         self._move(self._head, (d, 0.0, height), tilt)
 
     def picture(self, camera_image: np.ndarray) -> np.ndarray:
-        """Draw the scene beside the robot's camera image, ``(3, 64, 64)``: ``(256, 772, 3)`` uint8."""
+        """Draw side view and camera image, ``(3, 64, 64)``, side by side in one picture, ``(256, 772, 3)`` uint8."""
         view = self.client.computeViewMatrix((MIDDLE[0] - 1.5, -BESIDE, 3.4), MIDDLE, (0.0, 0.0, 1.0))
         projection = self.client.computeProjectionMatrixFOV(38.0, WIDTH / HEIGHT, 0.1, 60.0)
         scene = self.client.picture(HEIGHT, WIDTH, view, projection, LIGHT.tolist(), shadow=1)

@@ -1,4 +1,4 @@
-"""The ball-catching problem (Section IV-B of the paper): a camera is the only sensor."""
+"""Define the ball-catching problem (Section IV-B of the paper), with a camera as the only sensor."""
 
 import os
 import time
@@ -27,39 +27,40 @@ class BallCatchEnv(SharedEnv):
     r"""
     Drive along a line, in front of a brick wall, to the place where a ball lands.
 
-    State ``x = (d, b_x, b_y, v_x, v_y)``: the robot's position, the ball's position (``b_y`` is its height) and its
-    velocity, in m and m/s. Observation ``y``: the image of a camera on the robot, uint8 ``(3, 64, 64)``. Action ``u``:
-    the robot's speed in m/s. With ``T = 25`` controls,
+    State ``x = (d, b_x, b_y, v_x, v_y)``: the robot's position, the ball's position (``b_y`` is the height) and the
+    ball's velocity, in m and m/s. Observation ``y``: the image of a camera on the robot, uint8 ``(3, 64, 64)``. Action
+    ``u``: the robot's speed in m/s. With ``T = 25`` controls, the dynamics and the costs are
 
     .. math::
         d_{t+1} &= d_t + k u_t, \quad k = \Delta t = 1/15\,\mathrm{s}, \qquad
         b_{t+1} = b_t + \Delta t\, v_t, \qquad v_{t+1} = v_t - (0, \Delta t\, g), \\
         c_t &= 0.01\, |u_t|, \qquad c_T = 100\, |d_T - b^x_T|.
 
-    The defaults follow the paper's text. Another control gain, gravity and horizon fit the published numbers better:
-    ``BallCatchEnv(**sb3_tdpg.envs.scenarios.BALL_PUBLISHED_READING)``.
+    The defaults follow the paper's text. Other values of the control gain, gravity and horizon fit the published
+    numbers better than the defaults: ``BallCatchEnv(**sb3_tdpg.envs.scenarios.BALL_PUBLISHED_READING)``.
 
     :param control_gain: The robot moves by ``control_gain * u`` in each step. ``None`` means ``dt``.
     :param dt: Time step in s.
-    :param gravity: Acceleration of gravity in m/s^2.
+    :param gravity: Gravitational acceleration in m/s^2.
     :param horizon: Number of controls T.
     :param max_action: Bound of the action space ``[-max_action, max_action]``. The paper's action space is unbounded,
         but SB3 needs bounds. The default bound is large, because an action beyond it gives no gradient. The task needs
-        about 2 m/s.
-    :param robot_range: The robot starts uniformly in ``(low, high)``, in m.
-    :param ball_start_range: The ball starts uniformly in ``((low_x, low_y), (high_x, high_y))``, in m.
-    :param ball_speed_range: Range of the ball's initial velocity, in m/s, in the form of ``ball_start_range``.
-    :param ball_color: Red, green and blue, each in [0, 1].
+        speeds of about 2 m/s.
+    :param robot_range: The robot's initial position is uniform in ``(low, high)``, in m.
+    :param ball_start_range: The ball's initial position is uniform in ``((low_x, low_y), (high_x, high_y))``, in m.
+    :param ball_speed_range: The ball's initial velocity is uniform in ``((low_x, low_y), (high_x, high_y))``, in m/s.
+    :param ball_color: Colour of the ball: red, green and blue, each in [0, 1].
     :param ball_radius: Radius of the ball in m.
     :param camera_height: Height of the camera above the floor, in m.
     :param camera_pitch: Upward tilt of the camera in degrees, between -90 and 90.
     :param fov: Field of view of the camera in degrees.
-    :param texture: The wall's texture, for :func:`~sb3_tdpg.envs.textures.load_texture`: a name, a path or an array.
+    :param texture: Texture of the wall: a name, a path or an array (:func:`~sb3_tdpg.envs.textures.load_texture`).
     :param pixel_noise_std: Standard deviation of the noise on every pixel, for pixel values in [0, 1].
     :param noise_mode: How noisy images are mapped back to [0, 1]: ``"minmax"`` as in the paper, or ``"clip"``.
-    :param wall_stands_still: Draw wall, floor and sky as seen from d = 0, so that only the ball shows where the robot
-        is (for diagnosis).
-    :param renderer: ``"fast"``, a batched ray caster, or ``"pybullet"``, the reference. They agree in 99.8 % of pixels.
+    :param wall_stands_still: Whether to draw wall, floor and sky as if the robot were at d = 0. Then only the ball
+        shows where the robot is (for diagnosis).
+    :param renderer: ``"fast"``, a batched ray caster, or ``"pybullet"``, the reference. Their images agree in 99.8 % of
+        the pixels.
     :param n_processes: Number of processes that render a batch with PyBullet. This number does not change the results.
     :param render_mode: ``None``, ``"rgb_array"`` (scene and camera image) or ``"human"`` (PyBullet's window).
     """
@@ -175,7 +176,7 @@ class BallCatchEnv(SharedEnv):
         return images
 
     def render(self) -> np.ndarray | None:
-        """Draw the scene from the side and the camera's image, ``(256, 772, 3)`` uint8, or update PyBullet's window."""
+        """Return a picture of side view and camera image, ``(256, 772, 3)`` uint8, or update PyBullet's window."""
         if self.render_mode is None:
             return None
         state = self._current_state()
@@ -184,6 +185,6 @@ class BallCatchEnv(SharedEnv):
             time.sleep(self.dt)
             return None
         images = self._world.images(self._seen_from(state))
-        # The noise is a new sample, so that rendering does not change an episode.
+        # The noise comes from a separate generator, so that rendering does not change an episode.
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))
         return self._view.picture(camera_image)

@@ -1,15 +1,15 @@
 """
-A batched ray caster in NumPy that draws the ball-catching scene as PyBullet's TinyRenderer does.
+Draw the ball-catching scene as PyBullet's TinyRenderer does, with a batched ray caster in NumPy.
 
-It agrees with TinyRenderer in 99.8 % of the pixels and is 65 times as fast. It uses these facts:
+The ray caster agrees with TinyRenderer in 99.8 % of the pixels and is 65 times as fast. It uses these facts:
 
 - The ray of a pixel goes through the pixel's corner, not through its centre.
-- The camera does not turn about the vertical, so that depth and height on floor and wall are constant in a row of
-  pixels. Each row of an image is sky, wall or floor; only the ball is drawn pixel by pixel.
-- Textures are not interpolated. A flat surface has a single brightness, so its texels are multiplied by it in advance.
-- TinyRenderer draws a sphere as a mesh inside the sphere, which looks like a sphere of 0.965 times the radius.
+- The camera does not turn about the vertical axis. In a row of pixels, all points of the wall have the same depth and
+  height, and so do all points of the floor. Each row is sky, wall or floor; only the ball is drawn pixel by pixel.
+- Textures are not interpolated. The brightness of a flat surface is constant, so its texture is shaded in advance.
+- TinyRenderer draws a sphere as a mesh inside the sphere. The mesh looks like a sphere of 0.965 times the radius.
 
-Dimension key: N images, K side of the window around a ball; images are ``(N, 3, 64, 64)``.
+Dimension key: N images, K pixels per side of the window around a ball; images are ``(N, 3, 64, 64)``.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ TO_LIGHT = LIGHT / np.linalg.norm(LIGHT)
 
 
 def brightness(towards_light: np.ndarray, upward: np.ndarray) -> np.ndarray:
-    """Return the factor by which a texel is multiplied, from the normal's components towards the light and upward."""
+    """Return the brightness of a surface, given the components of its normal towards the light and upward."""
     reflected_up = 2 * upward * towards_light - TO_LIGHT[2]
     return AMBIENT + DIFFUSE * np.maximum(towards_light, 0) + SPECULAR * np.maximum(reflected_up, 0) ** 2
 
@@ -62,7 +62,7 @@ class FastRenderer:
         self._scratch = tuple(np.empty(size, dtype) for dtype in (np.float32, np.float32, np.int32, np.uint32))
 
     def _prepare_rays(self) -> None:
-        """Make a ray (x, y, z) of depth 1 for each pixel; x and z depend on its row, y on its column."""
+        """Make a ray (x, y, z) of depth 1 for each pixel; x and z depend on the pixel's row, y on its column."""
         pitch = np.deg2rad(self.scene.camera_pitch)
         self._slope = np.tan(np.deg2rad(self.scene.fov) / 2)
         steps = np.arange(IMAGE_SIZE)
@@ -90,13 +90,13 @@ class FastRenderer:
 
     @staticmethod
     def _depth_of(distance: float | np.ndarray, ray: np.ndarray) -> np.ndarray:
-        """Return the depth at which rays reach a distance along an axis; it is infinite for rays that never do."""
+        """Return the depth at which each ray reaches a distance along an axis, or infinity if it never does."""
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = distance / ray
         return np.where(depth > NEAR, depth, np.inf)
 
     def _draw_floor(self) -> tuple[np.ndarray, np.ndarray]:
-        """Draw floor and sky, ``(3, 64, 64)``; also return the floor's depth, which is infinite outside the floor."""
+        """Return an image of floor and sky, ``(3, 64, 64)``, and the depth of the floor, infinite outside the floor."""
         texture = shade(floor_texture(), (0.0, 0.0, 1.0))
         depth = self._depth_of(-self.scene.camera_height, self._ray_z)[:, None]
         depth[depth > FAR] = np.inf
@@ -126,7 +126,7 @@ class FastRenderer:
 
     def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
         """Draw the wall in each image, given its distance ``(N,)`` and its depth in each row of pixels, ``(N, 64)``."""
-        # (64,); they differ only in rows that show the sides of the floor
+        # (64,); first and last differ only in rows that show the sides of the floor
         first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)
         with_wall = np.flatnonzero((depth < last).any(axis=0))
         if not len(with_wall):
@@ -146,7 +146,7 @@ class FastRenderer:
             np.copyto(images[:, channel, rows], shifted, casting="unsafe")
 
     def _wall_colours(self, distance: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Look up the packed colours of the wall, ``(N, rows, 64)``; the second array is scratch space."""
+        """Return the packed colours of the wall, ``(N, rows, 64)``, and an array of the same shape as scratch space."""
         u = self._u_at_zero + np.multiply.outer(distance, self._u_per_metre[rows])  # (N, rows)
         u -= np.floor(u)
         line = (u * self._texels_u).astype(np.int32) * np.int32(self._texels_v)
@@ -180,16 +180,16 @@ class FastRenderer:
                 self._draw_windows(images, chosen, corner, window, centre[chosen], wall_depth)
 
     def _bounding_box(self, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first row and column that a ball may cover, and one past the last: ``(N, 2)`` each."""
+        """Return the rows and columns that each ball may cover: their start and (excluded) end, ``(N, 2)`` each."""
         radius = MESH_RADIUS * self.scene.ball_radius
         depth = centre @ self._axis
         across = np.stack([-(centre @ self._up), np.zeros(len(centre))], axis=1)  # (N, 2): downward, to the right
-        # The ball is a circle, seen from above or from the side. Lines through the eye with these slopes touch it.
+        # Seen from above or from the side, the ball is a circle. Lines through the eye with these slopes touch it.
         room = np.maximum(depth**2 - radius**2, 1e-12)[:, None]
         root = radius * np.sqrt(np.maximum(across**2 + depth[:, None] ** 2 - radius**2, 0))
         slopes = np.stack([across * depth[:, None] - root, across * depth[:, None] + root]) / room
         pixels = (slopes / self._slope + 1) * IMAGE_SIZE / 2
-        pixels[..., 0] -= 1  # the lowest row is 63, at ndc -1
+        pixels[..., 0] -= 1  # the lowest row is 63, at the normalised coordinate -1
         first, last = np.clip(np.stack([np.floor(pixels[0]), np.ceil(pixels[1]) + 1]), 0, IMAGE_SIZE).astype(int)
         is_around = abs(depth) <= radius + NEAR  # the ball is at the eye and may cover every pixel
         first[is_around], last[is_around] = 0, IMAGE_SIZE
@@ -206,7 +206,7 @@ class FastRenderer:
         centre: np.ndarray,
         wall_depth: np.ndarray,
     ) -> None:
-        """Draw the balls of the chosen images, each in a window of K x K pixels, given its upper left corner."""
+        """Draw the balls of the chosen images, each in a window of K x K pixels with a given upper left corner."""
         radius = MESH_RADIUS * self.scene.ball_radius
         steps = np.arange(window)
         rows, columns = corner[:, :1] + steps, corner[:, 1:] + steps  # (n, K)

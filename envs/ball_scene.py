@@ -1,8 +1,8 @@
 """
-The ball-catching scene as data, which all renderers use.
+Define the ball-catching scene as data, for all renderers.
 
 Coordinates: x points forward, y to the left and z upward. The floor is at z = 0. The camera is at
-(d, 0, camera_height) and looks along +x. Lengths are in metres.
+(d, 0, camera_height) and looks along +x, tilted upward by camera_pitch. Lengths are in metres.
 """
 
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ import numpy as np
 IMAGE_SIZE = 64  # pixels per side
 NEAR, FAR = 0.1, 20.0  # only points between these depths are drawn, so that white sky replaces the top of the wall
 
-# A plane is a square mesh. Its side is 30 m long and has 15 copies of the texture, like PyBullet's plane in 2020. (The
-# plane of PyBullet 3.2.7 shifts the texture by half a copy.) The sides of the wall are four times as long.
+# Floor and wall are square meshes with 15 copies of the texture per side, like PyBullet's plane in 2020. (The plane of
+# PyBullet 3.2.7 shifts the texture by half a copy.) A side of the floor is 30 m long, a side of the wall 120 m.
 PLANE_HALF, PLANE_COPIES = 15.0, 15
 WALL_SCALE = 4.0
 WALL_X, WALL_Z = 10.0, 42.0  # centre of the wall

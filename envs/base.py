@@ -1,4 +1,4 @@
-"""The base class of the environments: a finite-horizon POMDP in batched NumPy.
+"""Define the base class of the environments, a finite-horizon POMDP in batched NumPy.
 
 Dimension key: N parallel episodes, X state, U action; observations have shape ``(N, *obs)``.
 """
@@ -27,14 +27,14 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     """
     A finite-horizon POMDP (Section II of the paper) as a Gymnasium environment.
 
-    A subclass sets ``state_space``, ``observation_space`` and ``action_space`` and implements five methods, each for N
+    A subclass sets ``state_space``, ``observation_space`` and ``action_space``. It implements five methods, each for N
     episodes at once: :meth:`initial_state`, :meth:`dynamics`, :meth:`sensor`, :meth:`cost`, :meth:`terminal_cost`.
     All random numbers must come from ``self.np_random``.
 
     This class uses these methods to provide ``reset`` and ``step`` for one episode.
-    :class:`sb3_tdpg.vec_env.BatchedVecEnv` uses them to provide an SB3 ``VecEnv`` for many episodes. The last step of
-    the horizon returns ``terminated=True``, because the horizon is part of the problem; algorithms do not bootstrap
-    there. The reward is the negative cost; subclasses return costs.
+    :class:`sb3_tdpg.vec_env.BatchedVecEnv` uses them to provide an SB3 ``VecEnv`` for many episodes. The horizon is
+    part of the problem. So the last step returns ``terminated=True``, and algorithms do not bootstrap from its
+    observation. The reward is the negative cost; subclasses return costs.
 
     ``info["state"]`` is a copy of the true state: x_0 after ``reset``, and x_{t+1} after ``step``. ``info["cost"]`` is
     the cost of the step. A subclass can add entries to the info of a step with :attr:`_details`.
@@ -51,7 +51,8 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``, the number of processes that share the work of a batch.
     shares_work: bool = False
-    #: Names of cached properties that hold a Bullet world or processes. The process that first uses one creates it.
+    #: Names of cached properties that hold a Bullet world or processes. Each is created at its first use, in the
+    #: process that uses it.
     resources: frozenset[str] = frozenset()
     #: Additional entries of each episode's info after the last call of :meth:`dynamics`; the sequence can be empty.
     _details: Sequence[Mapping[str, Any]] = ()
@@ -70,7 +71,7 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         return {name: value for name, value in self.__dict__.items() if name not in self.resources}
 
     def check_open(self) -> None:
-        """Raise a ``RuntimeError`` after :meth:`close`."""
+        """Raise a ``RuntimeError`` if the environment has been closed."""
         if self._is_closed:  # a BulletClient raises the same error, but there may be none yet
             raise RuntimeError("this environment has been closed: make a new one")
 
@@ -82,19 +83,19 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
 
     @abstractmethod
     def initial_state(self, n: int) -> np.ndarray:
-        """Draw x_0: ``(N, X)``."""
+        """Draw the initial states x_0, ``(N, X)``."""
 
     @abstractmethod
     def dynamics(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         """
-        Draw x_{t+1} ~ p(. | x_t, u_t) as a new array: ``(N, X)`` from ``(N, X)`` and ``(N, U)``.
+        Draw the next states x_{t+1} ~ p(. | x_t, u_t) as a new array: ``(N, X)`` from ``(N, X)`` and ``(N, U)``.
 
         Actions of a ``Discrete`` space have the shape ``(N,)``, here and in :meth:`cost`.
         """
 
     @abstractmethod
     def sensor(self, state: np.ndarray) -> np.ndarray:
-        """Draw y_t ~ s(. | x_t): ``(N, *obs)``, in the dtype of the observation space."""
+        """Draw the observations y_t ~ s(. | x_t): ``(N, *obs)``, in the dtype of the observation space."""
 
     @abstractmethod
     def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
@@ -119,9 +120,9 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         Advance N episodes by one control.
 
-        :param state: x_t, ``(N, X)``
-        :param action: u_t, ``(N, U)``; it is clipped to the action space
-        :param is_last: Whether this is the last control, T - 1, whose cost includes the terminal cost.
+        :param state: The states x_t, ``(N, X)``.
+        :param action: The actions u_t, ``(N, U)``, which are clipped to the action space.
+        :param is_last: Whether this is the last control (t = T - 1), whose cost includes the terminal cost.
         :raises ValueError: if the actions have a wrong shape, or an action is NaN or infinite.
         """
         action, expected = np.asarray(action, dtype=np.float64), (len(state), *self.action_space.shape)

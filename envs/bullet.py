@@ -25,7 +25,7 @@ class BulletClient:
     several clients; each world has its own bodies. A client is closed by :meth:`close`, by garbage collection, or when
     Python exits.
 
-    :param gui: Open PyBullet's window; a process can have only one window.
+    :param gui: Whether to open PyBullet's window. A process can have only one window.
     :raises ValueError: if there is no display for the window.
     :raises RuntimeError: if PyBullet has no free connection.
     """
@@ -97,7 +97,7 @@ class BulletWorld:
 
 
 def enlarge(image: np.ndarray, factor: int) -> np.ndarray:
-    """Enlarge an image ``(H, W, 3)`` by an integer factor: each pixel is repeated."""
+    """Enlarge an image ``(H, W, 3)``: repeat each pixel ``factor`` times in both directions."""
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 

@@ -45,7 +45,7 @@ def one_of(name: str, value: str, choices: Collection[str]) -> str:
 
 
 def low_high(name: str, value: Any, form: str = "(low, high)", shape: tuple[int, ...] = (2,), unit: str = "") -> Any:
-    """Check the lowest and highest values of a number, or of each component of a vector; return them as an array."""
+    """Check the lower and upper limits of a number or of a vector's components; return the limits as an array."""
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all() or (array[0] > array[1]).any():
         raise ValueError(f"{name}={value} must be {form} of finite numbers{unit}, low <= high")

@@ -16,12 +16,12 @@ def paint_box(
     """
     Paint a rotated box into an image, in place.
 
-    :param image: ``(H, W, 3)`` uint8.
+    :param image: The image, ``(H, W, 3)`` uint8.
     :param middle: x and y of the box's middle, in the units of ``span``.
     :param size: Length and width of the box, in the units of ``span``.
-    :param angle: Angle between the length of the box and the x-axis, in rad.
-    :param colour: Red, green and blue, 0 to 255.
-    :param span: Coordinates of the left, right, lower and upper edge of the picture.
+    :param angle: Angle between the lengthwise axis of the box and the x-axis, in rad.
+    :param colour: Red, green and blue, each from 0 to 255.
+    :param span: Coordinates of the left, right, lower and upper edges of the image.
     """
     height, width = image.shape[:2]
     left, right, low, high = span

@@ -1,4 +1,4 @@
-"""The lava problem (Section IV-A of the paper): a double integrator between a wall and a lava pit."""
+"""Define the lava problem (Section IV-A of the paper): a double integrator between a wall and a lava pit."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,7 +19,8 @@ class LavaEnv(POMDPEnv):
     Reach ``d = 3 m`` and stop there, without falling into the lava at ``d = 5 m``.
 
     State ``x = (d, v)``: distance from the wall in metres, and velocity in metres per step. Observation
-    ``y ~ N(x, sensor_noise_std^2 I)``. Action ``u``: the change of velocity. With ``T = 5`` controls,
+    ``y ~ N(x, sensor_noise_std^2 I)``. Action ``u``: the change of velocity. With ``T = 5`` controls, the dynamics
+    and the costs are
 
     .. math::
         x_{t+1} = (d_t + v_t,\ v_t + u_t), \qquad
@@ -28,15 +29,17 @@ class LavaEnv(POMDPEnv):
     The robot starts with ``v = 0`` and ``d`` uniform in [0, 5] m. If it hits the wall, it stops (``v = 0``), and the
     control of that step has no effect. If it reaches 5 m, it falls into the lava and stays at ``(5, 0)``.
 
-    The defaults follow the paper's text. Another cost definition fits the numbers of Table I better:
+    The defaults follow the paper's text. Another cost definition fits the numbers of Table I better than the text does:
     ``LavaEnv(**sb3_tdpg.envs.scenarios.LAVA_TABLE_READING)``.
 
     :param sensor_noise_std: Standard deviation of the sensor noise (the paper's table prints variances).
     :param sensor_bias: Vector that is added to every observation, in m and m per step.
-    :param start_beta: ``(a, b)``: the robot starts at 5 m times a random number from Beta(a, b). ``None``: uniformly.
+    :param start_beta: ``(a, b)``: the robot starts at 5 m times a random number from Beta(a, b). With ``None`` it
+        starts uniformly in [0, 5] m.
     :param action_cost: Weight of ``|u_t|`` in the stage cost: 0 in the paper's text, 1 in the other cost definition.
-    :param lava_stage_cost: Stage cost in the lava. ``None``: the distance from the goal, which is 2 in the lava.
-    :param lava_terminal_cost: Terminal cost in the lava. ``None``: 100 times the distance, which is 200 in the lava.
+    :param lava_stage_cost: Stage cost in the lava. ``None`` means the distance from the goal, which is 2 in the lava.
+    :param lava_terminal_cost: Terminal cost in the lava. ``None`` means 100 times the distance from the goal, which
+        makes 200 in the lava.
     :param horizon: Number of controls T.
     :param max_action: Bound of the action space ``[-max_action, max_action]``. The paper's action space is unbounded,
         but SB3 needs bounds. The default bound is large, because an action beyond it gives no gradient.

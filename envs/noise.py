@@ -9,8 +9,8 @@ def noisy_pixels(images: np.ndarray, std: float, mode: str, rng: np.random.Gener
     """
     Add Gaussian noise to every pixel of images in [0, 1], ``(N, C, H, W)`` float32, and map them back to [0, 1].
 
-    ``"minmax"``, as in the paper, subtracts each image's minimum and then divides by the maximum. ``"clip"`` clips each
-    pixel to [0, 1].
+    ``"minmax"``, as in the paper, subtracts each image's minimum and then divides by the new maximum. ``"clip"`` clips
+    each pixel to [0, 1].
     """
     noisy: np.ndarray = std * rng.standard_normal(images.shape, dtype=np.float32) + images
     if mode == "minmax":

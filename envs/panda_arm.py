@@ -1,4 +1,4 @@
-"""Simulate the phases of motion of a Panda arm that grasps or squeezes a body on a table."""
+"""Simulate, phase by phase, a Panda arm that grasps or squeezes a body on a table."""
 
 import functools
 from abc import abstractmethod
@@ -45,10 +45,10 @@ Watch = Callable[[Configuration], object]
 
 class ArmSimulation(BulletWorld):
     """
-    Simulate table, robot and one body in their own Bullet world, in which table and robot have no visual shapes.
+    Simulate a table, a robot and one body in a separate Bullet world, without visual shapes of table and robot.
 
-    A subclass loads the robot and the body. It sets all positions before a motion, so that the outcome of the motion
-    depends only on the arguments.
+    A subclass loads the robot and the body. It sets all positions before a motion. So the outcome of the motion depends
+    only on the arguments of the method that starts it.
     """
 
     _robot: int
@@ -102,11 +102,11 @@ class ArmSimulation(BulletWorld):
             self._watch(Configuration(tuple(state[0] for state in states), *self._pose()))
 
     def _states(self, joints: Sequence[int]) -> list[tuple[float, ...]]:
-        """Return PyBullet's state of each joint, which begins with its position and velocity."""
+        """Return PyBullet's state of each joint: a tuple that begins with position and velocity."""
         return self.client.getJointStates(self._robot, joints)
 
     def _clear_contacts(self) -> None:
-        """Simulate a step without contacts, because contacts of the last motion would change the next motion."""
+        """Simulate a step with the body far away, because contacts of the last motion would change the next motion."""
         self.client.resetBasePositionAndOrientation(self._body, FAR_AWAY, UNTURNED)
         self.client.stepSimulation()
 
@@ -122,7 +122,7 @@ class ArmSimulation(BulletWorld):
             self.client.resetJointState(self._robot, joint, angle, 0.0)
 
     def _joints_for(self, position: tuple[float, ...], orientation: tuple[float, ...], accuracy: float) -> Joints:
-        """Compute the arm's joint angles for a pose of the hand by inverse kinematics, from the present angles."""
+        """Solve the inverse kinematics of the arm for a pose of the hand, starting from the present joint angles."""
         joints = self.client.calculateInverseKinematics(
             self._robot, HAND, position, orientation,
             jointDamping=[1e-5] * 9, maxNumIterations=200, residualThreshold=accuracy,

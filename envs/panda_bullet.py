@@ -48,7 +48,7 @@ Outcome = tuple[np.ndarray, int]
 
 class GraspSimulation(ArmSimulation):
     """
-    Simulate grasps: robot, table and mug in their own Bullet world, without visual shapes.
+    Simulate grasps with robot, table and mug in a separate Bullet world, without visual shapes.
 
     Every grasp starts from the same state of the world, so that the outcome depends only on state and pose.
     """
@@ -99,7 +99,7 @@ class GraspSimulation(ArmSimulation):
         self._put_body((x + cos * to_right - sin * ahead, y + sin * to_right + cos * ahead, z + upward), yaw)
 
     def _is_decided(self) -> bool:
-        """Return whether the mug is lost, or high enough to count as lifted."""
+        """Return whether the fingers have lost contact with the mug, or the mug is high enough to count as lifted."""
         return not self._contacts() or self._mug_frame()[0][2] > LIFTED_FOR_GOOD
 
     def _contacts(self) -> int:

@@ -1,4 +1,4 @@
-"""The depth camera of the grasping scene: PyBullet draws the mug, and geometry gives the depth of the table."""
+"""Simulate the depth camera of the grasping scene: PyBullet draws the mug, and geometry gives the table's depth."""
 
 import numpy as np
 
@@ -44,14 +44,15 @@ class DepthCamera(BulletWorld):
         self._rays_z = (rays @ self.rotation)[..., 2]  # (128, 128)
 
     def table_depth(self, below: float = 0.0) -> np.ndarray:
-        """Return the depth of the table along the optical axis, ``(128, 128)``, if it were lower by ``below`` m."""
+        """Return the depth along the optical axis of a table that is lowered by ``below`` m: ``(128, 128)`` in m."""
         return (-below - self.eye[2]) / self._rays_z
 
     def images(self, state: np.ndarray) -> np.ndarray:
         """
         Draw a depth image for each state of the mug: ``(N, 1, 128, 128)`` float32 in m.
 
-        States are ``(N, 4)`` or ``(N, 5)``. A fifth component raises the camera above its usual height, in m.
+        States are ``(N, 4)`` or ``(N, 5)``. The fifth component is the height of the camera above its usual height, in
+        m.
         """
         images = np.empty((len(state), 1, IMAGE_SIZE, IMAGE_SIZE), np.float32)
         client = self.client

@@ -1,4 +1,4 @@
-"""The grasping problem (Section IV-C of the paper): lift a mug by its rim, given one depth image."""
+"""Define the grasping problem (Section IV-C of the paper): lift a mug by its rim, given one depth image."""
 
 import time
 from collections.abc import Iterator
@@ -62,32 +62,39 @@ class PandaGraspEnv(SharedEnv):
     r"""
     Grasp a mug on a table, and lift it.
 
-    State ``x = (x, y, z, yaw)``: the pose of the mug's frame in m and rad. With a ``camera_range`` the height of the
-    camera is a fifth component. Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``. Action ``u``: the
-    hand grasps at the pose ``(0.5, 0, 0.06, pi/6) + 0.1 u``, its position in m and its yaw in rad. There is one
-    control, ``T = 1``, and PyBullet simulates its result:
+    State ``x = (x, y, z, yaw)``: the pose of the mug's frame in m and rad. With a ``camera_range``, a fifth component
+    is the distance by which the camera is raised. Observation ``y``: a depth image in m, float32 ``(1, 128, 128)``.
+    Action ``u``: the hand grasps at the pose ``(0.5, 0, 0.06, pi/6) + 0.1 u`` (position in m, yaw in rad). An episode
+    has one control, ``T = 1``. PyBullet simulates its result:
 
     .. math::
         c_0 = 0, \qquad c_1 = \begin{cases} 0 & \text{if the mug's frame is more than 5 cm above the table},\\
         1 & \text{otherwise.} \end{cases}
 
-    After the step, ``info`` has ``success`` (``is_success`` for SB3), ``mug`` (the mug's pose before the grasp),
-    ``mug_height`` (after the grasp, in m), ``grasp`` (the clipped pose of the hand) and ``contacts`` (number of points
-    in which the fingers touch the mug at the end).
+    After the step, ``info`` has these entries:
 
-    The outcome depends only on state and action, not on earlier trials or on the process.
+    - ``success``, and ``is_success`` for SB3: whether the mug is lifted
+    - ``mug``: the mug's pose before the grasp
+    - ``mug_height``: the height of the mug's frame after the grasp, in m
+    - ``grasp``: the clipped pose of the hand
+    - ``contacts``: the number of points in which the fingers touch the mug at the end
 
-    :param xy_half_width: The mug starts uniformly within this distance of (0.5, 0) along x and along y, in m.
-    :param yaw_range: The mug's yaw starts uniformly in ``(low, high)``, in rad. At yaw 0 the handle points to the left.
-    :param camera_range: Each trial raises the camera by a distance that is uniform in ``(low, high)``, in m. This
-        distance is the fifth state component.
-    :param camera_shift: Constant distance by which the camera is raised in all trials, in m. The state does not
-        contain it.
+    The outcome depends only on state and action, not on earlier trials or on the process that simulates the grasp.
+
+    :param xy_half_width: Half the side of the square in which the mug starts uniformly, in m. The square's middle is
+        (0.5, 0).
+    :param yaw_range: The mug's initial yaw is uniform in ``(low, high)``, in rad. At yaw 0 the handle points to the
+        robot's left.
+    :param camera_range: In each trial, the camera is raised by a distance that is uniform in ``(low, high)``, in m.
+        This distance is the fifth state component.
+    :param camera_shift: Constant distance by which the camera is raised in all trials, in m. This distance is not part
+        of the state.
     :param mug_scale: Size of the mug, as a multiple of the size of the paper's mug (93 mm across, 81 mm high).
-    :param frame_offset: Distance of the cup's axis from the origin of the mug's frame, away from the handle, in m.
+    :param frame_offset: Distance from the origin of the mug's frame to the cup's axis, in m. Positive values are away
+        from the handle.
     :param friction: Friction coefficient of the mug and of the fingers. (Bullet multiplies the coefficients of two
         bodies that touch.)
-    :param motion: ``"fast"``, or ``"reference"``, the paper's slow motion.
+    :param motion: ``"fast"``, or ``"reference"`` for the paper's slow motion.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch. This number does not change the results.
     :param render_mode: ``None``, ``"rgb_array"`` (the scene and the depth image) or ``"human"`` (PyBullet's window).
@@ -167,7 +174,7 @@ class PandaGraspEnv(SharedEnv):
         return self._with_noise(self._shared("images", self._seen(state)), self.np_random)
 
     def _seen(self, state: np.ndarray) -> np.ndarray:
-        """Return the states for the depth camera: the mug's pose and, if the camera is raised, its height."""
+        """Return the states for the depth camera: the mug's pose and, if the camera is raised, by which distance."""
         if self.camera_shift == 0:
             return state
         raised = state[:, 4:] if self.camera_range is not None else np.zeros((len(state), 1))
@@ -190,9 +197,10 @@ class PandaGraspEnv(SharedEnv):
         """
         Show the scene before or after the grasp.
 
-        ``"rgb_array"``: return the scene beside the depth image, ``(256, 644, 3)`` uint8, in which near points are
-        bright. See also :meth:`film`. ``"human"``: show the scene in PyBullet's window, and the grasp in real time. The
-        sensor noise in the picture is a new sample, so that rendering does not change an episode.
+        ``"rgb_array"``: return the scene and the depth image side by side, ``(256, 644, 3)`` uint8. Near points of the
+        depth image are bright. For a video, see :meth:`film`. ``"human"``: show the scene in PyBullet's window, and the
+        grasp in real time. The sensor noise in the picture comes from a separate generator, so that rendering does not
+        change an episode.
         """
         if self.render_mode is None:
             return None
@@ -207,7 +215,7 @@ class PandaGraspEnv(SharedEnv):
 
     def film(self) -> Iterator[np.ndarray]:
         """
-        Yield the frames of the last grasp, at 30 frames per second, beside the depth image from before the grasp.
+        Yield the frames of the last grasp, at 30 frames per second, beside the depth image before the grasp.
 
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """

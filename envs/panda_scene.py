@@ -1,8 +1,8 @@
 """
-The grasping scene as data, which the simulation and all pictures use.
+Define the grasping scene as data, for the simulation and all pictures.
 
-Coordinates: the robot is at the origin and looks along +x. y points to its left and z upward. The table's top is at
-z = 0. Lengths are in metres, angles in radians.
+Coordinates: the robot is at the origin and looks along +x. The y axis points to the robot's left, z upward. The table's
+top is at z = 0. Lengths are in metres, angles in radians.
 """
 
 import os
@@ -44,10 +44,10 @@ CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame; it is sl
 @dataclass(frozen=True)
 class PandaScene:
     """
-    The mug: its size, its frame and its friction.
+    The size, the frame and the friction of the mug.
 
-    The z axis of the cup's frame is the cup's axis, and the handle points along +y. The pose of the mug's frame is the
-    state; its origin is beside the cup's axis.
+    In the cup's frame, the z axis is the cup's axis, and the handle points along +y. The state of the environment is
+    the pose of another frame, the mug's frame, whose origin is beside the cup's axis.
 
     The parameters are those of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv`.
     """
@@ -73,17 +73,17 @@ class PandaScene:
 
     @property
     def cup_origin(self) -> np.ndarray:
-        """Origin of the cup's frame in the mug's, ``(3,)``."""
+        """Origin of the cup's frame in the mug's frame, ``(3,)``."""
         return np.array([0.0, -self.frame_offset, 0.0])
 
     @property
     def centre_of_mass(self) -> np.ndarray:
-        """Centre of mass in the mug's frame, ``(3,)``: the base position for Bullet."""
+        """Centre of mass in the mug's frame, ``(3,)``, which Bullet uses as base position."""
         return self.cup_origin + self.mug_scale * CENTRE_OF_MASS
 
     def collision_shapes(self) -> list[dict[str, Any]]:
         """
-        Build the mug from a disc, twelve staves around it and three bars for the handle, in the cup's frame.
+        Return the mug's shapes in the cup's frame: a disc, twelve staves around it and three bars for the handle.
 
         Bullet would replace a moving mesh by its convex hull, and the hull of a cup is not hollow.
         """
@@ -105,7 +105,7 @@ class PandaScene:
 
 
 def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
-    """Add the mug's visual mesh; return its body's id. Its base position is the position of the mug's frame."""
+    """Add the mug's visual mesh; return the id of a body whose base position is the origin of the mug's frame."""
     shape = client.createVisualShape(
         client.GEOM_MESH,
         fileName=MUG_FILE,
@@ -118,7 +118,7 @@ def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
 
 
 def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
-    """Add the mug's collision shapes; return its body's id. Its base position is the mug's centre of mass."""
+    """Add the mug's collision shapes; return the id of a body whose base position is the mug's centre of mass."""
     shapes = scene.collision_shapes()
     body = client.createCollisionShapeArray(
         [client.GEOM_BOX if "half_extents" in shape else client.GEOM_CYLINDER for shape in shapes],

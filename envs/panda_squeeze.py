@@ -1,4 +1,4 @@
-"""SqueezeInsert-v0 with a simulated arm: a Franka Panda in PyBullet squeezes a part and presses it into a slot."""
+"""Simulate SqueezeInsert-v0 with an arm: a Franka Panda in PyBullet squeezes a part and presses it into a slot."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -22,27 +22,33 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
     r"""
     Squeeze a part with the arm until its orientation is known, then press it into a slot that is only slightly wider.
 
-    State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv`, so that a
-    policy for one environment can act in the other. Here PyBullet simulates the squeezes. In each control the hand
-    moves down over the part with open jaws at the yaw ``u`` (modulo pi), closes the jaws, opens them and moves up.
+    State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv`. So a
+    policy for one environment can act in the other. Here PyBullet simulates the squeezes. In each step, the open jaws
+    move down over the part at the yaw ``u`` (modulo pi), close, open and move up.
 
-    Before each squeeze the hand is centred on the part, up to a random ``centring_error``. Only the position of the
-    part relative to the hand matters. So every squeeze is simulated at the same place on the table, and the yaw alone
-    is the state. After the last squeeze the part is put on the mouth of the slot with the yaw that it has, and the
-    closed jaws press on it. The cost depends on the yaw before this insertion, not on whether the part enters the slot.
+    Before each squeeze, the hand is centred on the part with a random error of up to ``centring_error``. Only the
+    position of the part relative to the hand matters. So every squeeze is simulated at the same place on the table, and
+    the yaw alone is the state. After the last squeeze, the part is placed on the mouth of the slot at its present yaw,
+    and the closed jaws press on it. The cost depends on the yaw before this insertion, not on whether the part enters
+    the slot.
 
-    After a step, ``info`` has ``offset`` (of the part from the middle of the hand, ``(2,)`` in m) and ``tilt`` (of the
-    part's vertical axis, in rad). After the last step it also has ``success`` (whether the part entered the slot;
-    ``is_success`` for SB3) and ``height`` (of the part's lower side above the table, in m).
+    After a step, ``info`` has these entries, the last two only after the last step:
 
-    A step depends only on the state, the action and the centring error, not on earlier steps or on the process.
+    - ``offset``: the vector from the middle of the hand to the part, ``(2,)`` in m
+    - ``tilt``: the angle between the part's vertical axis and the vertical, in rad
+    - ``success``, and ``is_success`` for SB3: whether the part entered the slot
+    - ``height``: the height of the part's lower side above the table, in m
+
+    A step depends only on the state, the action and the centring error, not on earlier steps or on the process that
+    simulates it.
 
     :param friction: Friction coefficient between part and jaws, and between part and slot.
-    :param centring_error: The part lies uniformly within this distance of the middle of the hand, along x and along y,
-        in m.
-    :param tolerance: Angle in rad between part and slot that the slot tolerates. This angle determines the width of
-        the chamfer. (Below 0.01 rad the slot tolerates larger angles than this, because of its clearance.)
-    :param sensor_noise_std: Standard deviation of the noise on each of the two components of the yaw.
+    :param centring_error: Largest offset of the part from the middle of the hand along x and along y, in m. The offset
+        is drawn uniformly.
+    :param tolerance: Largest angle between part and slot that the slot tolerates, in rad. It determines the width of
+        the chamfer. (With a ``tolerance`` below 0.01 rad, the slot tolerates larger angles, because of its clearance.)
+    :param sensor_noise_std: Standard deviation of the noise on each of the two observed components, sine and cosine of
+        twice the yaw.
     :param horizon: Number of squeezes T.
     :param n_processes: Number of processes that share a batch. This number does not change the results.
     :param render_mode: ``None`` or ``"rgb_array"``.

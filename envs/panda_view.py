@@ -1,4 +1,4 @@
-"""Draw the scenes of the arm from the side, for pictures, videos and PyBullet's window (no observations)."""
+"""Draw side views of the arm's scenes for pictures, videos and PyBullet's window, not for observations."""
 
 import os
 from collections.abc import Callable
@@ -16,18 +16,18 @@ LIGHT = (1.0, 1.2, 2.5)  # direction
 SHADOW_COLOR = (0.45, 0.36, 0.28, 1.0)
 FLOOR_FILE = os.path.join(ASSETS, "plane.urdf")
 FLOOR_HEIGHT = -0.625  # m
-NEAREST, FURTHEST = 0.30, 0.61  # m, white and black in the picture of the depth
+NEAREST, FURTHEST = 0.30, 0.61  # m, the depths that depth_picture() shows as white and as black
 
 
 class ArmView(BulletWorld):
     """
-    Draw floor, table and robot, which are in their own Bullet world without physics.
+    Draw floor, table and robot in a separate Bullet world without physics.
 
     :param load_robot: Function that loads the robot into the world and returns the id of its body.
     """
 
-    # The camera: its target in m; its distance from the target in m, with yaw and pitch in degrees; the smallest depth
-    # that is drawn, in m.
+    # The camera's target in m (middle); its distance from the target in m, its yaw and its pitch in degrees
+    # (viewpoint); and the smallest depth that is drawn, in m (near).
     middle: tuple[float, float, float]
     viewpoint: tuple[float, float, float]
     near = 0.1
@@ -80,7 +80,7 @@ class PandaView(ArmView):
         client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
 
     def picture(self, depth: np.ndarray) -> np.ndarray:
-        """Draw the scene beside a depth image, ``(1, 128, 128)`` in m: ``(256, 644, 3)`` uint8."""
+        """Draw scene and depth image, ``(1, 128, 128)`` in m, side by side in one picture, ``(256, 644, 3)`` uint8."""
         return beside(self.scene_picture(HEIGHT, WIDTH), depth_picture(depth))
 
 
@@ -104,6 +104,6 @@ class SqueezeView(ArmView):
 
 
 def depth_picture(depth: np.ndarray) -> np.ndarray:
-    """Convert a depth image, ``(1, H, W)`` in m, to a grey image, ``(H, W, 3)`` uint8, with bright near points."""
+    """Convert a depth image, ``(1, H, W)`` in m, to a grey image, ``(H, W, 3)`` uint8. Near points are bright."""
     brightness = np.clip((FURTHEST - depth[0]) / (FURTHEST - NEAREST), 0.0, 1.0)
     return np.rint(255 * brightness).astype(np.uint8)[..., None].repeat(3, axis=2)

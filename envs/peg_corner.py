@@ -16,24 +16,25 @@ HOLE = np.array([1.2, 1.2])  # cm
 
 class PegCornerEnv(POMDPEnv):
     r"""
-    Slide a peg on a fenced table over a hole near one corner.
+    Slide a peg on a fenced table until it is over a hole near one corner.
 
-    State ``x = (x, y)``: position of the peg on a table of 6 cm by 6 cm. It starts uniformly in [2, 6]^2 cm. Action
-    ``u``: at most ``max_action`` in each direction; the displacement is ``actuator_gain`` times the action. The fence
-    stops the peg. If a displacement would cross one side by a distance ``b``, friction subtracts :math:`\mu b` from the
-    component along that side. With :math:`d_t = \lVert x_t - g \rVert`, ``g = (1.2, 1.2)`` cm, and T = 4 controls,
+    State ``x = (x, y)``: position of the peg on a table of 6 cm by 6 cm. The peg starts uniformly in [2, 6]^2 cm.
+    Action ``u``: at most ``max_action`` in each direction. The peg moves by ``actuator_gain`` times the action. The
+    fence stops the peg. If a displacement would cross one side of the fence by a distance ``b``, friction subtracts
+    :math:`\mu b` from the component of the displacement along that side. With :math:`d_t = \lVert x_t - g \rVert`,
+    ``g = (1.2, 1.2)`` cm, and T = 4 controls, the costs are
 
     .. math::
         c_t = d_t, \qquad c_T = 30 \max(0, d_T - \text{tolerance}).
 
-    A policy that uses the sensor can move the peg straight to the hole. An open-loop policy can push the peg into the
-    corner with three moves from any start, and move it to the hole with the fourth.
+    A policy that uses the sensor can move the peg straight to the hole. From any start, an open-loop policy can push
+    the peg into the corner with three moves, and move it to the hole with the fourth.
 
     :param friction: Friction coefficient :math:`\mu` of the fence.
     :param tolerance: Distance from the hole up to which the terminal cost is zero, in cm.
     :param sensor_noise_std: Standard deviation of the sensor noise in cm.
     :param max_action: Bound of the action in each direction, in cm.
-    :param actuator_gain: The displacement is this factor times the action.
+    :param actuator_gain: Ratio of the peg's displacement to the action.
     :param horizon: Number of controls T.
     :param render_mode: ``None`` or ``"rgb_array"``.
     :raises ValueError: if a keyword is out of its range.

@@ -22,13 +22,13 @@ SHARES = 8  # number of parts of a batch per process; small parts let all proces
 
 class WorkPool:
     """
-    Share a batch among several processes with one worker each; the results are bit for bit those of one process.
+    Share a batch among several processes, each with its own worker object.
 
-    The processes ignore Ctrl-C and end when this process ends. If one of them dies, the next call raises
-    :class:`concurrent.futures.process.BrokenProcessPool`.
+    The results equal those of one process bit for bit. The processes ignore Ctrl-C and end when this process ends. If
+    one of them dies, the next call raises :class:`concurrent.futures.process.BrokenProcessPool`.
 
     :param n_processes: Number of processes.
-    :param make_worker: Class or function that makes a worker. Each process calls it once.
+    :param make_worker: Class or function that makes a worker. Each process calls this class or function once.
     :param arguments: Arguments of ``make_worker``.
     """
 
@@ -42,7 +42,7 @@ class WorkPool:
         )
 
     def call(self, method: str, *arrays: np.ndarray) -> Any:
-        """Call a method of the workers with parts of the arrays, ``(N, ...)``, and join the results."""
+        """Split the arrays, ``(N, ...)``, call a method of the workers with each part, and join the results."""
         n_parts = min(len(arrays[0]), SHARES * self._n_processes)
         parts = [np.array_split(array, n_parts) for array in arrays]
         with warnings.catch_warnings():
@@ -57,7 +57,7 @@ class WorkPool:
 
 
 class SharedEnv(POMDPEnv):
-    """Base class of environments that compute a batch with objects, such as Bullet worlds, in one or more processes."""
+    """Base class of environments that can use several processes, each with its own object, such as a Bullet world."""
 
     shares_work = True
     resources = frozenset({"_world", "_pool", "_view"})
@@ -80,7 +80,7 @@ class SharedEnv(POMDPEnv):
         return WorkPool(self.n_processes, *self._make_world())
 
     def _shared(self, method: str, *arrays: np.ndarray, **here: Any) -> Any:
-        """Call a method with arrays of N episodes in the pool, or in this process with the keywords ``here``."""
+        """Call a method with arrays of N episodes: in the pool, or in this process and with the keywords ``here``."""
         self.check_open()
         if self.n_processes > 1 and len(arrays[0]) > 1:
             return self._pool.call(method, *arrays)

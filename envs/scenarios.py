@@ -1,4 +1,4 @@
-"""The training and test variants of the paper as data: each row of a table is a :class:`Scenario`."""
+"""Define the training and test variants of the paper as data: each row of a table is a :class:`Scenario`."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ class Scenario:
     :param name: Title of the row.
     :param env_id: A registered Gymnasium id.
     :param env_kwargs: Keywords of the environment's constructor.
-    :param paper: The paper's numbers by method ("PG", "TDPG").
+    :param paper: The paper's numbers for each method ("PG", "TDPG").
     :param sensor: A wrapper of an SB3 ``VecEnv`` that changes the observations.
-    :param n_episodes: Number of episodes for this row; default: the number for the table.
+    :param n_episodes: Number of episodes for this row. ``None`` means the number for the whole table.
     """
 
     name: str
@@ -151,7 +151,8 @@ PANDA_SQUEEZE: Mapping[str, Any] = MappingProxyType(dict(turn=(0.995, 0.999), ba
 Keywords of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv` that fit the squeezes of
 :class:`~sb3_tdpg.envs.panda_squeeze.PandaSqueezeEnv`, by :func:`~sb3_tdpg.envs.squeeze_fit.fit_squeeze` with 720
 squeezes. For the parts that turn, the model's error has a root mean square of 0.2 degrees and is at most 0.7 degrees.
-The model neglects that friction holds the part at 6 % of the yaws, between 62.6 and 67.4 degrees from the jaws.
+In 6 % of the squeezes, at angles between 62.6 and 67.4 degrees to the jaws, friction keeps the part from turning. The
+model neglects this.
 """
 
 PAPER_ROWS: Mapping[str, Sequence[Scenario]] = MappingProxyType(

@@ -39,7 +39,7 @@ GEAR_FORCE = 100.0  # N, force of the gear that couples the fingers
 JAW_ABOVE_TABLE = 0.002  # m, height of the jaws during the squeeze
 HOVER = 0.045  # m, lift above the pose of the squeeze, so that the jaws are above the part
 ABOVE_SLOT = 0.002  # m, gap between the part on the slot and the jaws before the insertion
-PRESS_FORCE = 20.0  # N, at which the insertion ends: more force would turn a part that does not fit until it fits
+PRESS_FORCE = 20.0  # N: the insertion ends at this force, because more would turn a misaligned part until it fits
 INSERTED = 0.003  # m: an inserted part is below this height
 SLOWEST = 0.02  # rad/s, lowest speed of a joint
 
@@ -72,7 +72,7 @@ class Inserted(NamedTuple):
 
 class SqueezeSimulation(ArmSimulation):
     """
-    Simulate squeezes: robot, table, part and slot in their own Bullet world, in which the robot has no visual shapes.
+    Simulate squeezes with robot, table, part and slot in a separate Bullet world. The robot has no visual shapes.
 
     Every squeeze sets all positions and velocities, so that its outcome depends only on its arguments.
     """
@@ -117,7 +117,7 @@ class SqueezeSimulation(ArmSimulation):
 
     def _turned(self, yaw: float) -> tuple[Joints, Joints]:
         """
-        Return the joint angles for a yaw of the jaws, at the squeeze and above it.
+        Return the joint angles for a yaw of the jaws: for the pose of the squeeze, and for the pose above it.
 
         The hand's axis is vertical, so that only the last joint turns the hand. Half a turn does not change the jaws.
         """
@@ -150,7 +150,7 @@ class SqueezeSimulation(ArmSimulation):
 
     def insert(self, yaw: float, watch: Watch | None = None) -> Inserted:
         """
-        Press a part, which lies on the mouth of the slot, into the slot with the closed jaws.
+        Press a part from the mouth of the slot into the slot, with closed jaws.
 
         :param yaw: Angle between part and slot, in rad.
         :param watch: As in :meth:`squeeze`.
@@ -175,7 +175,7 @@ class SqueezeSimulation(ArmSimulation):
         return [self.insert(yaw, watch) for yaw in yaws.tolist()]
 
     def at_rest(self, yaw: float) -> Configuration:
-        """Return the scene before the first squeeze."""
+        """Return the configuration before the first squeeze, given the yaw of the part in rad."""
         upright = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
         return Configuration((*self._high, FINGER_OPEN, FINGER_OPEN), (*WORK_PLACE, PART[2] / 2), upright)
 
@@ -186,7 +186,7 @@ class SqueezeSimulation(ArmSimulation):
         return [max(phase.arm_speed * way / longest, SLOWEST) for way in ways]
 
     def _put_part(self, position: tuple[float, ...], yaw: float) -> None:
-        """Put the part at a position. After this call, the arm must be put at a position, too."""
+        """Put the part at a position. After this call, the caller must put the arm at a position."""
         self._clear_contacts()
         self._put_body(position, yaw)
 

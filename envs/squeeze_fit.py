@@ -12,7 +12,7 @@ import numpy as np
 from .panda_squeeze import PandaSqueezeEnv
 from .squeeze_insert import RIGHT_ANGLE, wrap
 
-NEAR = math.radians(3.0)  # a part within this angle of the jaws, or of lying across them, has been turned
+NEAR = math.radians(3.0)  # a part that ends within this angle of the jaws, or of lying across them, has been turned
 FAR = math.radians(20.0)  # a part that starts within this angle of its final yaw says little about `turn`
 
 
@@ -23,7 +23,7 @@ class SqueezeFit(NamedTuple):
     basin: float  # middle of the gap between aligned_up_to and across_from
     aligned_up_to: float  # largest angle between part and jaws at which the part turned towards the jaws
     across_from: float  # smallest angle between part and jaws at which the part turned across the jaws
-    stuck: float  # fraction of the parts that a squeeze turned neither way
+    stuck: float  # fraction of the parts that turned neither towards the jaws nor across them
     residual: float  # root mean square error of the model with the mean turn, without the stuck parts
     worst: float  # largest error of this model, without the stuck parts
 
@@ -33,8 +33,8 @@ def fit_squeeze(env: PandaSqueezeEnv, n: int = 720, seed: int = 0) -> SqueezeFit
     Squeeze parts in PyBullet, and fit ``turn`` and ``basin``.
 
     :param env: The environment whose squeezes are to be fitted.
-    :param n: Number of squeezes. The angles between part and jaws form a grid in (-pi/2, pi/2); the yaws of the jaws
-        are uniform.
+    :param n: Number of squeezes. The angles between part and jaws form a grid in (-pi/2, pi/2). The yaws of the jaws
+        are drawn uniformly.
     :param seed: Seed of the yaws of the jaws and of the centring errors.
     """
     env.reset(seed=seed)
@@ -52,7 +52,7 @@ def fit_angles(away: np.ndarray, left: np.ndarray) -> SqueezeFit:
 
     :param away: Angles before a squeeze, ``(N,)`` in rad.
     :param left: Angles after the squeeze, ``(N,)`` in rad.
-    :raises ValueError: if no part turned towards the jaws, or none across them.
+    :raises ValueError: if no part turned towards the jaws, or no part turned across them.
     """
     is_aligned, is_across = np.abs(left) < NEAR, np.abs(left) > RIGHT_ANGLE - NEAR
     if not (is_aligned.any() and is_across.any()):
@@ -78,7 +78,7 @@ def fit_angles(away: np.ndarray, left: np.ndarray) -> SqueezeFit:
 
 
 def main() -> None:
-    """Print the fit to the default PandaSqueeze-v0."""
+    """Fit the default PandaSqueeze-v0, and print the result."""
     env = PandaSqueezeEnv()
     fit = fit_squeeze(env)
     env.close()

@@ -25,7 +25,7 @@ class SqueezeInsertEnv(POMDPEnv):
 
     The part lies on a table with an unknown yaw :math:`\theta`. The action is the yaw ``u`` at which a parallel gripper
     closes. A part whose angle to the fingers is below ``basin`` turns towards the fingers; any other part turns until
-    it lies across them. With :math:`r = \theta_t - u_t`, wrapped to a half turn,
+    it lies across them. With :math:`r = \theta_t - u_t`, wrapped to :math:`[-\pi/2, \pi/2)`, a squeeze results in
 
     .. math::
         \theta_{t+1} = \theta_t + \alpha_t (r^* - r), \qquad
@@ -34,19 +34,20 @@ class SqueezeInsertEnv(POMDPEnv):
 
     Let :math:`e_t` be the angle between the part and the slot in rad. Each step costs :math:`c_t = 5 |e_t|`, and the
     insertion at the end costs :math:`c_T = 100 \max(0, |e_T| - \text{tolerance})`. A policy that uses the sensor can
-    turn the part directly. An open-loop policy can squeeze every part at the same angles: first at about 25 degrees to
-    the slot, after which nearly all parts are within ``basin`` of the slot, and then almost along the slot.
+    turn the part directly. An open-loop policy can squeeze every part at the same angles. The first squeeze is at about
+    25 degrees to the slot; after it, nearly all parts are within ``basin`` of the slot. The next squeezes are almost
+    along the slot.
 
-    The state is ``(sin 2 theta, cos 2 theta)``, and with a cue also the kind of the part, -1 or 1. The observation is
-    the state with noise on the first two components.
+    The state is ``(sin 2 theta, cos 2 theta)``. With a cue, a third component is the kind of the part, -1 or 1. The
+    observation is the state with noise on the first two components.
 
-    :param cue: Whether the kind of the part decides how it must lie: along the slot (1) or across it (-1). Without a
-        cue every part must lie along the slot.
+    :param cue: Whether the kind of the part decides how the part must lie: along the slot (1) or across it (-1).
+        Without a cue every part must lie along the slot.
     :param turn: ``(low, high)``: range of :math:`\alpha_t`, the fraction of the way to :math:`r^*` that a squeeze turns
         the part. The fraction is drawn uniformly for each squeeze.
     :param basin: The largest angle between part and fingers, in rad, at which the part turns towards the fingers.
-    :param tolerance: Angle in rad between part and slot up to which the insertion costs nothing.
-    :param sensor_noise_std: Standard deviation of the noise on each of the two components of the yaw.
+    :param tolerance: Largest angle between part and slot, in rad, at which the insertion costs nothing.
+    :param sensor_noise_std: Standard deviation of the noise on ``sin 2 theta`` and on ``cos 2 theta``.
     :param horizon: Number of squeezes T.
     :param render_mode: ``None`` or ``"rgb_array"``.
     :raises ValueError: if a keyword is out of its range.

@@ -1,5 +1,5 @@
 """
-The squeezing scene as data, which the simulation and the pictures use: a part, two jaws and a slot.
+Define the squeezing scene as data, for the simulation and the pictures: a part, two jaws and a slot.
 
 Coordinates are as in :mod:`.panda_scene`: the robot is at the origin and looks along +x. The table's top is at z = 0.
 Lengths are in metres, angles in radians.
@@ -43,7 +43,7 @@ SLOT_COLOR = (0.42, 0.44, 0.48, 1.0)
 @dataclass(frozen=True)
 class SqueezeScene:
     """
-    The part, the jaws and the slot, which lies along x.
+    The part, the jaws and the slot. The slot lies along x.
 
     The parameters are those of :class:`~sb3_tdpg.envs.panda_squeeze.PandaSqueezeEnv`.
     """
@@ -63,7 +63,7 @@ class SqueezeScene:
         return max(reach - width / 2 - SLOT_CLEARANCE, 0.0)
 
     def slot_boxes(self) -> list[dict[str, Any]]:
-        """Return boxes for wall, rim and chamfer of each side of the slot; in their frame, x is along the slot."""
+        """Return the boxes of wall, rim and chamfer on each side of the slot, in a frame with x along the slot."""
         boxes: list[dict[str, Any]] = []
         half = np.array(PART[:2]) / 2 + SLOT_CLEARANCE
         chamfer, height = self.chamfer, SLOT_HEIGHT
@@ -121,7 +121,7 @@ def load_robot(client: BulletClient, *, flags: int = 0) -> int:
 
 
 def add_part(client: BulletClient) -> int:
-    """Add the part, with a visual shape; return its body's id. Its base position is the middle of the part."""
+    """Add the part, with a visual shape; return the id of a body whose base position is the part's middle."""
     half = [size / 2 for size in PART]
     body = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
     picture = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=PART_COLOR)

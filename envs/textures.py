@@ -1,5 +1,5 @@
 """
-The wall textures of the ball-catching problem: procedural textures and image files.
+Draw the procedural wall textures of the ball-catching problem, and load textures from image files.
 
 Dimension key: S texels per side of a procedural texture; H rows and W columns of any texture. A texture is an array
 ``(H, W, 3)`` uint8 as in an image file. One copy covers 8 m x 8 m of the wall. PyBullet's plane rotates the texture: on
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-SIZE = 128  # S: a texel covers 6.25 cm of the wall, about a fifth of a camera pixel at the far end
+SIZE = 128  # S: a texel covers 6.25 cm of the wall; seen from 10 m away, a camera pixel covers five times that
 
 Pattern = Callable[[np.random.Generator], np.ndarray]  # draws a tileable picture (S, S), values in [0, 1]
 
@@ -82,7 +82,7 @@ def blobs(rng: np.random.Generator) -> np.ndarray:
 
 
 def waves(rng: np.random.Generator) -> np.ndarray:
-    """Draw horizontal bands that smooth noise bends, as in marble."""
+    """Draw horizontal bands that are bent by smooth noise, as in marble."""
     return 0.5 + 0.5 * np.sin(2 * np.pi * (int(rng.integers(3, 6)) * ROWS + 1.2 * _noise(rng, 2.0)))
 
 
@@ -97,7 +97,7 @@ Colour = tuple[float, float, float]  # hue, saturation, value, each in [0, 1]
 
 
 def _paint(pattern: Pattern, seed: int, dark: Colour, light: Colour) -> np.ndarray:
-    """Blend two colours by a pattern, add a little grain, and rotate the picture for the wall."""
+    """Blend two colours by a pattern, add weak noise, and rotate the picture for the wall."""
     rng = np.random.default_rng(seed)
     ends = np.array([colorsys.hsv_to_rgb(*dark), colorsys.hsv_to_rgb(*light)])
     amount = pattern(rng)[..., None]  # (S, S, 1)
@@ -153,9 +153,9 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
     Load a texture from a name, a path or an array.
 
     :param texture: A built-in name (``"brick"`` or one of ``TEST_TEXTURES``), ``"random-<seed>"`` for
-        :func:`random_texture`, ``"<percent>%-<name>"`` for one of these textures over the brick with this opacity
-        (``"40%-violet_dots"``), the path of an image file, or an array ``(H, W, 3)`` uint8.
-    :return: ``(H, W, 3)`` uint8
+        :func:`random_texture`, the path of an image file, or an array ``(H, W, 3)`` uint8. ``"<percent>%-<name>"``
+        draws a built-in or random texture over the brick with this opacity, as in ``"40%-violet_dots"``.
+    :return: The texture, ``(H, W, 3)`` uint8.
     :raises FileNotFoundError: if there is no such file.
     :raises ValueError: if a name is unknown, or if a file or an array is not an image.
     """
