@@ -1,7 +1,7 @@
 """
 Apply perturbations to the episodes of N environments.
 
-Dimension key: N environments, n of these at a time.
+Dimension key: N environments, n of them in one call.
 """
 
 import zlib
@@ -16,7 +16,7 @@ from sb3_tdpg.robustness.registry import KEEP, NOTHING, Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
 CHUNK = 64  # number of images perturbed at once, to limit the memory
-_DOMAIN = 0x50E7  # any constant: a perturbation must not draw what the environment with the same seed draws
+_DOMAIN = 0x50E7  # any constant: perturbation and environment must draw different numbers from the same seed
 
 Observations = Any
 """An array ``(n, *obs)``, or a dict of such arrays."""
@@ -37,13 +37,14 @@ def put(observations: Observations, which: Any, new: Observations) -> None:
 
 class Members:
     """
-    Hold one member of a family of perturbations for each of N episodes. This base class changes nothing.
+    Perturb each of N episodes by one *member* of a family of perturbations. This base class changes nothing.
 
     The members have their own random generator, so the random numbers of the environment do not change. A subclass
-    draws the values that an episode keeps, and calls :meth:`begin` at the end of its constructor.
+    draws the values that stay constant in an episode, and calls :meth:`begin` at the end of its constructor.
 
-    :param names: Part of the seed, so that nested perturbations and parts do not draw the same numbers.
-    :param seed: Seed of the generator; ``None``: random, until :meth:`reseed`.
+    :param names: Names that enter the seed, so that nested perturbations and the parts of a ``Dict`` draw different
+        numbers.
+    :param seed: Seed of the generator. With ``None``, the seed is random until a call of :meth:`reseed`.
     :param children: Members that are reseeded, and begin episodes, together with this object.
     """
 
@@ -64,7 +65,7 @@ class Members:
             child.reseed(env_seed)
 
     def begin(self, which: np.ndarray) -> None:
-        """Begin episodes in the environments ``which``, ``(n,)``, and draw the values that stay constant in them."""
+        """Begin episodes in the environments ``which``, ``(n,)``, and draw the values that each episode keeps."""
         for name, values in self._draw(len(which)).items():
             if len(which) == self.n:
                 self._episode[name] = values
@@ -74,7 +75,7 @@ class Members:
             child.begin(which)
 
     def repeat(self, n: int) -> "Members":
-        """Copy the member of a single episode to n episodes, before the first observation."""
+        """Copy the member of a single episode to n episodes; call this method before the first observation."""
         self._episode = {name: values.repeat(n, axis=0) for name, values in self._episode.items()}
         self.n, self.children = n, [child.repeat(n) for child in self.children]
         return self
@@ -85,9 +86,9 @@ class Members:
         """
         Perturb the next observations of some episodes, and return them as a new array.
 
-        :param observations: ``(n, *obs)``
-        :param which: indices of the episodes, ``(n,)``; default: all.
-        :param states: x_t, ``(n, X)``
+        :param observations: The observations of these episodes, ``(n, *obs)``.
+        :param which: Indices of the episodes, ``(n,)``. ``None`` means all.
+        :param states: The true states x_t, ``(n, X)``, if :attr:`uses_states`.
         """
         if which is None:  # no copies
             return self._show(observations, np.arange(self.n), states, self._episode)
@@ -107,7 +108,7 @@ class Members:
 
 
 class Perturber(Members):
-    """Apply a perturbation to batches of observations; it must apply to the sensor's space."""
+    """Apply a perturbation, which must be applicable to the sensor's space, to batches of observations."""
 
     def __init__(
         self,
@@ -150,11 +151,11 @@ class Perturber(Members):
         return perturbed
 
     def _in_time(self, observations: Observations, episode: Drawn) -> Observations:
-        """Replace the present observations by earlier ones, or by nothing."""
+        """Replace the present observations by earlier ones, or by blank ones."""
         t = episode["t"]
         source = self.perturbation.apply(t, self.value, episode, self._rng)
         of_all = source if source.ndim == 1 else np.zeros_like(t)
-        each, age = np.arange(len(t)), of_all.clip(0, t)  # the first observation is shown until then
+        each, age = np.arange(len(t)), of_all.clip(0, t)  # the oldest is the first observation
         result = {}
         for key, now in observations.items() if isinstance(observations, dict) else [("", observations)]:
             past, shown = episode[f"past {key}"], episode[f"shown {key}"]

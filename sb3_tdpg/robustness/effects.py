@@ -37,7 +37,7 @@ def noise_minmax(images: np.ndarray, std: float, episode: Episode, rng: np.rando
 
 
 def draw_signs(rng: np.random.Generator, n: int, value: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw a sign for each image, or each component of a vector, of each episode."""
+    """Draw for each episode one sign for all its images, or one sign for each component of its vectors."""
     return dict(sign=rng.choice([-1.0, 1.0], (n, *((1, 1, 1) if sensor.is_image else sensor.shape))))
 
 
@@ -55,7 +55,7 @@ def contrast(images: np.ndarray, factor: float, episode: Episode, rng: np.random
 
 
 def draw_turn(rng: np.random.Generator, n: int, degrees: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw the direction in which the colours of each episode turn about the axis of greys."""
+    """Draw for each episode the direction in which its colours rotate about the grey axis."""
     from scipy.spatial.transform import Rotation
 
     angle = np.deg2rad(degrees) * rng.choice([-1.0, 1.0], n)
@@ -67,7 +67,7 @@ def draw_turn(rng: np.random.Generator, n: int, degrees: float, sensor: Sensor) 
     "image", "angle, degrees", (20.0, 45.0, 80.0, 120.0, 180.0), draw=draw_turn, channels=(3,), on_depth=False
 )
 def hue(images: np.ndarray, degrees: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Turn the colours about the axis of greys, in one direction for an episode."""
+    """Rotate the colours about the grey axis, in the same direction for a whole episode."""
     return (episode["turn"] @ images.reshape(*images.shape[:2], -1)).reshape(images.shape)
 
 
@@ -106,12 +106,12 @@ def dropped_pixels(images: np.ndarray, share: float, episode: Episode, rng: np.r
 
 
 def evenly(number: np.ndarray, share: float, phase: np.ndarray) -> np.ndarray:
-    """Choose a share of the numbers 0, 1, ... at even distances; independent choices could miss short episodes."""
+    """Choose a share of the numbers 0, 1, ..., evenly spaced. Independent choices could leave out a short episode."""
     return np.floor(share * (number + 1) + phase) > np.floor(share * number + phase)
 
 
 def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw the phase at which each episode starts to count lost readings."""
+    """Draw the argument ``phase`` of :func:`evenly` for each episode."""
     return dict(phase=rng.random(n))
 
 
@@ -119,13 +119,13 @@ def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -
     "image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), draw=draw_phase, later_only=True, timing=True
 )
 def dropped_frames(t: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Show the last frame that arrived in place of lost ones."""
+    """Replace lost frames with the last frame that arrived."""
     return np.where((t > 0) & evenly(t - 1, share, episode["phase"]), KEEP, 0)
 
 
 @perturbation("image", "steps", (1, 2, 3, 4, 5), later_only=True, timing=True)
 def delay(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Show the observation of some steps ago, and the first observation until then."""
+    """Delay the observations by a number of steps; during these steps, show the first one."""
     return np.full_like(t, int(steps))
 
 
@@ -145,7 +145,7 @@ def _textures(channels: int, height: int, width: int) -> np.ndarray:
     draw=lambda rng, n, opacity, sensor: dict(texture=rng.integers(0, N_TEXTURES, n)),
 )  # fmt: skip
 def texture_overlay(images: np.ndarray, opacity: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Lay one of 16 textures half-transparently over all images of an episode."""
+    """Blend one of 16 textures into all images of an episode."""
     texture = _textures(*images.shape[1:])[episode["texture"]]
     return np.float32(1 - opacity) * images + np.float32(opacity) * texture
 
@@ -199,7 +199,7 @@ perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", later_only
 
 @perturbation("any", "probability", (0.1, 0.25, 0.4, 0.6, 0.8), later_only=True, timing=True)
 def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Repeat the last observation with this probability at each step."""
+    """At each step, repeat the last observation with the given probability."""
     return np.where((t > 0) & (rng.random(len(t)) < probability), KEEP, 0)
 
 
@@ -208,7 +208,7 @@ def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Gen
     draw=lambda rng, n, longest, sensor: dict(delay=rng.integers(1, int(longest) + 1, n), age=np.zeros(n, np.int64)),
 )  # fmt: skip
 def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Show the observation of some steps ago; each episode draws a delay, with a jitter of one step."""
+    """Delay the observations by a random number of steps per episode, with a jitter of one step."""
     due = (episode["delay"] + rng.integers(-1, 2, len(t))).clip(0, int(longest))
     age = episode["age"]
     age[:] = np.where(t == 0, 0, np.minimum(due, age + 1))  # an observation older than the last one is not shown
@@ -221,7 +221,7 @@ def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generato
     draw=lambda rng, n, steps, sensor: dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n)),
 )  # fmt: skip
 def blackout(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Show nothing (0, or a black image) for a burst of steps, once in an episode."""
+    """Once per episode, show 0 or a black image for several steps."""
     since = t - episode["start"]
     return np.where((since >= 0) & (since < steps), NOTHING, 0)
 
@@ -242,7 +242,7 @@ def freeze(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Genera
 
 
 def draw_group(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Draw one group of components to fail in each episode, and the first step at which each fails: ``(n, G)``."""
+    """Draw the group that fails in each episode, and return the step at which each group fails: ``(n, G)``."""
     which = rng.integers(len(sensor.groups), size=n)
     start = draw_start(rng, n, latest, sensor)["start"]
     never = np.iinfo(np.int64).max
@@ -251,7 +251,7 @@ def draw_group(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) 
 
 @perturbation("any", *LATEST, draw=draw_group, later_only=True, timing=True)
 def group_failure(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Show nothing of one group of components, from a random step on."""
+    """From a random step on, show one group of components as 0 or black."""
     return np.where(t[:, None] >= episode["start"], NOTHING, 0)
 
 

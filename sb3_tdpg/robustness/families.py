@@ -1,5 +1,5 @@
 """
-Declare families of perturbations; every episode has one member of the family.
+Declare families of perturbations. Each episode has one perturbation of the family, its *member*.
 
 Dimension key: N episodes side by side, n of them at a time, X state.
 """
@@ -28,22 +28,30 @@ class Family:
     """
     A declared family of perturbations; :meth:`members` draws a member for each episode.
 
-    A declaration is one of the following. With a dict or a list, each episode has one of the entries, at random. A
-    range of severities counts as one entry for each severity.
+    A declaration is one of the following:
 
     - a name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or a :class:`~sb3_tdpg.robustness.Perturbation`;
-    - a dict: names with a severity or a range ``(1, 3)`` of them; ``"images"`` with keywords of
-      :func:`~sb3_tdpg.robustness.training.images`; ``"noise_range"`` with those of
-      :func:`~sb3_tdpg.robustness.training.noise_range`; and ``"env_kwargs"`` with a list of keywords for other scenes
-      of the environment, whose sensors observe the same state (with ``"redraw"``: names of components of the state that
-      the scenes draw anew for each episode);
+    - a dict with the keys below;
     - a list of entries, each ``(name, value)`` with a value as in a dict, ``(name, value, factor)`` with a factor for
       the scale, or ``None`` for no perturbation;
-    - a function ``(observations (n, *obs), rng) -> changed observations``, called at each step.
+    - a function ``(observations (n, *obs), rng) -> changed observations``, which is called at each step.
+
+    A dict can have these keys:
+
+    - names of perturbations, each with a severity or a range of severities, such as ``(1, 3)``;
+    - ``"images"`` with keywords of :func:`~sb3_tdpg.robustness.training.images`;
+    - ``"noise_range"`` with keywords of :func:`~sb3_tdpg.robustness.training.noise_range`;
+    - ``"env_kwargs"`` with a list of keywords for other scenes of the environment. Their sensors observe the same
+      state;
+    - ``"redraw"`` in addition to ``"env_kwargs"``: a list of components of the state. The scenes draw these components
+      anew for each episode.
+
+    With a dict or a list, each episode has one of the entries at random. A range of severities counts as one entry for
+    each severity.
 
     :param declared: The declaration, see above.
-    :param env: The environment; it must be reset afterwards.
-    :param severity: Severity for a name without one; ``None``: each episode has a random one.
+    :param env: The environment. Reset it afterwards.
+    :param severity: Severity for a declaration that is only a name. With ``None``, each episode has a random severity.
     :param scale: See :class:`~sb3_tdpg.robustness.PerturbedVecEnv`.
     :raises ValueError: if a perturbation does not exist or does not apply.
     """
@@ -108,7 +116,7 @@ class Family:
         return default_scale(env.observation_space, env, self._given_scale)
 
     def _named(self, name: Any, value: Any, factor: float = 1.0) -> list[Callable[..., Members]]:
-        """Return a maker of a perturbation for each severity."""
+        """Return, for each severity, a function that makes the members of a perturbation."""
         env, horizon = self._env, horizon_of(self._env)
         if _has_keywords(name):
             try:
@@ -210,11 +218,11 @@ class FunctionMembers(Members):
 
 class SceneMembers(Members):
     """
-    Observe the same state in other scenes of an environment of this package.
+    Observe the same state in other scenes, for an environment of this package.
 
     :param scenes: Copies of the environment with other keywords.
-    :param redraw: Indices of the state's components that are drawn anew for each episode, from the initial states of
-        the scenes.
+    :param redraw: Indices of the state's components that are drawn anew for each episode, from the scenes'
+        distributions of the initial state.
     """
 
     uses_states = True
@@ -233,7 +241,7 @@ class SceneMembers(Members):
         return dict(number=number, redrawn=redrawn)
 
     def _by_scene(self, number: np.ndarray) -> list[tuple[POMDPEnv, np.ndarray]]:
-        """Group the indices of ``number`` by scene."""
+        """Return each scene with the indices of its episodes, given the number of the scene of each episode."""
         for each in self.scenes:
             each.np_random = self._rng
         return [(self.scenes[i], np.flatnonzero(number == i)) for i in np.unique(number)]

@@ -30,13 +30,13 @@ def perturbation_gallery(
     """
     Draw one image under each perturbation (rows) in each severity (columns), beside the unperturbed image.
 
-    The image comes from the first environment after 8 steps with the action 0 (moved into the bounds), or is the last
-    image of a shorter episode. Late and lost frames are then visible. For an id, the perturbations of its scene
-    (:func:`.scene_perturbations`) are drawn, too.
+    The image comes from the first environment after 8 steps with the action 0 (clipped to the bounds), so that late and
+    lost frames are visible. If the episode is shorter, its last image is drawn. If ``env`` is an id, the perturbations
+    of its scene (:func:`.scene_perturbations`) are drawn, too.
 
     :param env: An environment with images, or a registered id.
-    :param names: The rows; default: all perturbations of images that apply.
-    :param env_kwargs: Keywords for the environment's constructor, with an id.
+    :param names: Names of the perturbations to draw. By default, all perturbations of images that apply are drawn.
+    :param env_kwargs: Keywords for the environment's constructor, if ``env`` is an id.
     :param seed: Seed of the environment and the perturbations.
     :raises ValueError: if the observations are not images, a perturbation does not apply, or there is none to draw.
     """
@@ -71,7 +71,7 @@ def perturbation_gallery(
 
 
 def _look(env: VecEnv, seed: int) -> tuple[spaces.Space, int | None, list[np.ndarray]]:
-    """Return space and horizon, and the images of an episode of the first environment, up to the one that is drawn."""
+    """Return space, horizon and the images of the first environment's episode, up to the image to draw."""
     env.seed(seed)
     frames, horizon = [np.asarray(env.reset())[0]], horizon_of(env)
     actions = np.stack([Sensor(env.action_space).blank] * env.num_envs)

@@ -1,4 +1,4 @@
-"""Wrap TDPG's environment in the perturbations of its argument ``nuisance``."""
+"""Wrap TDPG's environment in the perturbations that the argument ``nuisance`` declares."""
 
 from typing import Any
 
@@ -16,15 +16,15 @@ OF_DEPTH = [None, ("noise", 1), ("dropped_pixels", (1, 2))]
 
 
 class NuisanceVecEnv(PerturbedVecEnv):
-    """The wrapper that TDPG adds to its environment and can remove again."""
+    """Perturb the environment of TDPG, which adds this wrapper itself and can remove it again."""
 
 
 def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
     """
     Wrap an environment in a declared nuisance, which replaces an earlier one.
 
-    :param declared: ``None``: no nuisance. ``"auto"``: see :func:`automatic`. Otherwise a declaration of a
-        :class:`~sb3_tdpg.robustness.families.Family`; a name alone stands for all its severities.
+    :param declared: ``None`` for no nuisance, ``"auto"`` for the nuisance that :func:`automatic` returns, or a
+        declaration of a :class:`~sb3_tdpg.robustness.families.Family`. A name alone stands for all its severities.
     :raises ValueError: if a perturbation does not exist or does not apply.
     """
     while isinstance(env, NuisanceVecEnv):
@@ -42,7 +42,7 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
 
 def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:
     """
-    Return the family of a declared nuisance of the sensor; with ``"auto"`` an episode keeps its changes.
+    Return the family of a declared nuisance of the sensor. With ``"auto"``, each episode keeps its changes.
 
     :raises ValueError: if there is no nuisance, or it changes the actions.
     """

@@ -1,5 +1,5 @@
 """
-A phase of training that makes the actions ignore a nuisance of the sensor.
+Add a phase to the training in which the policy learns to ignore a nuisance of the sensor.
 
 Dimension key: T horizon, N episodes, Z TRVs, U action.
 """
@@ -22,16 +22,16 @@ from sb3_tdpg.robustness.core import take
 from sb3_tdpg.robustness.families import Family
 from sb3_tdpg.robustness.nuisance import NuisanceVecEnv, held_family
 
-BATCH_STEPS = 400  # time steps of a gradient step, for instance 16 episodes of 25 steps
+BATCH_STEPS = 400  # time steps per gradient step, for instance 16 episodes of 25 steps
 
 
 def actions(policy: Any, batch: Any) -> list[Distribution]:
     """
-    Unroll a policy over episodes, or segments of them, with the recorded noise of the TRVs.
+    Return the action distributions of a policy in episodes or segments, given the recorded noise of the TRVs.
 
     :param policy: A :class:`~sb3_tdpg.TRVPolicy`.
     :param batch: An :class:`~sb3_tdpg.buffers.EpisodeBatch`.
-    :return: pi(. | x~_t), ``(T * N, ...)``; several for a ``MultiDiscrete`` space
+    :return: The distributions pi(. | x~_t), ``(T * N, ...)``: several for a ``MultiDiscrete`` space, otherwise one.
     """
     trvs, *_ = policy.rebuild_trvs(policy.episode_features(batch), batch)
     densities = policy.episode_action_density(trvs).distribution
@@ -39,7 +39,7 @@ def actions(policy: Any, batch: Any) -> list[Distribution]:
 
 
 def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.Tensor:
-    """Compute D[pi_p || pi_q], averaged over the steps that are alive, in nats per step."""
+    """Compute the KL divergence D[pi_p || pi_q], averaged over the time steps of the episodes, in nats per step."""
     parts = zip(p, q, strict=True)
     by_part = [kl_divergence(of_p, of_q).reshape(batch.alive.numel(), -1).sum(dim=1) for of_p, of_q in parts]
     return (batch.alive * th.stack(by_part).sum(dim=0).view_as(batch.alive)).sum() / batch.alive.sum()
@@ -47,10 +47,11 @@ def divergence(p: list[Distribution], q: list[Distribution], batch: Any) -> th.T
 
 class NuisancePhase(TDPGCallback):
     r"""
-    Make the actions ignore a nuisance, in a phase after each epoch of plain rollouts.
+    Train the policy to ignore a nuisance, in a phase after each epoch with unperturbed rollouts.
 
-    The *teacher* is the policy before the phase, on plain observations. The policy learns to act like the teacher on
-    perturbed observations, and to stay like the teacher on plain ones, with the same noise of the TRVs:
+    The *teacher* :math:`\bar\pi` is the policy before the phase, with unperturbed observations. In the phase, the
+    policy learns to act like the teacher on perturbed observations (superscript :math:`\omega`) and on unperturbed
+    observations (superscript 0). The noise of the TRVs is the same in all terms of the loss:
 
     .. math:: E_t\, D(\pi(\cdot | \tilde x_t^\omega) \| \bar\pi(\cdot | \tilde x_t^0))
         + D(\pi(\cdot | \tilde x_t^0) \| \bar\pi(\cdot | \tilde x_t^0)).
@@ -58,9 +59,9 @@ class NuisancePhase(TDPGCallback):
     Pass this callback to ``learn`` before a :class:`~sb3_tdpg.TrainingCheckpointCallback`. In a resumed training, the
     optimiser of the phase starts anew.
 
-    :param nuisance: ``"auto"``: random changes of images of bytes, which an episode keeps; otherwise a declaration of a
+    :param nuisance: ``"auto"`` for random changes of images of bytes, which each episode keeps, or a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`.
-    :param n_steps: Gradient steps of a phase.
+    :param n_steps: Number of gradient steps per phase.
     :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed or normalised
         (``VecNormalize``).
     """
@@ -107,7 +108,7 @@ class NuisancePhase(TDPGCallback):
         model.policy.set_training_mode(False)
 
     def perturbed(self, batch: Any) -> Any:
-        """Draw members for N episodes, and return the perturbed observations: ``(T, N, *obs)``."""
+        """Draw a member of the nuisance for each of N episodes; return the perturbed observations: ``(T, N, *obs)``."""
         members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
         states = batch.states.cpu().numpy()
         plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
@@ -115,7 +116,7 @@ class NuisancePhase(TDPGCallback):
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
     def _cut(self, batch: Any, observations: Any) -> Any:
-        """Replace the observations of whole episodes, and cut them into segments if the policy learns from segments."""
+        """Replace the observations of whole episodes; if the policy learns from segments, cut the episodes."""
         model: Any = self.tdpg
         batch = batch._replace(observations=observations)
         return batch if model.policy.time_varying else batch.segments(model.bptt_steps or len(batch.costs))
@@ -125,7 +126,8 @@ class NuisancePhase(TDPGCallback):
         Take the gradient steps of a phase.
 
         :param batch: The rollouts as whole episodes, since a member of the nuisance lasts for an episode.
-        :return: the divergence between the new policy's actions with and without fresh perturbations, in nats per step
+        :return: Divergence between the new policy's action distributions with and without newly drawn perturbations, in
+            nats per step.
         """
         policy, check_finite = self.tdpg.policy, self.tdpg._check_finite
         minibatches = self._minibatches(batch)
@@ -147,7 +149,7 @@ class NuisancePhase(TDPGCallback):
             return divergence(actions(policy, perturbed), actions(policy, plain), plain).item()
 
     def _minibatches(self, batch: Any) -> list[th.Tensor]:
-        """Draw the columns of each gradient step: about ``BATCH_STEPS`` steps, in as few passes as possible."""
+        """Draw the episodes of each gradient step, about ``BATCH_STEPS`` steps, with as few passes as possible."""
         n_columns = batch.alive.shape[1]
         size = min(n_columns, max(2, round(BATCH_STEPS * n_columns / batch.alive.sum().item())))
         n_passes = math.ceil(self.n_steps * size / n_columns)

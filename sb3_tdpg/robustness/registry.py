@@ -1,4 +1,4 @@
-"""The registries of perturbations, for the sensor and the actuators, and for the scene."""
+"""Register perturbations: those of sensor and actuators in one registry, those of the scene in another."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from sb3_tdpg.robustness.sensor import Sensor
 
 N_SEVERITIES = 5
 KINDS = ("image", "vector", "any", "action")
-KEEP, NOTHING = -1, -2  # instead of an age: the observation shown last, and no observation
+KEEP, NOTHING = -1, -2  # in place of an age: the observation shown last, and a blank observation
 
 Episode = Mapping[str, np.ndarray]  # the values drawn for the episodes of a batch, and their time
 Draw = Callable[[np.random.Generator, int, float, Sensor], dict[str, np.ndarray]]
@@ -33,22 +33,26 @@ class Perturbation:
     ``apply`` and ``draw`` work on n episodes and get the value of the severity.
     ``apply(observations, value, episode, rng)`` returns the perturbed batch as a new array, which may exceed the
     bounds. It gets images as ``(n, C, H, W)`` float32 in [0, 1], vectors as ``(n, D)`` float64 in multiples of their
-    scale, and actions without a scale. ``draw(rng, n, value, sensor)`` is called where an episode begins and returns
-    arrays with a leading dimension of n. ``apply`` finds them in ``episode``, beside the time ``episode["t"]``,
-    ``(n,)``, which is 0 at the first observation.
+    scale, and actions without a scale. ``draw(rng, n, value, sensor)`` is called when n episodes begin, and returns
+    arrays with a leading dimension of n. ``apply`` finds these arrays in ``episode``, together with the time
+    ``episode["t"]``, ``(n,)``, which is 0 at the first observation.
 
-    A perturbation of the *timing* gets ``episode["t"]`` in place of observations, and returns which observation is
-    shown, as ``(n,)`` integers: the age in steps (0: the present one; at most the value of the severity), ``KEEP`` for
-    the observation that was shown last, or ``NOTHING``. It can also return ``(n, G)`` integers, 0 or ``NOTHING`` for
-    each of ``sensor.groups``.
+    A perturbation of the *timing* gets ``episode["t"]`` in place of observations. It returns ``(n,)`` integers that
+    determine which observation is shown:
 
-    :param kind: ``"image"``, ``"vector"``, ``"any"`` (timing, for both and for ``Dict``) or ``"action"``.
+    - the age of an observation in steps, from 0 for the present one to the value of the severity;
+    - ``KEEP`` for the observation that was shown last;
+    - ``NOTHING`` for a blank observation.
+
+    The perturbation can also return ``(n, G)`` integers, 0 or ``NOTHING`` for each of the G groups ``sensor.groups``.
+
+    :param kind: ``"image"``, ``"vector"``, ``"any"`` (timing of images, vectors and ``Dict``) or ``"action"``.
     :param parameter: Name of the quantity whose values are the severities, with its unit.
     :param severities: Five values, from the mildest to the strongest.
     :param summary: The effect in a few words.
-    :param channels: Permitted numbers of image channels; ``None``: any.
-    :param on_depth: Whether it makes sense on depth images: floats of one channel.
-    :param later_only: Whether it leaves the first observation of an episode unchanged.
+    :param channels: Permitted numbers of image channels. ``None`` permits any number.
+    :param on_depth: Whether the perturbation makes sense on depth images, which have one channel of floats.
+    :param later_only: Whether the perturbation leaves the first observation of an episode unchanged.
     :param timing: Whether ``apply`` decides which observation is shown.
     :raises ValueError: if the kind is unknown, or there are not five severities.
     """
@@ -83,9 +87,10 @@ class Perturbation:
         """
         Return the reason why this perturbation does not apply, or ``None`` if it applies.
 
-        :param space: The observation space; in a ``Dict``, only the parts to which it applies are perturbed.
+        :param space: The observation space. In a ``Dict``, only the parts to which the perturbation applies are
+            perturbed.
         :param horizon: Largest number of steps of an episode, if there is a limit.
-        :param action_space: Needed by perturbations of the actions.
+        :param action_space: The action space, which only perturbations of the actions need.
         """
         if self.later_only and horizon == 1:
             return "it leaves the first observation of an episode unchanged, and with a horizon of 1 there is no other"
@@ -122,7 +127,7 @@ def register(perturbation: Perturbation) -> None:
 def perturbation(
     kind: str, parameter: str, severities: tuple[float, ...], *, name: str | None = None, **settings: Any
 ) -> Callable[[Apply], Apply]:
-    """Register a function as a :class:`Perturbation`; its docstring's first line is the summary."""
+    """Register a function as a :class:`Perturbation`. The first line of the function's docstring is the summary."""
 
     def add(apply: Apply) -> Apply:
         summary = (apply.__doc__ or "").strip().split("\n")[0].rstrip(".")
@@ -139,7 +144,7 @@ def find_applicable(
     horizon: int | None = None,
     action_space: spaces.Space | None = None,
 ) -> Perturbation:
-    """Return a perturbation, given itself or its name, if it applies; see :meth:`Perturbation.objection`."""
+    """Return a perturbation, given itself or its name; raise an error if it is unknown or does not apply."""
     if isinstance(perturbation, str) and perturbation not in PERTURBATIONS:
         raise ValueError(f"perturbation={perturbation!r} is unknown: use one of {list(PERTURBATIONS)}")
     found = PERTURBATIONS[perturbation] if isinstance(perturbation, str) else perturbation
@@ -154,7 +159,7 @@ def applicable(space: spaces.Space, horizon: int | None = None, action_space: sp
 
 
 def severity_table(kind: str | None = None) -> pd.DataFrame:
-    """Return a table of the perturbations of a kind, or of all, with parameter and severities (columns 1 to 5)."""
+    """Return a table of all perturbations, or those of one kind, with parameter and severities (columns 1 to 5)."""
     rows = {
         name: dict(kind=row.kind, parameter=row.parameter, **dict(zip("12345", row.severities)))  # noqa: B905
         for name, row in PERTURBATIONS.items()
@@ -165,7 +170,7 @@ def severity_table(kind: str | None = None) -> pd.DataFrame:
 
 Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each severity
 
-# The true state, and with it the task, must not change, so no row moves a mug.
+# The true state, and with it the task, must not change, so no entry moves a mug.
 SCENES: dict[str, dict[str, Severities]] = {
     "BallCatch-v0": {
         # A higher severity blends more of another texture into the training texture.
@@ -180,7 +185,7 @@ SCENES: dict[str, dict[str, Severities]] = {
         "camera_pose": tuple(dict(camera_shift=height) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
     },
 }
-"""Keywords by environment, perturbation and severity; add rows for your own environment."""
+"""Keywords by environment, perturbation and severity. Add entries for your own environment."""
 
 
 def scene_perturbations(env_id: str) -> dict[str, Severities]:

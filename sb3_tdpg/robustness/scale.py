@@ -27,13 +27,14 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> Any:
     """
     Measure the standard deviation of each observation component, over time and episodes, in a short rollout.
 
-    The rollout lasts until every environment has ended an episode and 500 observations have been seen, but at most 200
-    steps. The environments must be reset afterwards. Their random generators, and a seed that waits for the first
-    reset, are restored, so the next episodes are the same as without the rollout.
+    The rollout lasts until every environment has ended an episode and all environments together have returned 500
+    observations, but at most 200 steps. The environments must be reset afterwards. Their random generators, and a seed
+    that waits for the first reset, are restored, so the next episodes are the same as without the rollout.
 
-    :param model: SB3 model that acts; ``None``: clipped standard Gaussian actions, like those of an untrained policy.
-    :return: the standard deviations in the shape of the observation space, float64; for a ``Dict``, by key of each
-        vector
+    :param model: SB3 model that acts. With ``None``, the actions are clipped standard Gaussian, like those of an
+        untrained policy.
+    :return: The standard deviations in the shape of the observation space, float64. For a ``Dict``, a dict of the
+        standard deviations of each vector.
     """
     vec_env = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
     normalize = None if model is None else model.get_vec_normalize_env()
@@ -68,7 +69,7 @@ def _vectors(space: spaces.Space) -> dict[str, spaces.Space]:
 
 
 def _untrained(env: VecEnv) -> Callable[..., tuple[np.ndarray, None]]:
-    """Return a ``predict`` of clipped standard Gaussian actions, or of samples from a space that is not a ``Box``."""
+    """Return a ``predict`` that draws clipped standard Gaussian actions, or samples a space that is not a ``Box``."""
     n, rng, space = env.num_envs, np.random.default_rng(_SEED), copy.deepcopy(env.action_space)
     space.seed(_SEED)
 
@@ -84,11 +85,11 @@ def default_scale(space: spaces.Space, env: VecEnv | gym.Env, scale: Any = None)
     r"""
     Return the scale of a vector's components, or of the vectors in a ``Dict`` by key; ``None`` if there is no vector.
 
-    A component with finite bounds has the standard deviation of a uniform distribution between them,
+    The scale of a component with finite bounds is the standard deviation of a uniform distribution between them,
     :math:`(\mathrm{high} - \mathrm{low}) / \sqrt{12}`. The other components are measured by :func:`observation_scale`.
 
-    :param scale: The user's scale, which is used instead: a number, or one for each component; for a ``Dict`` also by
-        key.
+    :param scale: The user's scale, which is used instead: a number, or an array with a number for each component. For a
+        ``Dict``, it can also be a dict of these.
     """
     vectors = _vectors(space)
     if not vectors:

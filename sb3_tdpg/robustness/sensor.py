@@ -17,7 +17,7 @@ VAST = 1e6  # bounds further apart count as infinite: some environments use the 
 
 
 def finite_range(space: spaces.Box) -> np.ndarray:
-    """Return the distance between the bounds of each component, in the space's shape; inf where there are none."""
+    """Return the distance between the bounds of each component, in the space's shape; inf for missing bounds."""
     with np.errstate(over="ignore", invalid="ignore"):
         distance = space.high.astype(np.float64) - space.low.astype(np.float64)
     return np.where(distance <= VAST, distance, np.inf)
@@ -27,8 +27,8 @@ def kind_of(space: spaces.Space) -> str | None:
     """
     Return ``"image"`` or ``"vector"`` for a ``Box``, and ``None`` for any other space.
 
-    An image has finite bounds, and either three dimensions, of which one is the channels, or two dimensions of bytes. A
-    space of four dimensions is a stack of images, the oldest first.
+    An image has finite bounds. It has three dimensions, one of which is the channels, or it has two dimensions of
+    bytes. A space of four dimensions is a stack of images, the oldest first.
     """
     if not isinstance(space, spaces.Box):
         return None
@@ -37,7 +37,7 @@ def kind_of(space: spaces.Space) -> str | None:
 
 
 def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:
-    """Return the parts of a ``Dict`` by key; any other space is its only part."""
+    """Return the parts of a ``Dict`` by key. Any other space counts as one part with the key ``""``."""
     return dict(space.items()) if isinstance(space, spaces.Dict) else {"": space}
 
 
@@ -58,7 +58,7 @@ class Sensor:
 
     @cached_property
     def parts(self) -> dict[str, "Sensor"]:
-        """The sensor of each part of a ``Dict`` by key; any other space is its only part."""
+        """The sensor of each part of a ``Dict`` by key. Any other space counts as one part with the key ``""``."""
         if not isinstance(self.space, spaces.Dict):
             return {"": self}
         scale = self.scale or {}
@@ -92,7 +92,7 @@ class Sensor:
 
     @property
     def blank(self) -> np.ndarray:
-        """The observation of a dead sensor: a black image, or 0 moved into the bounds."""
+        """The observation of a dead sensor: a black image, or 0 clipped to the bounds."""
         if not isinstance(self.space, spaces.Box):
             return np.zeros(self.space.shape or (), self.space.dtype)
         low, high = self.space.low, self.space.high
@@ -116,12 +116,12 @@ class Sensor:
 
     @property
     def channels_last(self) -> bool:
-        """Whether the last axis holds the channels; as in Stable-Baselines3, unless the first axis is the shortest."""
+        """Whether the last axis holds the channels. As in SB3, the first axis holds them if it is the shortest."""
         return int(np.argmin(self.frame)) != 0
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """``(C, H, W)`` or ``(D,)``, whatever the order in the space."""
+        """The shape ``(C, H, W)`` or ``(D,)``, whatever the order of the space's axes."""
         if not self.is_image:
             return (int(np.prod(self.space.shape)),)
         return (self.frame[2], *self.frame[:2]) if self.channels_last else self.frame
@@ -144,7 +144,7 @@ class Sensor:
         return np.moveaxis(units, 3, 1) if self.channels_last else units
 
     def from_units(self, units: np.ndarray, observations: np.ndarray) -> np.ndarray:
-        """Convert back to the order, bounds and type of the space; components without a scale stay unperturbed."""
+        """Convert back to the order, bounds and type of the space. Components with a scale of 0 stay as observed."""
         low, high = self.space.low, self.space.high
         if self.is_image:
             units = (np.moveaxis(units, 1, 3) if self.channels_last else units).reshape(observations.shape)

@@ -1,5 +1,5 @@
 """
-Perturbations for training, with keywords instead of severities and with random strengths.
+Define perturbations for training. They have keywords instead of severities, and random strengths.
 
 Dimension key: n images or episodes, C channels, H and W rows and columns, D components of a vector.
 """
@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 from sb3_tdpg.robustness.registry import N_SEVERITIES, Episode, Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
-PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells a side of the random patterns
+PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells per side of the random patterns
 
 PATTERN_GROUP = 16  # number of images whose patterns have cells of one size
 
@@ -29,28 +29,28 @@ def images(
     noise: float = 0.1,
 ) -> Perturbation:
     r"""
-    Return a mixture of random changes of images, applied in this order to y in [0, 1].
+    Return a mixture of random changes, which are applied in this order to an image y in [0, 1].
 
     1. colour: the channels are mixed, :math:`y \leftarrow M y`, where M is :math:`I + \mathtt{color} \cdot` a standard
-       normal matrix, with each row divided by its sum (or by 0.3, if that is more);
-    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p. The pattern has 2 to 64 cells a
-       side, with sharp or smooth edges (the same for 16 images side by side). The opacity a is uniform up to
-       ``pattern``, 0 for three images of ten, and 1 in a rectangle with sides uniform up to ``patch`` of the image's
-       sides;
+       normal matrix. Each row of M is divided by its sum, or by 0.3 if the sum is smaller;
+    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p. The pattern has 2 to 64 cells per
+       side, with sharp or smooth edges. Groups of 16 images have the same number of cells and the same kind of edges.
+       The opacity a is 0 with a probability of 0.3, and otherwise uniform up to ``pattern``. In one rectangle, a is 1;
+       the rectangle's sides are uniform up to ``patch`` times the image's sides;
     3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
        [0, 1];
-    4. noise: Gaussian at every pixel, with a standard deviation uniform up to ``noise``.
+    4. noise: Gaussian noise at every pixel, with a standard deviation that is uniform up to ``noise``.
 
-    The bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound the information about
-    everything in the image, so information about these changes also counts.
+    The information bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound the information
+    about everything in the image, so they also count the information about these changes.
 
     :param held: Whether an episode keeps the changes that were drawn at its beginning, except for the noise. Otherwise
         every image has its own changes.
     :param color: Strength of the mixing; 0 leaves the colours unchanged.
     :param pattern: Largest opacity of the pattern, at most 1.
-    :param patch: Largest side of the opaque rectangle, at most 1.
+    :param patch: Largest side of the opaque rectangle as a fraction of the image's side, at most 1.
     :param contrast: Largest loss of contrast, at most 1.
-    :param noise: Largest standard deviation of the noise.
+    :param noise: Largest standard deviation of the noise, for pixels in [0, 1].
     :raises ValueError: if a strength is out of its range.
     """
     strengths = dict(color=color, pattern=pattern, patch=patch, contrast=contrast, noise=noise)
@@ -101,7 +101,7 @@ def patterns(rng: np.random.Generator, n: int, channels: int, height: int, width
 
 
 def _rectangles(rng: np.random.Generator, n: int, height: int, width: int, largest: float) -> np.ndarray:
-    """Draw rectangles with sides uniform up to this share of the image's: ``(n, 1, H, W)``, 1 inside."""
+    """Draw rectangles with sides uniform up to ``largest`` times the image's sides: ``(n, 1, H, W)``, 1 inside."""
 
     def interval(length: int) -> np.ndarray:
         size = largest * rng.random((n, 1))
@@ -114,7 +114,7 @@ def _rectangles(rng: np.random.Generator, n: int, height: int, width: int, large
 
 
 def _changed(images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np.ndarray:
-    """Change each image ``(n, C, H, W)``, float32 in [0, 1], as drawn, with new noise."""
+    """Apply the drawn changes and new noise to images ``(n, C, H, W)``, float32 in [0, 1]."""
     of = {name: th.from_numpy(values) for name, values in drawn.items() if name != "t"}  # torch is several times faster
     y = (of["mixing"] @ th.from_numpy(images).flatten(2)).unflatten(2, images.shape[2:])
     y = th.lerp(y, of["pattern"], of["amount"])
@@ -125,7 +125,7 @@ def _changed(images: np.ndarray, drawn: Episode, rng: np.random.Generator) -> np
 
 def noise_range(low: float = 0.01, high: float | Sequence[float] = 1.0) -> Perturbation:
     """
-    Return noise with a standard deviation that is drawn for each episode, log-uniform between two values, in scales.
+    Return noise whose standard deviation, in units of the scale, is drawn log-uniformly for each episode.
 
     :param low: The smallest standard deviation.
     :param high: The largest standard deviation; if several are given, each episode first draws one of them.

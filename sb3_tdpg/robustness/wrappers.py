@@ -1,5 +1,5 @@
 """
-A wrapper that perturbs the observations or the actions of an SB3 ``VecEnv``.
+Perturb the observations or the actions of an SB3 ``VecEnv``.
 
 Dimension key: N environments side by side.
 """
@@ -23,21 +23,23 @@ class PerturbedVecEnv(VecEnvWrapper):
     """
     Perturb the observations or the actions of N environments, for evaluation or training.
 
-    Every episode has its own draw, also after an automatic reset. ``info["terminal_observation"]`` is perturbed as the
-    last observation of the episode that has ended. A perturbation of observations does not change the state, the
-    reward, the rest of ``info`` or the environments' random numbers. ``env.seed(...)`` also seeds the perturbation.
-    Without ``env.seed`` and without ``seed``, every reset takes a seed from torch's generator, so that the seed of a
-    training and a checkpoint also determine the perturbations. Put this wrapper inside a ``VecNormalize`` or a
-    ``VecFrameStack``; a perturbation of actions may also lie around a ``VecNormalize``.
+    Every episode draws its own random values, also after an automatic reset. ``info["terminal_observation"]`` is
+    perturbed as the last observation of the episode that has ended. A perturbation of observations does not change the
+    state, the reward, the rest of ``info`` or the environments' random numbers. ``env.seed(...)`` also seeds the
+    perturbation. Without ``env.seed`` and without ``seed``, every reset takes a seed from PyTorch's generator. So the
+    seed of a training or a checkpoint also determines the perturbations. Put this wrapper inside a ``VecNormalize`` or
+    a ``VecFrameStack``. A perturbation of actions can also be outside a ``VecNormalize``.
 
     :param venv: The environments. Their attribute ``observation_groups`` may name the components that fail together:
         ``{"imu": [0, 1, 2]}``, or ``{"imu": ["gyroscope"]}`` in a ``Dict``.
-    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, a dict of several, of which each episode
-        has one, a function or another declaration; see :class:`~sb3_tdpg.robustness.families.Family`.
-    :param severity: Severity for a name: 1 (mild) to 5 (strong); ``None``: each episode has a random one.
+    :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or another declaration, such as a
+        function or a dict; see :class:`~sb3_tdpg.robustness.families.Family`. With a dict, each episode has one of the
+        entries.
+    :param severity: Severity for a name, from 1 (mild) to 5 (strong). With ``None``, each episode has a random
+        severity.
     :param seed: Seed of the perturbation.
-    :param scale: Scale of the components of a vector (in a ``Dict`` also by key); default: from the bounds of the
-        space, and where they are infinite, measured in a short rollout
+    :param scale: Scale of a vector's components; for a ``Dict``, it can also be a dict of scales. The default scale
+        comes from the bounds of the space. Where these are infinite, the scale is measured in a short rollout
         (:func:`~sb3_tdpg.robustness.observation_scale`).
     :raises ValueError: if the name or the severity is unknown, the perturbation does not apply, or it perturbs
         observations that a ``VecNormalize`` has normalised.
