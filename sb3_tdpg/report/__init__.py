@@ -1,4 +1,4 @@
-"""Write a robustness report: one page about models in an environment under every perturbation and severity."""
+"""Write a robustness report: one page that compares models under every perturbation and severity."""
 
 from sb3_tdpg.report.main import robustness_report
 from sb3_tdpg.report.models import load_model, parse_models

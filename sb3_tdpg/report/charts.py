@@ -56,7 +56,7 @@ def degradation_curves(numbers: Numbers) -> Figure:
 
 
 def own_rows_figure(numbers: Numbers) -> Figure:
-    """Draw the cost of each method in the test rows of the environment, with its interval and its models."""
+    """Draw, for each test row of the environment, each method's cost with its interval, and the costs of its models."""
     shown = numbers.levels[numbers.levels["kind"].isin(("unperturbed", "own"))]
     figure, axes = _by_row(numbers, shown.assign(value=shown["iqm"]), numbers.model_levels)
     axes.grid(alpha=0.25, axis="x")
@@ -67,7 +67,7 @@ def own_rows_figure(numbers: Numbers) -> Figure:
 
 
 def comparison_figure(numbers: Numbers) -> Figure:
-    """Draw for each method the share of pairs of models in which its model costs less than the first method's."""
+    """Draw, for each method, the share of model pairs in which its model costs less than the first method's model."""
     reference = numbers.models[0]
     frame = numbers.comparisons[[numbers.can_be_clear(label) for label in numbers.comparisons["model"]]]
     costs = numbers.model_groups.pivot(index=["model", "train_seed"], columns="perturbation", values="cost")

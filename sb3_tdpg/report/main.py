@@ -59,11 +59,12 @@ def robustness_report(
     progress_bar: bool = True,
 ) -> str:
     """
-    Run every model under every perturbation, and write a page that says where each method is more robust.
+    Run every model under every perturbation, and write a page that compares the robustness of the methods.
 
-    ``out`` then contains ``report.md``, ``report.html`` (one file with its pictures) and the files that
-    docs/guide/report.md names. During the run, the page is updated with the finished rows. The same call continues an
-    interrupted report. A later call can have other perturbations or severities; finished rows are not run again.
+    ``out`` then contains ``report.md``, ``report.html`` (one file that includes its pictures) and the files that
+    docs/guide/report.md names. A *row* of the report is the unperturbed environment, a perturbation at one severity, or
+    a test row of the environment. During the run, the page is updated with the finished rows. The same call continues
+    an interrupted report. A later call can have other perturbations or severities; finished rows are not run again.
 
     :param models: The models of each method: one model, or a list with one model for each training seed. A model is a
         file (:class:`~pathlib.Path` or text) or a model of TDPG, Stable-Baselines3 or sb3-contrib. All methods are
@@ -71,19 +72,19 @@ def robustness_report(
     :param env_id: A registered id, or ``module:id``.
     :param out: Folder of the results.
     :param env_kwargs: Keywords of the environment in all rows.
-    :param perturbations: Perturbations of the sensor and of the scene; default: all that apply.
+    :param perturbations: Names of perturbations. By default, all perturbations that apply.
     :param severities: Severities from 1 to 5.
-    :param scenarios: Test rows of the environment; default: the test rows of the paper's table, if there are any.
-    :param n_episodes: Number of episodes of each model in each row; default: as many as ``n_steps`` allows, but at most
-        100 with images and 500 with vectors.
+    :param scenarios: Test rows of the environment. By default, the test rows of the paper's table, if there are any.
+    :param n_episodes: Number of episodes of each model in each row. By default, as many as ``n_steps`` allows, but at
+        most 100 with images and 500 with vectors.
     :param n_steps: Maximum number of steps of each model in each row, from which ``n_episodes`` is computed.
-    :param information: Also measure the information in the TRVs of the first TDPG model of each method. With long
-        episodes this takes much longer than the rest of the report.
+    :param information: Whether to measure also the information in the TRVs of the first TDPG model of each method. With
+        long episodes this takes much longer than the rest of the report.
     :param seed: Seed of environments, policies, perturbations and bootstrap.
     :param deterministic: Whether the policies act without noise.
     :param jobs: Number of processes, if all models are files.
-    :param progress_bar: Show progress on stderr.
-    :return: the page, as Markdown
+    :param progress_bar: Whether to show progress on stderr.
+    :return: The page, as Markdown.
     :raises ValueError: if an argument is wrong, or the folder contains another report; no row has been run in this
         case.
     :raises ImportError: if the extra ``plots`` is not installed.
@@ -265,7 +266,7 @@ def _name(source: Source) -> str:
 
 
 def _look_at(env_id: str, env_kwargs: Mapping[str, Any]) -> tuple[spaces.Space, spaces.Space, int | None, Any]:
-    """Return observation space, action space, horizon and the scale of the components of an environment."""
+    """Return an environment's observation space, action space and horizon, and the scale of its observations."""
     try:
         env = make_episodes_env(env_id, 8, env_kwargs=env_kwargs, use_processes=False)
     except Exception as e:

@@ -24,12 +24,12 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
     Read models from the command line, and group them into methods.
 
     An argument is a file, a folder with a ``model.zip``, or a pattern such as ``runs/pg-seed*/model.zip``, with an
-    optional ``LABEL=`` in front. Without a label, the method has the name of the file without the seed. If the file's
-    name does not identify a model (``model.zip``, ``best_model.zip``, the environment's id), the method has the name of
-    the folder without the seed. For example, ``runs/pg-seed3/model.zip`` is a model of ``pg``, and
+    optional ``LABEL=`` in front. Without a label, the method's name is the file's name without the seed. If the file's
+    name does not identify a model (``model.zip``, ``best_model.zip``, the environment's id), the method's name is
+    the folder's name without the seed. For example, ``runs/pg-seed3/model.zip`` is a model of ``pg``, and
     ``logs/ppo/Lava-v0_1/Lava-v0.zip`` is a model of ``ppo Lava-v0``.
 
-    :return: the files of each method, in the order of the arguments
+    :return: The files of each method, in the order of the arguments.
     :raises ValueError: if a file does not exist or is given twice, or if two files would get the name of one folder.
     """
     methods: dict[str, list[Path]] = {}
@@ -53,7 +53,7 @@ def parse_models(arguments: Sequence[str], env_id: str = "") -> dict[str, list[P
 
 
 def label_of(path: Path, env_id: str = "") -> str:
-    """Return the name of the method of a model file; see :func:`parse_models`."""
+    """Return the name of the method to which a model file belongs; see :func:`parse_models`."""
     name = path.absolute().parent.name if _is_named_after_folder(path, env_id) else path.name.removesuffix(".zip")
     name = SEED.sub("", name) or name
     if name != env_id.rpartition(":")[2]:

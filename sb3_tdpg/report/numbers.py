@@ -16,7 +16,7 @@ from sb3_tdpg.report.rows import ALL, PERTURBED, UNPERTURBED
 
 CLEAR = 0.05
 """A difference counts as clear up to this p-value."""
-MAX_EXACT = 8  # the test is exact if a method has at most this many models; SciPy does this only without equal costs
+MAX_EXACT = 8  # p-values are exact if a method has at most this many models (also with equal costs, unlike in SciPy)
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Numbers:
     """The cost of each method in each row: ``model``, ``perturbation``, ``severity``, ``kind``, ``n_seeds``, ``iqm``,
     ``low``, ``high``."""
     groups: pd.DataFrame
-    """The mean over the severities of each perturbation, for each method. The columns are those of ``levels`` without
-    ``severity``, the cost above the unperturbed cost with its interval (``added``, ``added_low``, ``added_high``), and
-    ``lowest``: whether the cost is clearly below the cost of every other method, that is, its interval is below the
-    other interval and the p-value is at most 0.05."""
+    """The mean cost of each method over the severities of each perturbation. The columns are those of ``levels`` except
+    ``severity``, and four more. ``added`` is the cost above the unperturbed cost, with its interval (``added_low``,
+    ``added_high``). ``lowest`` is true if the method costs clearly less than every other method: its interval is below
+    the other method's interval, and the p-value is at most 0.05."""
     comparisons: pd.DataFrame
     """The comparison of each method with the first method (``reference``), with a row for each perturbation. ``p_cost``
     is the share of the pairs of models in which the method's model costs less. ``p_added`` is the share in which the
@@ -49,7 +49,7 @@ class Numbers:
         return list(self.levels["model"].unique())
 
     def can_be_clear(self, label: str) -> bool:
-        """Return whether the two methods have enough models for a clear difference from the first method."""
+        """Return whether a method and the first method have enough models for a clear difference."""
         n, of_reference = self.n_models(label), self.n_models(self.models[0])
         return p_value(np.arange(n), n + np.arange(of_reference)) <= CLEAR
 
@@ -76,10 +76,10 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
     """
     Aggregate the records of ``run_row``.
 
-    The number of a model is its mean cost over episodes (for a perturbation, also over severities). The number of a
-    method is the interquartile mean over its models, with a stratified bootstrap interval over the models. If a method
-    has a single model, the interval is for this model, not for the method. It is the interval of the mean over
-    episodes: a normal approximation, or Wilson's interval if all costs are 0 or 1 (failures).
+    The cost of a model is its mean over episodes, and for a perturbation also over severities. The cost of a method is
+    the interquartile mean over its models, with a stratified bootstrap interval over the models. If a method has a
+    single model, the interval is for this model, not for the method. It is then the interval of the mean over episodes:
+    a normal approximation, or Wilson's interval if all costs are 0 or 1 (failures).
 
     :param records: The records of all rows.
     :param seed: Seed of the bootstrap.
@@ -115,7 +115,7 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
 
 
 def _long(by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
-    """Convert the arrays of each method and name, ``(S, rows)``, to a frame with a row for each model and row."""
+    """Convert each method's arrays, ``(S, rows)``, to a frame with one line for each model and row of the report."""
     frames = [
         pd.DataFrame(dict(model=label, train_seed=number, **keys, **{name: x[number] for name, x in arrays.items()}))
         for label, arrays in by_seed.items()
@@ -154,7 +154,7 @@ def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
 
 
 def _interval_columns(cube: np.ndarray, seed: int, is_share: bool = False, prefix: str = "") -> dict[str, np.ndarray]:
-    """Aggregate ``(S, G, E)`` over models; return a column with the number and two with the ends of its interval."""
+    """Aggregate costs ``(S, G, E)``; return columns with the mean and with both ends of its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
     one = len(cube) == 1
     columns = _mean_of_one(cube[0], is_share) if one else interquartile_means(cube.mean(axis=2), seed)
@@ -162,7 +162,7 @@ def _interval_columns(cube: np.ndarray, seed: int, is_share: bool = False, prefi
 
 
 def _mean_of_one(costs: np.ndarray, is_share: bool) -> tuple[np.ndarray, ...]:
-    """Return the mean over episodes of ``(G, E)``, and the ends of its interval."""
+    """Return the mean over episodes of costs ``(G, E)``, and the ends of the mean's interval."""
     from scipy.stats import norm
 
     mean, variance, n = costs.mean(axis=1), costs.var(axis=1), costs.shape[1]
@@ -172,8 +172,8 @@ def _mean_of_one(costs: np.ndarray, is_share: bool) -> tuple[np.ndarray, ...]:
     if not is_share:
         half = z * np.sqrt(variance / (n - 1))
         return mean, mean - half, mean + half
-    # Wilson's interval, for the number of independent trials that gives the mean this variance. One row has n trials,
-    # several rows have more. Zero failures in n trials do not mean that the failure rate is zero.
+    # Wilson's interval is computed for the number of independent trials that corresponds to the variance: n for one
+    # row, more for several rows. Zero failures in n trials do not mean that the failure rate is zero.
     trials = np.divide(n * mean * (1 - mean), variance, out=np.full_like(mean, n), where=variance > 0)
     center, half = mean + z**2 / (2 * trials), z * np.sqrt(mean * (1 - mean) / trials + (z / (2 * trials)) ** 2)
     return mean, *(np.clip((center + sign * half) / (1 + z**2 / trials), 0.0, 1.0) for sign in (-1, 1))

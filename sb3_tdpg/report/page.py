@@ -90,7 +90,7 @@ class Costs:
         return ", ".join(f"{escaped(m)} costs {self.cell(self.groups.loc[(m, name)])}" for m in self.numbers.models)
 
     def worst_case(self, label: str) -> dict[str, Any]:
-        """Find the perturbation and the severity with the highest cost of a method."""
+        """Find the perturbation and the severity at which a method costs most."""
         levels = self.numbers.levels[self.numbers.levels["model"] == label]
         plain = levels.loc[levels["kind"] == "unperturbed", "iqm"].iloc[0]
         perturbed = levels[levels["kind"].isin(PERTURBED)]
@@ -125,7 +125,7 @@ class Costs:
 
 
 def _verdict(numbers: Numbers, label: str) -> dict[str, Any]:
-    """Return where a method is better than the first method."""
+    """Compare a method with the first method; return the values for the template."""
     reference, names = numbers.models[0], numbers.perturbations
     ours, theirs = escaped(label), escaped(reference)
     sizes = [numbers.n_models(each) for each in (label, reference)]
@@ -142,7 +142,11 @@ def _by_word(words: pd.Series) -> dict[str, list[str]]:
 
 
 def _comparisons_table(numbers: Numbers) -> str:
-    """Make a table of how often a model beats a model of the first method; empty if no difference can be clear."""
+    """
+    Make a table of how often a model costs less than a model of the first method.
+
+    The table is empty if no difference can be clear.
+    """
     rows = []
     for row in numbers.comparisons.to_dict("records"):
         if numbers.can_be_clear(row["model"]):

@@ -75,9 +75,9 @@ def run_row(plan: Plan, row: Row, models: Models) -> pd.DataFrame:
 
 def default_episodes(kind: str | None, horizon: int | None, n_steps: int) -> int:
     """
-    Return how many episodes a budget of steps allows.
+    Return the number of episodes that a budget of steps allows.
 
-    :param kind: Kind of the observations.
+    :param kind: Kind of the observations, ``"image"`` or another.
     :param horizon: Maximum length of an episode, if there is a limit.
     :param n_steps: The budget of steps.
     """
@@ -88,7 +88,7 @@ def default_episodes(kind: str | None, horizon: int | None, n_steps: int) -> int
 
 
 def seconds_of_a_row(plan: Plan, row: Row, models: Models, horizon: int | None) -> float:
-    """Estimate the maximum time of a row from some steps of the first model of each method."""
+    """Estimate the maximum time of a row in seconds, from some steps of each method's first model."""
     total = 0.0
     with threads(1):
         for first, *others in models.values():
