@@ -1,7 +1,7 @@
 """
 Write one step of a policy to a file that runs without this package: ONNX or TorchScript.
 
-Dimension key: N robots, Z task-relevant variables (TRVs), U actions.
+Dimension key: N robots, Z task-relevant variables (TRVs), U action components, I inputs and O outputs of a network.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class ExportedStep(nn.Module):
 
     @property
     def input_names(self) -> list[str]:
-        """The names of the inputs, in the order of the inputs."""
+        """The names of the inputs, in order."""
         observations = [f"observation.{key}" for key in self.keys] or ["observation"]
         return [*observations, "memory", *["time_step"] * self.policy.time_varying, "trv_noise", "action_noise"]
 
@@ -122,7 +122,7 @@ class ExportedStep(nn.Module):
         return observation.float() if observation.dtype == th.uint8 else observation
 
     def _action(self, parameters: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        """Return the action for the outputs of the action head. Without noise it is the mode of the distribution."""
+        """Return the action for the outputs of the action head. Without noise, it is the mode of the distribution."""
         space = self.policy.action_space
         if isinstance(space, spaces.Box):
             mean, log_std = self.policy.action_gaussian(parameters)
@@ -137,14 +137,14 @@ class ExportedStep(nn.Module):
 
 
 def _at_time_steps(network: TimeMLP, x: th.Tensor, t: th.Tensor | None) -> th.Tensor:
-    """Evaluate a network at each robot's time step: ``(N, I)`` and ``(N,) -> (N, O)``; None means shared weights."""
+    """Evaluate a network, ``(N, I) -> (N, O)``, at each robot's time step, ``(N,)``. None means shared weights."""
     if t is None:
         return network.at(x, 0)
     return network.mlp.through(x, lambda layer, x: (x[:, None, :] @ layer.weight[t] + layer.bias[t])[:, 0])
 
 
 def metadata_of(step: ExportedStep) -> dict[str, Any]:
-    """Return the metadata of an exported file, which its user needs."""
+    """Return the metadata that the user of an exported file needs."""
     policy, space = step.policy, step.policy.action_space
     noise = "gumbel"
     if isinstance(space, (spaces.Box, spaces.MultiBinary)):
@@ -188,7 +188,7 @@ def export_policy(
     :param format: ``"onnx"`` (needs the extra ``export``) or ``"torchscript"``. By default the suffix of ``path``,
         ``.onnx`` or ``.pt``, determines the format.
     :param normalization: The statistics with which ``VecNormalize`` standardised the observations in training.
-    :return: the file
+    :return: The file.
     :raises ValueError: if the format is unknown.
     :raises ImportError: if the packages for ONNX are missing.
     """
@@ -208,7 +208,7 @@ def export_policy(
         step = ExportedStep(policy, normalization).eval()
         metadata = json.dumps(metadata_of(step))
         with th.no_grad(), warnings.catch_warnings(), replaced_atomically(path) as partial:
-            # Hide torch's warnings about its own parts that it will replace, and about image sizes, which are fixed.
+            # Hide torch's warnings about deprecated parts of torch, and about image sizes, which are fixed.
             warnings.filterwarnings("ignore", category=FutureWarning)
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             warnings.filterwarnings("ignore", category=th.jit.TracerWarning)
@@ -230,8 +230,9 @@ def export_model(
 
     :param model: File written by ``model.save``. It is unpickled, which can run any code.
     :param out: The file to write. By default it has the folder and the name of the model.
-    :param format: See :func:`export_policy`. By default the suffix of ``out`` determines the format, or it is ONNX.
-    :return: the file
+    :param format: See :func:`export_policy`. By default, the suffix of ``out`` determines the format. Without a known
+        suffix, the format is ONNX.
+    :return: The file.
     :raises ValueError: if there is no such model.
     """
     model = Path(model)
@@ -258,7 +259,7 @@ def export_trained(model: Any, path: str | os.PathLike[str], format: str | None,
 
 
 def _is_not_of_torchvision(record: logging.LogRecord) -> bool:
-    """Return whether a log record is not one of torch's warnings about torchvision, which no policy needs."""
+    """Return whether to keep a log record. Warnings about torchvision are dropped, because no policy needs it."""
     return not record.getMessage().startswith("torchvision is not installed")
 
 

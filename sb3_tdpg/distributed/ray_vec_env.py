@@ -1,7 +1,7 @@
 """
 Run environments on the machines of a Ray cluster, or on the cores of this machine.
 
-Dimension key: N environments in the order of ``env_fns``; each actor has B successive environments.
+Dimension key: N environments in the order of ``env_fns``; each actor runs B successive environments.
 """
 
 import itertools
@@ -48,7 +48,7 @@ class EnvActor:
         return DummyVecEnv(self._env_fns)
 
     def call(self, message: bytes) -> tuple[bytes, bytes]:
-        """Call another method; pickle here, because Ray takes 0.1 ms longer for an array and makes it read-only."""
+        """Call another method and pickle the results: Ray takes 0.1 ms longer for an array and makes it read-only."""
         name, *arguments = cloudpickle.loads(message)
         observations, rest = getattr(self, name)(*arguments)
         return pickle.dumps(observations, pickle.HIGHEST_PROTOCOL), cloudpickle.dumps((self._life, rest))
@@ -97,27 +97,28 @@ class RayVecEnv(VecEnv):
 
         make_vec_env("PandaGrasp-v0", n_envs=32, vec_env_cls=RayVecEnv, vec_env_kwargs=dict(n_actors=8))
 
-    If Ray is not initialised (``ray.init``), this class joins the cluster of the environment variable ``RAY_ADDRESS``,
-    or starts Ray on this machine until the last ``RayVecEnv`` is closed. Every machine of a cluster needs this package.
+    If Ray is not initialised (``ray.init``), this class joins the cluster that the environment variable ``RAY_ADDRESS``
+    names. Without this variable, it starts Ray on this machine, and ends Ray when the last ``RayVecEnv`` is closed.
+    Every machine of a cluster needs this package.
 
     An exception of an environment is raised unchanged. If an actor dies (killed, crashed, machine lost), the next call
-    raises :class:`DeadActorError`. With ``max_restarts`` Ray restarts the actor instead, and the actor makes new
-    environments. The running episodes are lost, and so are attributes set by ``set_attr``. The next step gives a
+    raises :class:`DeadActorError`. With ``max_restarts`` above 0, Ray restarts the actor instead, and the actor makes
+    new environments. The running episodes are lost, and so are attributes set by ``set_attr``. The next step gives a
     warning and ends these episodes like a time limit, with reward 0 and ``info["episode_lost"]=True``.
 
     :param env_fns: Functions that make one environment each.
-    :param n_actors: Number of actors; default: one for each CPU of the cluster, but not more than environments.
-    :param max_restarts: How often Ray may restart each actor.
-    :param actor_options: Ray's options for an actor, such as ``dict(num_gpus=0.1)``; default: one CPU (no CPU if this
-        class has started Ray).
+    :param n_actors: Number of actors. By default, one for each CPU of the cluster, but at most one per environment.
+    :param max_restarts: Largest number of times that Ray restarts each actor.
+    :param actor_options: Ray's options for an actor, such as ``dict(num_gpus=0.1)``. By default an actor reserves one
+        CPU, or none if this class has started Ray on this machine.
     :param start_timeout: Seconds to wait until all actors have made their environments.
-    :param step_timeout: Seconds after which an actor that does not answer is killed; a restart must take less time.
-        ``None`` means no limit.
+    :param step_timeout: Seconds after which an actor that does not answer is killed. This time must be longer than a
+        restart takes. ``None`` means no limit.
     :raises TimeoutError: if the actors do not start in time, for instance because the cluster has too few CPUs.
     """
 
-    # All objects share the connection to Ray. These are the number of its users, whether this class made the
-    # connection, and whether Ray runs only on this machine.
+    # All objects share the connection to Ray. These attributes are the number of objects that use the connection,
+    # whether this class made the connection, and whether Ray runs only on this machine.
     _n_users, _is_ours, _is_local = 0, False, False
 
     def __init__(
@@ -196,7 +197,7 @@ class RayVecEnv(VecEnv):
         return self._receive_all(replies)[1][0]
 
     def _send(self, actor: int, method: str, *arguments: Any) -> list[Any]:
-        """Call a method of an actor; return Ray's references to the observations and to the rest."""
+        """Call a method of an actor; return Ray's references to the observations and to the other results."""
         # Ray needs 1 ms longer for an object of more than 100 kB, so terminal images are not sent with the next images.
         return self._actors[actor].call.options(num_returns=2).remote(cloudpickle.dumps((method, *arguments)))
 
@@ -230,7 +231,7 @@ class RayVecEnv(VecEnv):
         return pickle.loads(observations), result
 
     def _ask(self, indices: VecEnvIndices, method: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """Call a method of the actors' ``DummyVecEnv`` for some environments; return one result for each."""
+        """Call a method of the actors' ``DummyVecEnv`` for some environments; return one result per environment."""
         places = [(actor, i) for actor, share in enumerate(self._shares) for i in range(share.stop - share.start)]
         wanted = [places[i] for i in self._get_indices(indices)]
         replies = [(actor, self._send(actor, "ask", [i], method, args, kwargs)) for actor, i in wanted]
