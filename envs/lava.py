@@ -84,19 +84,6 @@ class LavaEnv(POMDPEnv):
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
 
-    @property
-    def cost_bound(self) -> float:
-        """
-        Upper bound on the cost of an episode.
-
-        A robot that is neither at the wall nor in the lava stayed within [0, 5] m in the last step. So its speed was at
-        most 5 m per step, and the last control adds at most ``max_action`` to this speed.
-        """
-        max_action = float(self.action_space.high[0])
-        farthest = float(np.hypot(GOAL[0] - WALL, LAVA - WALL + max_action))
-        stage = max(farthest, self.lava_stage_cost or 0.0) + self.action_cost * max_action
-        return self.horizon * stage + max(100.0 * farthest, self.lava_terminal_cost or 0.0)
-
     def initial_state(self, n: int) -> np.ndarray:
         state = np.zeros((n, 2))
         if self.start_beta is None:

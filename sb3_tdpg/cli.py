@@ -136,31 +136,17 @@ def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequenc
 
 
 def _certify(
-    models: Sequence[Path], env: str, env_kwargs: Sequence[str], out: Path | None, nuisance: str | None,
-    n_members: int, **options: Any,
-) -> None:  # fmt: skip
+    models: Sequence[Path], env: str, env_kwargs: Sequence[str], nuisance: str, out: Path, **options: Any
+) -> None:
     from sb3_tdpg.certificates.declared import certify_nuisance
-    from sb3_tdpg.paper.certificates import certify_lava
 
-    out = out or Path("results", "certificate" if nuisance is None else "nuisance")
     say_what_is_trusted(*models)
-    keywords = parse_keywords(env_kwargs)
-    if nuisance is not None:
-        if options.pop("n_random_shifts"):
-            raise ValueError("--random-shifts are those of Lava's sensor and start: leave them or --nuisance out")
-        try:
-            declared = yaml.safe_load(nuisance)
-        except yaml.YAMLError as e:
-            raise ValueError(f"--nuisance {nuisance!r} is not YAML, such as '{{vector_noise: [1, 3]}}'") from e
-        options.update(env_kwargs=keywords, n_members=n_members)
-        _print_results(out, lambda: certify_nuisance(models, env, declared, out, **options))
-        return
-    if env.rpartition(":")[2] != "Lava-v0":
-        raise ValueError(
-            f"certify has declared shifts for Lava-v0 only, not for {env}: declare your own in Python, see "
-            "sb3_tdpg.certificates.shifts.TrainingEpisodes"
-        )
-    _print_results(out, lambda: certify_lava(models, out, env_kwargs=keywords, **options))
+    options["env_kwargs"] = parse_keywords(env_kwargs)
+    try:
+        declared = yaml.safe_load(nuisance)
+    except yaml.YAMLError as e:
+        raise ValueError(f"--nuisance {nuisance!r} is not YAML, such as '{{vector_noise: [1, 3]}}'") from e
+    _print_results(out, lambda: certify_nuisance(models, env, declared, out, **options))
 
 
 def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Path | None, **options: Any) -> None:
@@ -349,19 +335,18 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--n-eval-episodes", type=_positive, default=500, help="episodes of each evaluation (default: 500)")
     add("--out", type=Path, help="folder for the results (default: results/frontier-<env or block>)")
 
-    text = "compute upper bounds on the cost of lava policies under shifts of sensor and start"
+    text = "compute upper bounds on the cost of policies under random members of a declared nuisance"
     add = command(_certify, text, "--env", "--env-kwargs", "--seed")
     add("models", nargs="+", type=Path, help="the .zip files from model.save()")
-    add("--random-shifts", type=_positive, default=0, dest="n_random_shifts", help="in addition to the paper's shifts")
-    text = "certify a declared nuisance instead: 'auto', a name, or '{vector_noise: [1, 3], vector_bias: 2}'"
-    add("--nuisance", metavar="YAML", help=text)
+    text = "the nuisance: 'auto', a name, or '{vector_noise: [1, 3], vector_bias: 2}'"
+    add("--nuisance", required=True, metavar="YAML", help=text)
     add("--members", type=_positive, default=1000, dest="n_members", help="random members of the nuisance")
     add("--n-episodes", type=_positive, default=1_000_000, help="training episodes to record")
-    add("--n-test-episodes", type=_positive, default=2000, help="episodes per random shift")
+    add("--n-test-episodes", type=_positive, default=2000, help="episodes per member")
     add("--confidence", type=float, default=0.95)
-    add("--cost-bound", type=float, help="clip the cost at this value (default: the cost of standing at the wall)")
-    text = "folder for the results (default: results/certificate, with --nuisance results/nuisance)"
-    add("--out", type=Path, help=text)
+    text = "clip the cost at this value (default for Lava: the cost of standing at the wall)"
+    add("--cost-bound", type=float, help=text)
+    add("--out", type=Path, default=Path("results/nuisance"), help="folder for the results (default: results/nuisance)")
 
     text = "run models under every perturbation, report which method is more robust, and where"
     add = command(_report, text, "--env", "--env-kwargs", "--seed", "--deterministic", "--jobs")

@@ -260,7 +260,7 @@ def test_a_damaged_model_is_told_in_a_line_that_names_it(write, tmp_path, capsys
     write(path)
     with pytest.raises(ValueError, match=r"model\.zip is not a model of TDPG: the file is damaged"):
         TDPG.load(path, device="cpu")
-    for program, *to in (["enjoy"], ["certify", "--out", out], ["report", "--out", out]):
+    for program, *to in (["enjoy"], ["certify", "--nuisance", "vector_bias", "--out", out], ["report", "--out", out]):
         assert "model.zip " in error_line(capsys, program, path, *to, "--env", "Lava-v0")
         assert not out.exists()
 

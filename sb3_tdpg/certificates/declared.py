@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from sb3_tdpg.certificates.models import compare, load_models, write_summary
-from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes, wall_cost
+from sb3_tdpg.certificates.shifts import Shift, TrainingEpisodes
+from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.markdown import markdown_table
-from sb3_tdpg.common.provenance import write_frame_atomically
+from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation.environments import scenario_env
+from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
+from sb3_tdpg.evaluation.loading import statistics_beside
 from sb3_tdpg.robustness.nuisance import held_family
+from sb3_tdpg.tdpg import TDPG
 
 FAMILY = "a member for each episode"
 
@@ -58,11 +63,15 @@ def certify_nuisance(
     """
     if n_test_episodes < 2 or n_members < 1:
         raise ValueError(f"n_test_episodes={n_test_episodes} must be at least 2, n_members={n_members} at least 1")
+    if seed < 0:
+        raise ValueError(f"seed={seed} must be at least 0")
     training = Scenario("Training", env_id, dict(env_kwargs or {}))
     loaded = load_models(models, training)
-    if cost_bound is None and env_id.rpartition(":")[2] != "Lava-v0":
-        raise ValueError(f"cost_bound is needed for {env_id}: an upper bound on the cost of an episode")
-    cost_bound = wall_cost(next(iter(loaded.values())).horizon) if cost_bound is None else cost_bound
+    if cost_bound is None:
+        if env_id.rpartition(":")[2] != "Lava-v0":
+            raise ValueError(f"cost_bound is needed for {env_id}: an upper bound on the cost of an episode")
+        # The stage costs at the wall, and the terminal cost there, which has a weight of 100.
+        cost_bound = (next(iter(loaded.values())).horizon + 100.0) * float(GOAL[0] - WALL)
     out.mkdir(parents=True, exist_ok=True)
     n_budget_episodes = min(n_budget_episodes, n_episodes)
     settings: dict[str, Any] = dict(n_episodes=n_episodes, cost_bound=cost_bound, confidence=confidence, seed=seed)
@@ -75,8 +84,8 @@ def certify_nuisance(
             shifts = [Shift(FAMILY, nuisance=partial(family.members, seed=seed))]
             shifts += [Shift(f"member {i}", nuisance=partial(family.one, seed + i)) for i in range(n_members)]
             for i, shift in enumerate(tqdm(shifts, desc=label)):
-                row = compare(episodes, shift, n_test_episodes, seed=seed + 1 + i)
-                rows.append(dict(model=label, shift=shift.name, training_cost=episodes.costs.mean(), **row))
+                row = dict(model=label, shift=shift.name, training_cost=episodes.costs.mean())
+                rows.append(row | _compare(episodes, shift, n_test_episodes, seed + 1 + i))
     records = pd.DataFrame(rows)
     write_frame_atomically(records, out / "nuisance.csv")
     settings.update(nuisance=str(declared), n_members=n_members, n_budget_episodes=n_budget_episodes)
@@ -84,7 +93,42 @@ def certify_nuisance(
     text = (
         f"The trivial bound is {cost_bound:g}: the cost is clipped there. Confidence of each bound: {confidence:.0%}."
     )
-    return write_summary(out, [nuisance_table(records, cost_bound), text], models, settings)
+    how = provenance()
+    write_run_config(out / "config.json", dict(models=[path.name for path in models], **settings, provenance=how))
+    summary = "\n\n".join([nuisance_table(records, cost_bound), text, how_made(how["command"], how)]) + "\n"
+    write_atomically(out / "summary.md", summary)
+    return summary
+
+
+def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
+    """Load policies, label them, and check that they fit the training environment."""
+    models: dict[str, TDPG] = {}
+    if twice := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
+        raise ValueError(f"{twice[0]} is given twice")
+    for path in paths:
+        if found := statistics_beside(path):
+            raise ValueError(f"{path} acts on normalised observations ({found}): train one without VecNormalize")
+        try:
+            model = TDPG.load(path, device="cpu")
+        except OSError as e:
+            raise ValueError(f"{path} cannot be read ({e.strerror}): give .zip files that model.save() wrote") from e
+        method = "PG" if model.beta == math.inf else "TDPG"
+        # Choose the shortest label that is free; only the last one contains the whole path.
+        labels = (method, f"{method} ({path.parent.name}/{path.stem})", f"{method} ({path})")
+        models[next(label for label in labels if label not in models)] = model
+    check_models_fit(models, [training])
+    return models
+
+
+def _compare(episodes: TrainingEpisodes, shift: Shift, n_test_episodes: int, seed: int) -> dict[str, Any]:
+    """Certify one shift, and measure the cost under it."""
+    certified = episodes.certify(shift)
+    costs, measured_kl = episodes.measure(shift, n_test_episodes, seed=seed)
+    row: dict[str, Any] = dict(cost=costs.mean(), standard_error=costs.std(ddof=1) / math.sqrt(len(costs)))
+    row["clipped_cost"] = np.minimum(costs, certified.trivial).mean()
+    row.update((name, getattr(certified, name)) for name in ("bound", "through_trvs", "through_sensor"))
+    row.update(kl=certified.budget.kl, exceedance=certified.budget.exceedance)
+    return dict(**row, measured_kl=measured_kl, sensor_kl=certified.sensor_kl)
 
 
 def nuisance_table(records: pd.DataFrame, trivial: float) -> str:

@@ -10,41 +10,28 @@ Dimension key: T horizon, N episodes, X state, Z TRVs.
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from scipy.special import betaln, digamma
 from stable_baselines3.common.utils import obs_as_tensor
 from torch.distributions import Normal, kl_divergence
 
-from sb3_tdpg.certificates.certificate import (
-    Certificate,
-    CostDistribution,
-    check_allowance,
-    cost_distribution,
-    worst_mean,
-)
+from sb3_tdpg.certificates.certificate import CostDistribution, check_allowance, cost_distribution, worst_mean
 from sb3_tdpg.envs.base import POMDPEnv
-from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.randomness import isolated_randomness
 from sb3_tdpg.evaluation.rollout import act
-from sb3_tdpg.information import InformationBatch
-from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.robustness.core import Members
 from sb3_tdpg.vec_env import BatchedVecEnv
 
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
-INFORMATION_EPISODES = 4_000  # number of episodes for the bound on the information
 EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of episodes with a capped divergence that are tried
 
 _START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
@@ -98,72 +85,11 @@ class RecordedEpisodes(NamedTuple):
     densities: list[Normal]  # of the TRVs at each step, (N, Z), and of the last actions, (N, U)
     seed: tuple[int, ...]  # of the sensor
 
-    def first(self, n: int | None) -> RecordedEpisodes:
+    def first(self, n: int) -> RecordedEpisodes:
         """Return the first n episodes."""
         densities = [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities]
         arrays = (self.costs[:n], self.states[:, :n], self.prev_trvs[:, :n], self.last_trv_noise[:n])
         return RecordedEpisodes(*arrays, densities, self.seed)
-
-
-def gaussian_kl(bias: np.ndarray, std: float, training_std: float) -> float:
-    """Compute D[N(bias, std^2 I) || N(0, training_std^2 I)] in nats; inf if only one of them has noise."""
-    if std == training_std and not bias.any():
-        return 0.0
-    if std == 0 or training_std == 0:
-        return math.inf
-    ratio = (std / training_std) ** 2
-    return float(0.5 * (len(bias) * (ratio - 1 - math.log(ratio)) + (bias**2).sum() / training_std**2))
-
-
-def beta_kl(a: float, b: float) -> float:
-    """Compute D[Beta(a, b) || uniform] in nats."""
-    return float(-betaln(a, b) + (a - 1) * digamma(a) + (b - 1) * digamma(b) - (a + b - 2) * digamma(a + b))
-
-
-def wall_cost(horizon: int) -> float:
-    """Return the cost of a whole episode at the wall, which is the worst place in both cost definitions."""
-    return (horizon + 100.0) * float(GOAL[0] - WALL)
-
-
-def lava_shift(
-    name: str,
-    *,
-    sensor_noise_std: float | None = None,
-    sensor_bias: Sequence[float] | None = None,
-    start_beta: Sequence[float] | None = None,
-    training_noise_std: float = 0.01,
-) -> Shift:
-    """Declare a shift of the lava problem; training has a uniform start, no bias and its own sensor noise."""
-    noise = training_noise_std if sensor_noise_std is None else sensor_noise_std
-    bias = np.zeros(2) if sensor_bias is None else np.asarray(sensor_bias, dtype=np.float64)
-    given = dict(sensor_noise_std=sensor_noise_std, sensor_bias=sensor_bias, start_beta=start_beta)
-    return Shift(
-        name,
-        {key: value for key, value in given.items() if value is not None},
-        0.0 if start_beta is None else beta_kl(*start_beta),
-        gaussian_kl(bias, noise, training_noise_std),
-    )
-
-
-def random_lava_shifts(n: int, *, seed: int = 0, training_noise_std: float = 0.01) -> list[Shift]:
-    """
-    Draw n shifts of the lava problem: noise, bias and start change with probability 1/2 each, at least one of them.
-
-    The noise's variance is log-uniform in [1e-6, 1]. The bias has a random direction and a length that is log-uniform
-    in [0.001, 1]. The start is Beta(a, b), with a and b log-uniform in [1/2, 2].
-    """
-    random = np.random.default_rng(seed)
-    shifts: list[Shift] = []
-    while len(shifts) < n:
-        is_changed = random.random(3) < 0.5
-        noise, length = (10.0 ** random.uniform((-3.0, -3.0), (0.0, 0.0))).tolist()
-        angle = random.uniform(0, 2 * math.pi)
-        bias = (length * math.cos(angle), length * math.sin(angle))
-        start = tuple((2.0 ** random.uniform(-1, 1, 2)).tolist())
-        values: dict[str, Any] = dict(sensor_noise_std=noise, sensor_bias=bias, start_beta=start)
-        if changes := dict(compress(values.items(), is_changed)):
-            shifts.append(lava_shift(f"shift {len(shifts)}", **changes, training_noise_std=training_noise_std))
-    return shifts
 
 
 class TrainingEpisodes:
@@ -172,8 +98,8 @@ class TrainingEpisodes:
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
     :param scenario: The training environment, one of this package.
-    :param cost_bound: Upper bound on the episode cost. The cost is clipped there. If it is below the true bound
-        (:attr:`LavaEnv.cost_bound <sb3_tdpg.envs.lava.LavaEnv.cost_bound>`), the certificate is for the clipped cost.
+    :param cost_bound: Upper bound on the episode cost. The cost is clipped there. If an episode can cost more, the
+        certificate is for the clipped cost.
     :param n_episodes: Number of episodes for the distribution of the cost.
     :param n_budget_episodes: Number of the first episodes, which are used for the divergence of the TRVs.
     :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
@@ -198,7 +124,7 @@ class TrainingEpisodes:
             most = f"at most n_episodes={n_episodes} and {EPISODES_AT_A_TIME}"
             raise ValueError(f"n_budget_episodes={n_budget_episodes} must be at least 1 and {most}")
         check_allowance(confidence, cost_bound)
-        self.model, self.scenario, self.seed = model, scenario, seed
+        self.model, self.scenario, self.confidence, self.cost_bound = model, scenario, confidence, cost_bound
         self._env = _pomdp(model, scenario)
         costs: list[np.ndarray] = []
         for i in range(math.ceil(n_episodes / EPISODES_AT_A_TIME)):
@@ -207,38 +133,20 @@ class TrainingEpisodes:
             costs.append(episodes.costs)
             if i == 0:
                 self.recorded = episodes.first(n_budget_episodes)
-                self.information = _information(episodes.first(INFORMATION_EPISODES))
         self.costs = np.concatenate(costs)
-        self._allow(confidence, cost_bound)
-
-    def allowing(self, confidence: float | None, cost_bound: float | None = None) -> TrainingEpisodes:
-        """Return the same episodes with another confidence and, if given, another bound on the cost."""
-        other = copy.copy(self)
-        other._allow(confidence, self.cost_bound if cost_bound is None else cost_bound)
-        return other
-
-    @property
-    def true_cost_bound(self) -> float:
-        """The environment's own upper bound on the episode cost (its attribute ``cost_bound``), or inf."""
-        return float(getattr(self._env, "cost_bound", math.inf))
-
-    def _allow(self, confidence: float | None, cost_bound: float) -> None:
-        self.confidence, self.cost_bound = confidence, cost_bound
         share = None if confidence is None else (1 + confidence) / 2
         self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, share)
 
-    def divergences(self, shift: Shift, n_episodes: int | None = None) -> np.ndarray:
+    def divergences(self, shift: Shift) -> np.ndarray:
         """
-        Compute the divergence at each step of the first recorded episodes, given the noise that couples the sensors.
+        Compute the divergence at each step of the recorded episodes, given the noise that couples the sensors.
 
         :return: ``(T + 1, N)``: for each step D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] of the TRVs in
             nats, and in the last row the divergence of the last actions
         """
-        recorded = self.recorded.first(n_episodes)
-        shifted = encode(self.model, self._shifted(shift), recorded)
-        return _divergences(shifted, recorded.densities)
+        return _divergences(encode(self.model, self._shifted(shift), self.recorded), self.recorded.densities)
 
-    def budgets(self, shift: Shift, n_episodes: int | None = None) -> list[Budget]:
+    def budgets(self, shift: Shift) -> list[Budget]:
         """
         Bound the divergence between episodes with and without the shift, from recorded episodes.
 
@@ -248,31 +156,25 @@ class TrainingEpisodes:
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
-        divergences = self.divergences(shift, n_episodes)
+        divergences = self.divergences(shift)
         share = None if self.confidence is None else 1 - (1 - self.confidence) / (2 * len(divergences))
         steps = [cost_distribution(divergence, float(divergence.max()), share) for divergence in divergences]
         return [_budget(steps, shift.start_kl, level) for level in EXCEEDANCE_LEVELS]
 
-    def certify(self, shift: Shift, n_episodes: int | None = None) -> ShiftCertificate:
+    def certify(self, shift: Shift) -> ShiftCertificate:
         """
         Bound the expected cost under a shift, clipped at ``cost_bound``.
 
         The certificates through the TRVs and through the sensor hold simultaneously, so the lowest is valid.
-
-        :param n_episodes: Number of the first recorded episodes to use for the divergence of the TRVs; default: all.
         """
 
         def bound_through_trvs(budget: Budget) -> float:
             return worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl).bound
 
-        budget = min(self.budgets(shift, n_episodes), key=bound_through_trvs)
+        budget = min(self.budgets(shift), key=bound_through_trvs)
         sensor_kl = shift.start_kl + len(self.recorded.states) * shift.sensor_kl
         bounds = (bound_through_trvs(budget), worst_mean(self.distribution, sensor_kl).bound, self.cost_bound)
         return ShiftCertificate(min(bounds), *bounds, budget, sensor_kl)
-
-    def fixed_beta(self, beta: float, information: float) -> Certificate:
-        """Apply the corrected Theorem II.1 at a fixed beta, with an upper bound on the information in nats."""
-        return worst_mean(self.distribution, beta * information, beta)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
         """Run the shifted environment; return the costs, ``(N,)``, and the mean divergence, which the budget bounds."""
@@ -333,20 +235,6 @@ def encode(model: Any, env: Any, recorded: RecordedEpisodes) -> list[Normal]:
 
 def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
     return policy.action_density(trvs, np.full(len(trvs), policy.horizon - 1)).distribution
-
-
-def _information(recorded: RecordedEpisodes) -> float:
-    """Compute the log-det bound, an upper bound on the sum over t of I[x_t; x~_t]."""
-    n_episodes, trv_dim = recorded.last_trv_noise.shape
-    if n_episodes < trv_dim + 2:
-        least = f"at least {trv_dim + 2}, to estimate the information of {trv_dim} TRVs"
-        raise ValueError(f"n_episodes={n_episodes} must be {least}")
-    means, stds = (th.stack([getattr(d, name) for d in recorded.densities[:-1]]).cpu() for name in ("mean", "stddev"))
-    last = means[-1] + stds[-1] * recorded.last_trv_noise.cpu()
-    trvs = th.cat([recorded.prev_trvs[1:].cpu(), last[None]])
-    states = th.as_tensor(recorded.states, dtype=th.float32)
-    log_det = LogDet(len(trvs), states.shape[2], trvs.shape[2])
-    return float(log_det(InformationBatch(states, trvs, means, stds)).sum())
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:

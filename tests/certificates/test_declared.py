@@ -1,11 +1,16 @@
 """Certificates for a declared nuisance: no random member costs more than its bound."""
 
+import json
+
 import pandas as pd
 import pytest
-from small_problems import tiny_tdpg, train_epochs
+from small_problems import error_line, tiny_tdpg, train_epochs
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_tdpg.certificates.declared import FAMILY, nuisance_table
+from sb3_tdpg.certificates.declared import FAMILY, certify_nuisance, load_models, nuisance_table
 from sb3_tdpg.cli import main
+from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.scenarios import Scenario
 
 
 def test_certified_bounds_hold_for_random_members(tmp_path):
@@ -20,30 +25,56 @@ def test_certified_bounds_hold_for_random_members(tmp_path):
     assert (records["clipped_cost"] <= records["bound"]).all()
     assert records["kl"].nunique() > 15  # another member, another divergence
     assert (records["measured_kl"] <= records["kl"] + 1e-6).mean() > 0.9
-    assert "random members" in (tmp_path / "out" / "summary.md").read_text()
+    summary = (tmp_path / "out" / "summary.md").read_text()
+    assert "random members" in summary and "The trivial bound is 315" in summary and "Made by" in summary
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["cost_bound"] == 315  # standing at the wall
 
 
-def test_the_two_kinds_of_certificates_have_folders_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    tiny_tdpg("Lava-v0", n_episodes=2).save("model.zip")
-    command = ["certify", "model.zip", "--env", "Lava-v0", "--n-episodes", "500"]
-    assert main(command) == 0
-    assert main([*command, "--nuisance", "vector_bias", "--members", "1", "--n-test-episodes", "2"]) == 0
-    assert {path.parent.name for path in tmp_path.glob("results/*/summary.md")} == {"certificate", "nuisance"}
+NUISANCE = ["--nuisance", "vector_bias"]
 
 
-@pytest.mark.parametrize(("arguments", "fragment"), [
-    (["--nuisance", "vector_bias", "--random-shifts", "3"], "leave them or --nuisance out"),
-    (["--nuisance", "{"], "is not YAML"),
-    (["--nuisance", "fog"], "perturbation='fog' is unknown"),
-    (["--nuisance", "auto"], "is none for"),
-    (["--nuisance", "actuator_gain"], "changes the actions"),
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["nothing.zip", *NUISANCE], "nothing.zip cannot be read"),
+    (["nothing.zip", *NUISANCE, "--env", "sb3_tdpg:Lava-v0"], "nothing.zip cannot be read"),
+    (["model.zip", "model.zip", *NUISANCE], "model.zip is given twice"),
+    (["model.zip", *NUISANCE, "--seed", "-1"], "seed=-1 must be at least 0"),
+    (["model.zip", *NUISANCE, "--n-test-episodes", "1"], "n_test_episodes=1 must be at least 2"),
+    (["model.zip", *NUISANCE, "--confidence", "1.5"], "confidence=1.5 must lie between 0 and 1"),
+    (["model.zip", *NUISANCE, "--cost-bound", "nan"], "cost_bound=nan must be finite"),
+    (["model.zip", *NUISANCE, "--out", "model.zip"], "File exists"),
+    (["model.zip", "--nuisance", "{"], "is not YAML"),
+    (["model.zip", "--nuisance", "fog"], "perturbation='fog' is unknown"),
+    (["model.zip", "--nuisance", "auto"], "is none for"),
+    (["model.zip", "--nuisance", "actuator_gain"], "changes the actions"),
 ])  # fmt: skip
-def test_wrong_arguments_of_certify_are_explained(arguments, fragment, tmp_path, capsys):
-    model = tiny_tdpg("Lava-v0")
-    model.save(tmp_path / "model.zip")
-    assert main(["certify", str(tmp_path / "model.zip"), "--env", "Lava-v0", "--out", str(tmp_path), *arguments]) != 0
-    assert fragment in capsys.readouterr().err
+def test_bad_input_to_the_command_is_told_in_a_line(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sb3_tdpg.certificates.shifts.record_episodes", None)  # by then, nothing has been run
+    tiny_tdpg("Lava-v0", n_episodes=2).save("model.zip")
+    assert message in error_line(capsys, "certify", "--env", "Lava-v0", *arguments)
+
+
+def test_another_environment_needs_a_bound_on_the_cost(tmp_path):
+    tiny_tdpg("SqueezeInsert-v0", n_episodes=2).save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="cost_bound is needed for SqueezeInsert-v0"):
+        certify_nuisance([tmp_path / "model.zip"], "SqueezeInsert-v0", "vector_bias", tmp_path)
+
+
+def test_a_model_of_normalised_observations_is_refused(tmp_path):
+    env = VecNormalize(DummyVecEnv([LavaEnv]), norm_reward=False)
+    tiny_tdpg(env, n_episodes=2).save(tmp_path / "model.zip")
+    env.save(tmp_path / "vecnormalize.pkl")
+    with pytest.raises(ValueError, match="acts on normalised observations"):
+        load_models([tmp_path / "model.zip"], Scenario("Training", "Lava-v0"))
+
+
+def test_models_from_folders_of_one_name_are_all_certified(tmp_path):
+    paths = [tmp_path / name / "model.zip" for name in ("a", "b", "c/a", "d/a")]
+    for path in paths:
+        path.parent.mkdir(parents=True)
+        tiny_tdpg().save(path)
+    labels = ["TDPG", "TDPG (b/model)", "TDPG (a/model)", f"TDPG ({paths[3]})"]
+    assert list(load_models(paths, Scenario("Training", "Lava-v0"))) == labels
 
 
 def test_a_cost_above_its_bound_counts_from_three_standard_errors_on():
