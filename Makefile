@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 OLDEST ?= .venv-oldest
 JOBS ?= 2
-EXTRAS ?= zoo,postgres,ray,hub,export,tests,plots,public,docs,dev
+EXTRAS ?= zoo,postgres,ray,hub,export,tests,plots,mujoco,docs,dev
 HTML ?= docs/_build/html
 
 BIN := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
@@ -11,7 +11,7 @@ PY := $(VENV)/$(BIN)/python
 STAMP := $(VENV)/.installed
 
 # The names of targets are not files: docs/ exists, but the target docs must not count as "up to date".
-.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-pays-controls reproduce-panda-squeeze reproduce-public records wheel release-check clean
+.PHONY: help venv demo test test-slow test-oldest mutants soak lint type format docs pictures bench reproduce reproduce-lava reproduce-ball reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-pays-controls reproduce-panda-squeeze records wheel release-check clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -78,7 +78,7 @@ pictures: $(STAMP) ## draw the pictures of the documentation (PICTURES="lava.gif
 bench: $(STAMP) ## measure the speed of the environments, the critics and an epoch
 	$(PY) tests/benchmarks/run.py
 
-reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-pays-controls reproduce-panda-squeeze reproduce-public ## reproduce every experiment (days)
+reproduce: reproduce-lava reproduce-ball-controls reproduce-ball-paper reproduce-ball-varying reproduce-grasp reproduce-grasp-camera reproduce-pays reproduce-pays-controls reproduce-panda-squeeze ## reproduce every experiment (days)
 
 reproduce-lava: $(STAMP) ## reproduce the lava problem's figures and table
 	$(PY) -m sb3_tdpg reproduce lava --out results/lava_reproduction --publish docs/results/lava
@@ -110,9 +110,6 @@ reproduce-pays-controls: $(STAMP) ## add PPO and RecurrentPPO, also trained with
 
 reproduce-panda-squeeze: $(STAMP) ## test policies of the batched model on the Panda in PyBullet under sensor faults
 	$(PY) -m sb3_tdpg reproduce panda-squeeze --n-seeds 5 --out results/panda_squeeze --publish docs/results/panda_squeeze
-
-reproduce-public: $(STAMP) ## compare TDPG (preset, tuned, cost limit) with PPO and RecurrentPPO on public tasks
-	$(PY) -m sb3_tdpg reproduce public --out results/public_tasks --publish docs/results/public_tasks
 
 records: $(STAMP) ## check the records of single episodes and pack them for a release
 	$(PY) docs/make_records.py

@@ -75,7 +75,6 @@ EXPERIMENTS = {
     "pays": Experiment("paper.pays:reproduce_pays", "pays", flags=("controls",)),
     "pays-cue": Experiment("paper.pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
     "panda-squeeze": Experiment("paper.pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",)), ("controls",)),
-    "public": Experiment("paper.public:reproduce_public", "public_tasks"),
 }
 
 

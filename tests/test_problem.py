@@ -134,3 +134,9 @@ def test_images_of_floats_are_images_if_the_policy_is_told_so():
     blind = toy_vec_env(observation_space=env.observation_space, gives_state=False)
     with pytest.raises(ValueError, match=r"an image .* cannot stand in for it"):
         TDPG(env=blind, policy_kwargs=dict(normalize_images=False))
+
+
+def test_an_environment_of_popgym_which_keeps_its_state_to_itself_can_be_trained_on():
+    env = ToyEnv(gives_state=False)
+    env.state_space, env.observability_level = spaces.Discrete(3), "partial"  # as POPGym's environments have them
+    assert train_epochs(tiny_tdpg(DummyVecEnv([lambda: env]), n_episodes=2), 1).state_dim == 2  # the observation
