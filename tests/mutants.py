@@ -41,7 +41,7 @@ TESTS = [
     "test_episodic.py", "common/test_running_norms.py", "test_features.py", "test_problem.py",
     "test_nuisance.py", "test_callbacks.py", "test_sb3_surface.py", "test_vec_env.py", "information",
     "robustness/test_families.py", "evaluation/test_information_report.py", "evaluation/test_interval.py",
-    "evaluation/test_interval_bounds.py", "evaluation/test_trust_badge.py", "certificates", "envs",
+    "evaluation/test_interval_bounds.py", "certificates", "envs",
 ]  # fmt: skip
 SETTINGS = """
 [mutmut]

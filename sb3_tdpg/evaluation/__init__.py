@@ -6,13 +6,10 @@ from sb3_tdpg.evaluation.interval import InformationInterval, information_interv
 from sb3_tdpg.evaluation.records import evaluate_scenarios, rollout_states
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
 from sb3_tdpg.evaluation.tables import add_ratio, comparison_markdown, summary_table
-from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
 
 __all__ = [
     "InformationInterval",
     "InformationReport",
-    "TrustBadge",
-    "TrustCheck",
     "add_ratio",
     "aggregate_seeds",
     "comparison_markdown",
@@ -29,5 +26,4 @@ __all__ = [
     "state_knowledge",
     "summary_table",
     "training_curves",
-    "trust_checks",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +27,6 @@ from sb3_tdpg.evaluation.interval import InformationInterval, component_estimate
 from sb3_tdpg.evaluation.interval_bounds import MAX_TRAINING
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
-from sb3_tdpg.evaluation.trust_badge import TrustBadge, TrustCheck, trust_checks
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import log_density_matrix
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TINY = 1e-30
-ESTIMATES = ("interval", "knowledge", "checks")  # the parts of an information report, in this order
+ESTIMATES = ("interval", "knowledge")  # the parts of an information report, in this order
 
 
 class InformationBounds(NamedTuple):
@@ -50,15 +49,13 @@ class InformationBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class InformationReport:
-    """The information in the TRVs of a policy, and checks of the estimates."""
+    """The information in the TRVs of a policy."""
 
     interval: InformationInterval
     """Interval for I[x_t; x~_t] at each time step."""
     knowledge: pd.DataFrame
     """Information about each component of the state, capped at the upper limit of the interval; see
     :func:`~sb3_tdpg.evaluation.state_knowledge`."""
-    badge: TrustBadge
-    """Checks of the interval and of the components."""
     costs: np.ndarray
     """Costs of the episodes, ``(N,)``."""
 
@@ -77,7 +74,7 @@ class InformationReport:
         left_out = f", {n_left_out} steps with too few of them left out" if n_left_out else ""
         return (
             f"I[x_t; x~_t], summed over time: {lower:.2f} to {upper:.2f} nat "
-            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes{left_out}); {self.badge}"
+            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes{left_out})"
         )
 
 
@@ -91,7 +88,7 @@ def information_report(
     :param env: A ``VecEnv`` with any number of environments.
     :param n_episodes: Number of episodes N; with fewer environments they are run in rounds.
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
-    :param at_end: Called at the end of each of the three ``ESTIMATES``.
+    :param at_end: Called at the end of each of the ``ESTIMATES``.
     :raises ValueError: if model and environment do not fit, or there are too few episodes for an interval.
     """
     if not isinstance(model.policy, TRVPolicy):
@@ -105,25 +102,16 @@ def information_report(
     batch = InformationBatch(*(th.cat(parts, dim=1) for parts in zip(*(each[:5] for each in batches), strict=True)))
     batch = batch.select(th.arange(n_episodes))
     interval = information_interval(batch, seed=seed)
+    if not np.isfinite(interval.upper).any():
+        raise ValueError(
+            f"no time step has an interval: at most {interval.n_episodes.max(initial=0)} episodes are alive"
+        )
     at_end()
     known = state_knowledge(batch, read_problem(env).state_names, seed=seed)
     at_end()
-    badge = trust_checks(batch, interval, seed=seed)
-    at_end()
-    known, check = within(known, interval)
-    badge = replace(badge, checks=(*badge.checks, check))
-    return InformationReport(interval, known, badge, np.concatenate(costs)[:n_episodes])
-
-
-def within(known: pd.DataFrame, interval: InformationInterval) -> tuple[pd.DataFrame, TrustCheck]:
-    """Cap the information about components at the whole state's upper limit; check their lower limits against it."""
-    upper = interval.upper[known["t"]]
-    excess = (known["nats_lower"] - upper).max()
-    meaning = "nats by which the lower limit of a component of the state is above the upper limit of the whole state"
-    # If no component varies, nothing exceeds the limit.
-    check = TrustCheck("components", max(0.0, float(excess)), 0.0, meaning)
-    limited = {name: np.minimum(known[name], upper) for name in ("nats", "nats_lower")}
-    return known.assign(**limited), check
+    # No component is known better than the whole state.
+    limited = {name: np.minimum(known[name], interval.upper[known["t"]]) for name in ("nats", "nats_lower")}
+    return InformationReport(interval, known.assign(**limited), np.concatenate(costs)[:n_episodes])
 
 
 @threads(1)

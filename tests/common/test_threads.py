@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.common.threads import threads
-from sb3_tdpg.evaluation import information_interval, trust_checks
+from sb3_tdpg.evaluation import information_interval
 from sb3_tdpg.evaluation.information import state_knowledge
 from sb3_tdpg.presets import DEPTH, IMAGE, VECTOR
 
@@ -79,7 +79,7 @@ class Samples:
         raise Asked(*in_use())
 
 
-@pytest.mark.parametrize("estimate", [information_interval, trust_checks, partial(state_knowledge, names=["a"])])
+@pytest.mark.parametrize("estimate", [information_interval, partial(state_knowledge, names=["a"])])
 def test_what_is_measured_after_the_training_takes_one_thread(estimate):
     with pytest.raises(Asked) as told:
         estimate(Samples())

@@ -96,6 +96,17 @@ def test_the_limit_is_the_tightest_and_allows_for_the_others():
     assert limit(dict(a=near), 0.02, 1)[1] == pytest.approx(1 + normal_quantile(0.02) * near.error)
 
 
+def test_shuffled_pairs_have_no_information_and_a_noisier_copy_has_less():
+    batch = gaussian_batch(400, [[0.5, 0.5], [1.0, 2.0]], generator=generator())
+    interval = information_interval(batch)
+    shuffled = information_interval(batch._replace(states=batch.states.roll(1, dims=1)))
+    assert (interval.lower > 0).all()
+    for name in LOWER_BOUNDS:
+        assert (shuffled.estimates[name] < 3 * shuffled.errors[name]).all()
+    noisier = batch._replace(trvs=batch.means + 2 * (batch.trvs - batch.means), stds=2 * batch.stds)
+    assert (information_interval(noisier).upper < interval.lower).all()
+
+
 def test_above_the_logarithm_of_n_the_lower_limit_stays_below_the_truth():
     for nats in (8.0, 20.0):
         interval = information_interval(gaussian_channels(nats, 2, 100, 10, np.random.default_rng(0)))
