@@ -7,7 +7,7 @@ import warnings
 
 LEAST_SLACK = 0.01  # smallest slack, as a share of the limit or of the improvement, since costs scatter
 NO_SCALE = 1e-9  # a scale up to this counts as 0, and the weight does not start
-RATE = 0.3  # largest increase of log w per epoch, reached if the cost is one scale below the limit
+RATE = 0.3  # increase of log w per epoch if the cost is one scale below the limit, before clipping
 MAX_GROWTH = 1000.0  # largest ratio of w to its start; without it, w grows forever if no information is needed
 # The following constants are for a limit that is a share of the improvement.
 WINDOW = 5  # number of epochs over which a cost is averaged
@@ -37,10 +37,10 @@ class AutoWeight:
         log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
     The scale is abs(C); if it is 0, the weight does not start. With ``by_slack`` the scale is the slack: the limit
-    minus the lowest cost so far. A limit of 95 % of the attainable return then has as strong an effect as a limit of
-    50 %. In the formula, C - slack / 2 then replaces C, because the few episodes of an epoch say little about the
-    expected cost. The range of ``clip`` is then -3 to 0.3, so the weight grows more slowly than it shrinks. The reason
-    is that a policy loses its return within a few epochs and takes many epochs to recover it.
+    minus the lowest cost so far. The weight then changes as fast for a limit of 95 % of the attainable return as for a
+    limit of 50 %. In the formula, C - slack / 2 then replaces C, because the few episodes of an epoch say little about
+    the expected cost. The range of ``clip`` is then -3 to 0.3, so the weight grows more slowly than it shrinks. The
+    reason is that a policy loses its return within a few epochs and takes many epochs to recover it.
 
     If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
     best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs

@@ -241,7 +241,11 @@ def check_learning_rate(rate: float) -> None:
 
 
 def check_action_space(space: spaces.Space) -> None:
-    """Raise a ``ValueError`` if TDPG does not support this action space, or its bounds are not finite."""
+    """
+    Raise a ``ValueError`` if TDPG does not support this action space.
+
+    The bounds of a ``Box`` must be at most 1e18 in absolute value, and a discrete space must begin with 0.
+    """
     if not isinstance(space, SUPPORTED_ACTION_SPACES):
         names = ", ".join(kind.__name__ for kind in SUPPORTED_ACTION_SPACES)
         raise ValueError(f"the action space {space} is not supported: use one of {names}")

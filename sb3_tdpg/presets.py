@@ -245,7 +245,8 @@ def fill_in_trvs(
 
     :param defaults: Defaults of the preset.
     :param n_features: Number of features of an observation.
-    :raises ValueError: if there are fewer TRVs than features and changes that are added to them.
+    :raises ValueError: if there are fewer TRVs than features and changes that are added to them, or ``skip_changes`` is
+        True without ``skip``.
     """
     if trv_dim is not None:
         check_count("policy_kwargs: trv_dim", trv_dim)

@@ -81,9 +81,10 @@ class TDPG(EpisodicAlgorithm):
         :class:`~sb3_tdpg.information.InformationEstimator`.
     :param mi_kwargs: Keywords of the estimator.
     :param baseline: Variance reduction of the gradient. ``"regression"``: subtract a regression of the cost-to-go on
-        the true state at each step. ``"value"``: subtract the output of a network that gets the true state and the
-        remaining time (:class:`~sb3_tdpg.advantages.ValueFunction`). ``"mean"``: subtract the mean cost of the
-        episodes, as in the paper.
+        the true state, one for each time step up to a horizon of 50 and one for all steps above. ``"value"``: subtract
+        the output of a network that gets the true state and the remaining time
+        (:class:`~sb3_tdpg.advantages.ValueFunction`). ``"mean"``: subtract the mean cost of the episodes, as in the
+        paper.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper.
         ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both gradients are unbiased; the
         pathwise gradient has less variance.

@@ -183,7 +183,7 @@ def _git() -> dict[str, Any] | None:
 
 def jsonable(value: Any) -> Any:
     """
-    Convert a value to JSON types; infinite numbers and unknown types become strings, such as ``"inf"``.
+    Convert a value to JSON types; NaN, infinite numbers and unknown types become strings, such as ``"inf"``.
 
     A function gives the same string in every process, except for a closure, whose name does not identify its content.
     """

@@ -127,7 +127,7 @@ class CriticEstimator(InformationEstimator):
         Recommended number of episodes: ten for each input of a critic.
 
         If the TRVs carry no information, the critics still report 0.5 to 1 nat at each step with this many episodes.
-        With 2 episodes, they report 10 to 200 nats.
+        With 2 episodes, they report 10 to 200 nats at each step.
         """
         return 10 * (self.state_dim + self.trv_dim)
 
