@@ -14,7 +14,6 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from small_problems import words
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs import ENTRY_POINTS
@@ -66,6 +65,8 @@ def test_every_registered_environment_is_reproducible_from_its_seed(env_id):
 def test_an_episode_stays_in_the_state_space_pays_its_cost_and_is_terminated_at_the_horizon(env_id):
     env = gym.make(env_id)
     horizon, state_space = env.unwrapped.horizon, env.unwrapped.state_space
+    assert (len(env.unwrapped.state_names),) == state_space.shape
+    assert all(re.fullmatch(r".+ \(.+\)", name) for name in env.unwrapped.state_names)  # with a unit
     for seed in range(20):
         env.action_space.seed(seed)
         _, info = env.reset(seed=seed)
@@ -77,13 +78,6 @@ def test_an_episode_stays_in_the_state_space_pays_its_cost_and_is_terminated_at_
             ends.append(end)
         assert state_space.contains(info["state"])
         assert ends == [[False, False]] * (horizon - 1) + [[True, False]]  # and never truncated
-
-
-@EVERY_ID
-def test_every_component_of_the_state_has_a_name_with_a_unit(env_id):
-    env = gym.make(env_id).unwrapped
-    assert (len(env.state_names),) == env.state_space.shape
-    assert all(re.fullmatch(r".+ \(.+\)", name) for name in env.state_names)
 
 
 @EVERY_ID
@@ -138,21 +132,15 @@ def still_ball(**kwargs):
     return BallCatchEnv(robot_range=(0.5, 0.5), **kwargs)
 
 
-@pytest.mark.parametrize("vectorise", [
-    lambda make, **kwargs: DummyVecEnv([lambda: make(**kwargs)]),
-    lambda make, **kwargs: BatchedVecEnv(make(**kwargs), 1),
-], ids=["DummyVecEnv", "BatchedVecEnv"])  # fmt: skip
 @pytest.mark.parametrize(("make", "perturbation"), [
     (LavaEnv, dict(sensor_noise_std=50.0)),
     (still_ball, dict(pixel_noise_std=0.2)),
     (still_ball, dict(pixel_noise_std=0.2, noise_mode="clip")),
     (still_ball, dict(texture="violet_dots")),
 ], ids=words)  # fmt: skip
-def test_a_perturbation_reaches_the_observation_in_every_episode_and_never_the_true_state(
-    make, perturbation, vectorise
-):
+def test_a_perturbation_reaches_the_observation_in_every_episode_and_never_the_true_state(make, perturbation):
     def run(**kwargs):
-        env = vectorise(make, horizon=4, **kwargs)
+        env = BatchedVecEnv(make(horizon=4, **kwargs), 1)
         env.seed(0)
         observations, states = [env.reset()[0]], [env.reset_infos[0]["state"]]
         for _ in range(11):
@@ -306,18 +294,12 @@ def test_actions_of_another_shape_are_refused_and_not_counted(env_id):
     assert dones == [False] * (env.horizon - 1) + [True]
 
 
-# -- what the constructors refuse ------------------------------------------------------------------------------------
-
-CAMERA_RANGE = r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1"
-CAMERA_SHIFT = r"camera_shift=.* must leave the camera within 0.1 m of its usual height"
 REFUSED = {
     LavaEnv: [
         (dict(sensor_noise_std=-0.1), "sensor_noise_std=-0.1 must be finite and not negative"),
         (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
         (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
-        (dict(horizon=2.5), "horizon=2.5 must be an integer of at least 1"),
         (dict(max_action=0.0), "max_action=0.0 must be finite and positive"),
-        (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
         (dict(action_cost=np.nan), "action_cost=nan must be finite"),
         (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
         (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
@@ -346,12 +328,10 @@ REFUSED = {
         (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
         (dict(texture="bricks"), r"texture='bricks' is unknown: use one of \['brick', 'blue_tiles', .*'red_planks'\]"),
         (dict(texture=np.zeros((8, 8), np.uint8)), r"shape \(8, 8\) and dtype uint8; expected \(height, width, 3\)"),
-        (dict(texture=np.zeros((8, 8, 3))), "dtype float64; expected"),
     ],
     PandaGraspEnv: [
         (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.15 m"),
         (dict(yaw_range=(1.0, -1.0)), r"yaw_range=\(1.0, -1.0\) must be \(low, high\) of finite numbers in rad"),
-        (dict(yaw_range=(0.0, np.inf)), "yaw_range=.* must be"),
         (dict(mug_scale=0.0), "mug_scale=0.0 must be between 0.5 and 1.5"),
         (dict(frame_offset=1.0), "frame_offset=1.0 must be between -0.05 and 0.05 m"),
         (dict(friction=-1.0), "friction=-1.0 must be finite and not negative"),
@@ -359,20 +339,17 @@ REFUSED = {
         (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
         (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
         (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
-        *((dict(camera_range=value), CAMERA_RANGE)
-          for value in [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05, (0.0,)]),
-        (dict(camera_shift=0.11), CAMERA_SHIFT),
-        (dict(camera_shift=np.nan), CAMERA_SHIFT),
-        (dict(camera_shift=0.08, camera_range=(-0.03, 0.03)), CAMERA_SHIFT),
+        *((dict(camera_range=value), r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1")
+          for value in [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05]),
+        *((keywords, "camera_shift=.* must leave the camera within 0.1 m of its usual height")
+          for keywords in [dict(camera_shift=np.nan), dict(camera_shift=0.08, camera_range=(-0.03, 0.03))]),
     ],
     PandaSqueezeEnv: [
         (dict(friction=-0.1), "friction=-0.1 must be between 0 and 1"),
         (dict(centring_error=0.01), "centring_error=0.01 must be between 0 and 0.0035 m: else a jaw may come down"),
         (dict(tolerance=0.3), "tolerance=0.3 must be between 0 and 0.2 rad"),
         (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite and not negative"),
-        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
         (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
-        (dict(render_mode="human"), "render_mode='human' must be None or one of"),
     ],
     SqueezeInsertEnv: [
         (dict(turn=(0.9, 1.1)), r"turn\[1\]=1.1 must be between 0 and 1: a squeeze does not turn the part too far"),
@@ -380,14 +357,10 @@ REFUSED = {
         (dict(basin=2.0), "basin=2.0 must be between 0 and 1.5708 rad"),
         (dict(tolerance=-0.1), "tolerance=-0.1 must be finite and not negative"),
         (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
-        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
     ],
     PegCornerEnv: [
-        (dict(friction=-1.0), "friction=-1.0 must be finite"),
-        (dict(tolerance=-1.0), "tolerance=-1.0 must be finite"),
-        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite"),
-        (dict(max_action=-1.0), "max_action=-1.0 must be finite"),
-        (dict(actuator_gain=-1.0), "actuator_gain=-1.0 must be finite"),
+        ({name: -1.0}, f"{name}=-1.0 must be finite")
+        for name in ("friction", "tolerance", "sensor_noise_std", "max_action", "actuator_gain")
     ],
 }  # fmt: skip
 
@@ -398,12 +371,6 @@ REFUSED = {
 def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(make, keywords, message):
     with pytest.raises(ValueError, match=message):
         make(**keywords)
-
-
-@pytest.mark.parametrize("make", REFUSED, ids=words)
-def test_a_misspelt_keyword_is_not_swallowed(make):
-    with pytest.raises(TypeError, match="sensor_nois"):
-        make(sensor_nois=0.1)
 
 
 def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
@@ -439,14 +406,11 @@ class Switch(POMDPEnv):
         return np.zeros(len(state))
 
 
-def test_actions_may_have_two_dimensions():
+def test_actions_may_have_two_dimensions_or_be_discrete():
     env = Switch()
     env.action_space, env.cost = spaces.Box(-1, 1, (2, 2)), lambda state, action: action[:, 0, 1]
     env.reset()
     assert env.step(np.array([[0.0, 0.5], [0.0, 0.0]]))[1] == -0.5
-
-
-def test_actions_may_be_discrete():
     env = Switch()
     observation, _ = env.reset(seed=0)
     assert [env.step(action)[1] for action in (0, 1)] == [-1.0, 0.0] if observation[0] > 0 else [0.0, -1.0]
