@@ -9,6 +9,7 @@ from information_problems import channel, gaussian_batch, generator
 from small_problems import CountdownEnv, lava_env, tiny_tdpg, train_epochs
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import InformationCallback, SelectionCallback, make_episodes_env
@@ -46,6 +47,8 @@ def test_the_knowledge_is_of_the_component_that_the_trvs_tell():
     np.testing.assert_allclose(r2, [[0.9, 0], [0, 0.9]], atol=0.05)
     assert (frame["nats_lower"] <= frame["nats"]).all()
     assert (frame["nats_lower"] > 0).tolist() == [True, False, False, True]
+    with pytest.raises(ValueError, match="a name for each of the 3"):
+        state_knowledge(looking_at_the_first_then_the_second(), names=("a", "b"))
 
 
 def test_what_many_trvs_know_of_two_components_is_found_in_each_of_them():
@@ -70,11 +73,6 @@ def test_a_component_that_is_constant_at_one_step_only_has_no_number_there():
     assert frame["r2"].isna().tolist() == [False, True, False, False]
 
 
-def test_names_must_be_as_many_as_components():
-    with pytest.raises(ValueError, match="a name for each of the 3"):
-        state_knowledge(looking_at_the_first_then_the_second(), names=("a", "b"))
-
-
 def test_the_report_on_a_policy_has_frames_and_figures(tmp_path):
     model = tiny_tdpg(PROBLEM)
     env = make_episodes_env(PROBLEM, n_episodes=40)
@@ -87,8 +85,7 @@ def test_the_report_on_a_policy_has_frames_and_figures(tmp_path):
     assert report.knowledge.loc[report.knowledge["component"] == "v (m/step)", "nats"].isna().tolist()[0], "v_0 = 0"
     for name, figure in report.figures().items():
         save_figure(figure, tmp_path / f"{name}.png")
-    assert (tmp_path / "timeline.png").exists()
-    assert (tmp_path / "knowledge.png").exists()
+    assert {path.stem for path in tmp_path.iterdir()} >= {"timeline", "knowledge"}
     again = information_report(model, env, n_episodes=50, seed=3)
     pd.testing.assert_frame_equal(report.frame, again.frame)
     env.close()
@@ -163,14 +160,11 @@ def test_the_timeline_names_the_bounds():
     interval = information_interval(gaussian_batch(100, [[0.0, 0.0], [100.0, 100.0]], generator=generator()))
     axes = information_timeline(interval_frame(interval)).axes[0]
     labels = axes.get_legend_handles_labels()[1]
-    assert "lower: frozen critic" in labels
-    assert "lower: never negative" in labels
+    assert {"lower: frozen critic", "lower: never negative"} < set(labels)
     assert any("ln N" in label for label in labels)
 
 
 def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the_training(tmp_path, monkeypatch):
-    from stable_baselines3.common.logger import configure
-
     # The console cuts these to the same name.
     wheels = [f"angular velocity of the wheel on the {side}" for side in ("left", "right")]
     monkeypatch.setattr(LavaEnv, "state_names", tuple(f"{name} (rad/s)" for name in wheels))
