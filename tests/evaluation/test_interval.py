@@ -12,7 +12,6 @@ from sb3_tdpg.evaluation.interval import (
     LOWER_BOUNDS,
     UPPER_BOUNDS,
     _gap,
-    component_estimates,
     joint_quantile,
     limit,
     min_episodes,
@@ -182,14 +181,6 @@ def test_only_living_episodes_count_and_a_step_with_too_few_has_no_interval():
     assert (ended.n_left_out, ended.n_episodes[3]) == (0, 0)
 
 
-def test_the_limit_of_a_component_lies_below_its_estimate_and_a_constant_one_has_none():
-    batch = gaussian_batch(100, [[1.0, 1.0]], generator=generator())
-    states = th.cat([batch.states, th.ones(1, 100, 1)], dim=2)
-    estimates, limits = component_estimates(batch._replace(states=states))
-    assert (limits[:, :2] < estimates[:, :2]).all()
-    assert np.isnan(estimates[:, 2]).all() and np.isnan(limits[:, 2]).all()
-
-
 def test_many_trvs_need_more_than_two_living_episodes_for_each():
     batch = gaussian_batch(62, [[0.5] * 30] * 2, generator=generator())
     alive = th.ones(2, 62, dtype=th.bool)
@@ -197,13 +188,6 @@ def test_many_trvs_need_more_than_two_living_episodes_for_each():
     interval = information_interval(batch._replace(alive=alive))
     assert np.isfinite([interval.lower, interval.upper]).tolist() == [[True, False], [True, False]]
     assert (min_episodes(30), min_episodes(2)) == (62, 20)
-
-
-def test_a_higher_confidence_is_a_wider_interval():
-    batch = gaussian_batch(100, [[1.0, 1.0]], generator=generator())
-    wide, narrow = (information_interval(batch, confidence=c) for c in (0.99, 0.8))
-    assert wide.lower < narrow.lower
-    assert narrow.upper < wide.upper
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -218,7 +202,7 @@ def test_a_batch_that_is_not_fit_is_refused(change, message):
         information_interval(random_batch()._replace(**change))
 
 
-@pytest.mark.parametrize("confidence", [0.0, 1.0, 95, math.nan])
+@pytest.mark.parametrize("confidence", [0.0, 1.0, math.nan])
 def test_a_confidence_out_of_its_range_is_refused(confidence):
     with pytest.raises(ValueError, match="confidence="):
         information_interval(random_batch(), confidence=confidence)
