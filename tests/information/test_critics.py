@@ -79,9 +79,9 @@ def test_a_broken_critic_starts_anew_and_leaves_the_others_alone(name, poison):
         return estimator, batch, estimator.fit(batch)
 
     sound, _, diagnostics = fit(poisoned=False)
-    assert diagnostics["critic_refits"] == 0
+    assert diagnostics == {"critic_refits": 0}  # nothing else, as nothing is held out
     mended, batch, diagnostics = fit(poisoned=True)
-    assert diagnostics["critic_refits"] == 1
+    assert diagnostics == {"critic_refits": 1}
     estimate = mended(batch)
     assert th.isfinite(estimate).all()
     assert (estimate > -0.5).all()
@@ -215,18 +215,6 @@ def test_the_critics_never_see_an_episode_that_is_held_out(name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", CRITICS)
-def test_holding_out_nothing_reports_nothing_and_draws_no_number(name):
-    results = []
-    for settings in ({}, dict(held_out=0.0)):
-        th.manual_seed(0)
-        estimator = build(name, 4, 2, 2, **TINY_CRITIC, **settings)
-        assert set(estimator.fit(random_batch())) == {"critic_refits"}
-        results.append((parameters(estimator), th.rand(3)))
-    assert_same_parameters(results[0][0], results[1][0])
-    assert th.equal(results[0][1], results[1][1])
-
-
-@pytest.mark.parametrize("name", CRITICS)
 def test_one_episode_that_ends_early_leaves_the_estimates_of_the_others(name):
     numbers = th.randn(3, 60, 1)
     batch = InformationBatch(numbers, numbers + th.randn_like(numbers), numbers, th.ones_like(numbers))
@@ -276,15 +264,20 @@ def with_garbage(batch, value):
     "settings", [{}, dict(standardize=True), dict(held_out=0.4)], ids=["plain", "standardized", "held_out"]
 )
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))
-def test_what_stands_where_an_episode_has_ended_makes_no_difference(name, settings):
+def test_what_stands_where_an_episode_has_ended_makes_no_difference_and_gets_no_gradient(name, settings):
     batch = random_batch(alive=half_dead())
     results, reports = [], []
     for garbage in (0.5, 1e4):
+        samples = with_garbage(batch, garbage)
         th.manual_seed(0)
         estimator = build(name, 4, 2, 2, **{**TINY_CRITIC, **settings})
         for _ in range(2):
-            reports.append(estimator.fit(with_garbage(batch, garbage)))
-        results.append(estimator(with_garbage(batch, garbage)))
+            reports.append(estimator.fit(samples))
+        inputs = [x.requires_grad_() for x in samples[1:4]]
+        results.append(estimator(samples))
+        for gradient in th.autograd.grad(results[-1].sum(), inputs, allow_unused=True):
+            if gradient is not None:
+                assert gradient[~batch.alive].abs().sum() == 0 < gradient[batch.alive].abs().sum()
     assert th.isfinite(results[0]).all()
     assert results[0][3] == 0  # too few episodes
     th.testing.assert_close(results[0], results[1])
@@ -296,17 +289,6 @@ def test_what_stands_where_an_episode_has_ended_makes_no_difference(name, settin
 def test_a_step_is_estimated_from_the_episodes_that_live(name):
     batch = random_batch(alive=half_dead())
     th.testing.assert_close(build(name, 4, 2, 2)(batch)[2:3], build(name, 1, 2, 2)(batch.at(2)))
-
-
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
-def test_no_gradient_flows_into_dead_episodes(name):
-    batch = random_batch(alive=half_dead())
-    inputs = [getattr(batch, key).requires_grad_() for key in ("trvs", "means", "stds")]
-    build(name, 4, 2, 2, **TINY_CRITIC)(batch).sum().backward()
-    for x in inputs:
-        if x.grad is not None:
-            assert x.grad[~batch.alive].abs().sum() == 0
-            assert x.grad[batch.alive].abs().sum() > 0
 
 
 @pytest.mark.parametrize("name", CRITICS)
