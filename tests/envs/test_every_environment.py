@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
-from small_problems import words
+from small_problems import LinearProblem, words
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs import ENTRY_POINTS
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
@@ -127,36 +126,8 @@ def test_drawing_does_not_change_an_episode(env_id):
     drawn.close()
 
 
-def still_ball(**kwargs):
-    """Ball catching that draws no number but for noise."""
-    return BallCatchEnv(robot_range=(0.5, 0.5), **kwargs)
-
-
-@pytest.mark.parametrize(("make", "perturbation"), [
-    (LavaEnv, dict(sensor_noise_std=50.0)),
-    (still_ball, dict(pixel_noise_std=0.2)),
-    (still_ball, dict(pixel_noise_std=0.2, noise_mode="clip")),
-    (still_ball, dict(texture="violet_dots")),
-], ids=words)  # fmt: skip
-def test_a_perturbation_reaches_the_observation_in_every_episode_and_never_the_true_state(make, perturbation):
-    def run(**kwargs):
-        env = BatchedVecEnv(make(horizon=4, **kwargs), 1)
-        env.seed(0)
-        observations, states = [env.reset()[0]], [env.reset_infos[0]["state"]]
-        for _ in range(11):
-            observation, _, dones, infos = env.step(np.full((1, 1), 0.3))
-            observations.append(observation[0])
-            states.append(env.reset_infos[0]["state"] if dones[0] else infos[0]["state"])
-        return np.array(observations), np.array(states)
-
-    observations, states = run(**perturbation)
-    clean_observations, clean_states = run(**dict.fromkeys(perturbation.keys() & {"sensor_noise_std"}, 0.0))
-    np.testing.assert_array_equal(states, clean_states)
-    assert ((observations != clean_observations).reshape(12, -1).mean(axis=1) > 0.3).all()
-
-
 @pytest.mark.parametrize("make", [
-    lambda: still_ball(pixel_noise_std=0.1),
+    lambda: BallCatchEnv(robot_range=(0.5, 0.5), pixel_noise_std=0.1),
     lambda: PandaGraspEnv(depth_noise_std=0.3, xy_half_width=0.0, yaw_range=(0.0, 0.0)),
 ], ids=["ball", "panda"])  # fmt: skip
 def test_noise_follows_the_seed_differs_between_images_and_stays_in_the_space(make):
@@ -171,10 +142,12 @@ def test_noise_follows_the_seed_differs_between_images_and_stays_in_the_space(ma
 
 
 OF_SCENES = {
+    LavaEnv: [(dict(sensor_noise_std=50.0), True), (dict(action_cost=1.0), False)],
     BallCatchEnv: [
-        *((dict(keywords, renderer=renderer), True) for renderer in ("pybullet", "fast") for keywords in (
+        *((keywords, True) for keywords in (
             dict(ball_color=(1.0, 0.0, 1.0)), dict(ball_radius=1.0), dict(camera_height=1.5), dict(camera_pitch=20.0),
-            dict(fov=70.0), dict(texture="random-3"),
+            dict(fov=70.0), dict(texture="random-3"), dict(pixel_noise_std=0.2),
+            dict(pixel_noise_std=0.2, noise_mode="clip"),
         )),
         (dict(gravity=5.0), False),
     ],
@@ -188,10 +161,10 @@ OF_SCENES = {
 @pytest.mark.parametrize(
     ("make", "keywords", "changes"), [(make, *row) for make, rows in OF_SCENES.items() for row in rows], ids=words
 )
-def test_a_keyword_of_the_scene_changes_the_image_one_of_the_physics_does_not_and_neither_the_state(
+def test_a_keyword_of_the_scene_changes_the_observation_one_of_the_physics_does_not_and_neither_the_state(
     make, keywords, changes
 ):
-    plain, other = make(**{k: v for k, v in keywords.items() if k == "renderer"}), make(**keywords)
+    plain, other = make(), make(**keywords)
     (expected_image, expected), (image, info) = (env.reset(seed=0) for env in (plain, other))
     assert np.array_equal(image, expected_image) != changes
     np.testing.assert_array_equal(info["state"], expected["state"])
@@ -300,9 +273,8 @@ REFUSED = {
         (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
         (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
         (dict(max_action=0.0), "max_action=0.0 must be finite and positive"),
-        (dict(action_cost=np.nan), "action_cost=nan must be finite"),
-        (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
-        (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
+        *(({name: np.nan}, f"{name}=nan must be finite")
+          for name in ("action_cost", "lava_stage_cost", "lava_terminal_cost")),
         (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
         (dict(start_beta=(0.0, 1.0)), r"start_beta=\(0.0, 1.0\) must be two positive numbers"),
         (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
@@ -312,17 +284,13 @@ REFUSED = {
         (dict(noise_mode="max"), r"noise_mode='max' must be one of \['minmax', 'clip'\]"),
         (dict(renderer="opengl"), r"renderer='opengl' must be one of \['pybullet', 'fast'\]"),
         (dict(n_processes=0), "n_processes=0 must be"),
-        (dict(dt=0.0), "dt=0.0 must be finite and positive"),
-        (dict(control_gain=-1.0), "control_gain=-1.0 must be finite and positive"),
         (dict(gravity=np.inf), "gravity=inf must be finite"),
-        (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
+        *(({name: 0.0}, f"{name}=0.0 must be finite and positive")
+          for name in ("dt", "control_gain", "max_action", "ball_radius", "camera_height")),
         (dict(robot_range=(1.0, -1.0)), r"robot_range=\(1.0, -1.0\) must be \(low, high\)"),
-        (dict(robot_range=2.0), r"robot_range=2.0 must be \(low, high\)"),
         (dict(ball_start_range=(8.0, 1.0)), r"ball_start_range=\(8.0, 1.0\) must be \(\(low_x, low_y\)"),
         (dict(ball_speed_range=((-4, 8), (-5, 8))), r"ball_speed_range=.* must be \(\(low_x, low_y\).* low <= high"),
         (dict(ball_color=(0, 255, 0)), r"ball_color=\(0, 255, 0\) must be \(red, green, blue\), each between 0 and 1"),
-        (dict(ball_radius=0.0), "ball_radius=0.0 must be finite and positive"),
-        (dict(camera_height=-1.0), "camera_height=-1.0 must be finite and positive"),
         (dict(camera_pitch=90.0), "camera_pitch=90.0 must be between -90 and 90 degrees"),
         (dict(fov=np.nan), "fov=nan must be between 0 and 180 degrees"),
         (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
@@ -338,7 +306,6 @@ REFUSED = {
         (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
         (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
         (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
-        (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
         *((dict(camera_range=value), r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1")
           for value in [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05]),
         *((keywords, "camera_shift=.* must leave the camera within 0.1 m of its usual height")
@@ -382,39 +349,16 @@ def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
             BallCatchEnv(texture=kind(tmp_path / name))
 
 
-class Switch(POMDPEnv):
-    """Two actions, and a cost of 1 for the wrong one."""
-
-    def __init__(self):
-        super().__init__(horizon=3)
-        self.state_space = self.observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self.action_space = spaces.Discrete(2)
-
-    def initial_state(self, n):
-        return self.np_random.choice([-1.0, 1.0], (n, 1))
-
-    def dynamics(self, state, action):
-        return state
-
-    def sensor(self, state):
-        return state.astype(np.float32)
-
-    def cost(self, state, action):
-        return (action != (state[:, 0] > 0)).astype(float)
-
-    def terminal_cost(self, state):
-        return np.zeros(len(state))
-
-
 def test_actions_may_have_two_dimensions_or_be_discrete():
-    env = Switch()
+    env = LinearProblem()
     env.action_space, env.cost = spaces.Box(-1, 1, (2, 2)), lambda state, action: action[:, 0, 1]
+    env.dynamics, env.terminal_cost = lambda state, action: state, lambda state: np.zeros(len(state))
     env.reset()
     assert env.step(np.array([[0.0, 0.5], [0.0, 0.0]]))[1] == -0.5
-    env = Switch()
-    observation, _ = env.reset(seed=0)
-    assert [env.step(action)[1] for action in (0, 1)] == [-1.0, 0.0] if observation[0] > 0 else [0.0, -1.0]
-    env = BatchedVecEnv(Switch(), 100)
+    env.action_space, env.cost = spaces.Discrete(2), lambda state, action: (action != (state[:, 0] > 0)).astype(float)
+    _, info = env.reset(seed=0)
+    assert [env.step(action)[1] for action in (0, 1)] == [-1.0, 0.0] if info["state"] > 0 else [0.0, -1.0]
+    env = BatchedVecEnv(env, 100)
     model = TDPG("TRVPolicy", env, n_episodes=100, beta=math.inf, learning_rate=1e-2, seed=0, device="cpu")
-    model.learn(100 * 3 * 30)
-    assert model.rollout_buffer.episode_costs.mean() < 0.8  # 1.5 by chance
+    model.learn(100 * 2 * 30)
+    assert model.rollout_buffer.episode_costs.mean() < 0.5  # 1.0 by chance
