@@ -132,7 +132,6 @@ QUICKSTART_MAKES = (
     "results/report-CartPole-v1/report.html",
     "ball.gif",
     "logs/tdpg/Lava-v0_1/Lava-v0.zip",
-    "results/sweep-Lava-v0/selected.zip",
 )
 
 

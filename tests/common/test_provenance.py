@@ -40,8 +40,8 @@ def test_the_command_is_told_without_the_folders_of_the_machine(tmp_path, monkey
         sys, "orig_argv", [str(tmp_path / "bin" / "python3"), "-m", "sb3_tdpg", "--out", str(out), "./x"]
     )
     assert provenance()["command"] == "python3 -m sb3_tdpg --out 'results/a b' ./x"
-    monkeypatch.setattr(sys, "orig_argv", ["/venv/bin/python3", "/venv/bin/sb3-tdpg", "sweep", "--out", str(out)])
-    assert provenance()["command"] == "sb3-tdpg sweep --out 'results/a b'"
+    monkeypatch.setattr(sys, "orig_argv", ["/venv/bin/python3", "/venv/bin/sb3-tdpg", "demo", "--out", str(out)])
+    assert provenance()["command"] == "sb3-tdpg demo --out 'results/a b'"
     monkeypatch.setattr(sys, "orig_argv", ["python", "train.py"])
     assert provenance()["command"] == "python train.py"
 

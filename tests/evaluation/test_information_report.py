@@ -1,10 +1,11 @@
-"""What a policy's TRVs know: of each component of the state, in the report with its figures, and in the log."""
+"""What a policy's TRVs know: of each component, in the report with its figures, in the log, and in an episode."""
 
 import math
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 from information_problems import channel, gaussian_batch, generator
 from small_problems import CountdownEnv, lava_env, tiny_tdpg, train_epochs
 from stable_baselines3 import PPO
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import InformationCallback, SelectionCallback, make_episodes_env
 from sb3_tdpg.envs.lava import LavaEnv
+from sb3_tdpg.envs.scenarios import LAVA
 from sb3_tdpg.evaluation import information as information_module
 from sb3_tdpg.evaluation import (
     information_interval,
@@ -24,8 +26,10 @@ from sb3_tdpg.evaluation import (
     save_figure,
     state_knowledge,
 )
-from sb3_tdpg.evaluation.information import encode_episodes
+from sb3_tdpg.evaluation.information import encode_episodes, information_bounds, rollout_information
 from sb3_tdpg.evaluation.interval import component_estimates, min_episodes
+from sb3_tdpg.information import InformationBatch
+from sb3_tdpg.information.loo import own_sample_bound
 
 PROBLEM = "Lava-v0"
 
@@ -188,3 +192,69 @@ def test_a_callback_is_refused_where_an_epoch_has_too_few_episodes_for_an_interv
     model = tiny_tdpg(PROBLEM, n_episodes=min_episodes(2) - 1)
     with pytest.raises(ValueError, match=r"n_episodes=19 is too small.* at least 20"):
         train_epochs(model, 1, callback=InformationCallback())
+
+
+def of_gaussian_noise(means):
+    return InformationBatch(means, means + th.randn_like(means), means, th.ones_like(means))
+
+
+# The TRVs are a sample, which alone would give the lower bound of the faint ones an error of ten times the truth.
+@pytest.mark.parametrize(("spread", "n_steps", "n_episodes", "tolerances"), [
+    (2.0, 3, 2000, (dict(abs=0.1), dict(abs=0.2))),
+    (0.02, 5, 1000, (dict(rel=0.25), dict(rel=0.25))),
+])  # fmt: skip
+def test_bounds_enclose_the_information_of_a_gaussian_channel(spread, n_steps, n_episodes, tolerances):
+    exact = n_steps * 2 * 0.5 * math.log(1 + spread**2)  # in each of two components, at each step
+    for _ in range(5):
+        bounds = information_bounds(of_gaussian_noise(spread * th.randn(n_steps, n_episodes, 2)))
+        assert bounds.upper == pytest.approx(exact, **tolerances[0])
+        assert bounds.lower == pytest.approx(exact, **tolerances[1])
+
+
+@pytest.mark.parametrize("n_episodes", [5, 40, 1000])
+@pytest.mark.parametrize("spread", [0.0, 0.02, 1.0])
+def test_the_bound_from_below_is_never_above_the_one_from_above(spread, n_episodes):
+    for _ in range(20):
+        bounds = information_bounds(of_gaussian_noise(spread * th.randn(5, n_episodes, 2)))
+        assert bounds.lower <= bounds.upper
+
+
+def test_the_bound_from_below_is_that_of_the_own_sample_with_less_noise():
+    modes = 3.0 * th.randint(0, 2, (40, 1, 400, 2)).float()
+    skew = th.randn(40, 1, 400, 2).exp()
+    for means in (modes, skew):
+        batches = [of_gaussian_noise(each) for each in means]
+        plain = np.array([own_sample_bound(batch).item() for batch in batches])
+        lower = np.array([information_bounds(batch).lower for batch in batches])
+        assert (lower - plain).mean() == pytest.approx(0.0, abs=4 * (lower - plain).std() / math.sqrt(len(plain)))
+        assert lower.std() < 1.1 * plain.std()
+
+
+@pytest.mark.parametrize(("n_alive", "counts"), [(0, 1), (4, 2)])
+def test_a_step_with_few_living_episodes_knows_as_much_as_the_last_with_enough_and_one_with_none_nothing(
+    n_alive, counts
+):
+    x = th.randn(2, 500, 3)
+    alive = th.ones(2, 500, dtype=th.bool)
+    alive[1, n_alive:] = False  # 3 TRVs take 5 episodes
+    batch = InformationBatch(x, x, x, th.ones_like(x), alive)
+    first = information_bounds(InformationBatch(*(v[:1] for v in batch[:4])))
+    assert information_bounds(batch) == (counts * first.upper, counts * first.lower)
+    with pytest.raises(ValueError, match="3 TRVs cannot be estimated from 4 episodes: it takes at least 5"):
+        information_bounds(InformationBatch(*(v[:, :4] for v in batch[:4])))
+
+
+def test_rollouts_for_the_information_are_those_of_the_policy():
+    model = tiny_tdpg(n_episodes=400)
+    model.learn(model.n_episodes * model.horizon)
+    with th.no_grad():
+        in_training = model.estimator(model.rollout_buffer.episode_batch().information_batch()).sum().item()
+    fresh = rollout_information(model, LAVA[0], 2000)
+    assert fresh.trvs.shape == (model.horizon, 2000, model.policy.trv_dim)
+    assert fresh.states.shape == (model.horizon, 2000, 2)
+    # The start positions are drawn, and so is the noise of the TRVs.
+    noise = (fresh.trvs - fresh.means) / fresh.stds
+    assert noise.std().item() == pytest.approx(1.0, abs=0.05)
+    assert information_bounds(fresh).upper == pytest.approx(in_training, rel=0.35, abs=0.02)
+    again = rollout_information(model, LAVA[0], 2000)
+    assert (again.trvs == fresh.trvs).all()
