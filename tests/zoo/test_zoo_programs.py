@@ -18,7 +18,7 @@ import optuna
 from rl_zoo3.utils import get_trained_models
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_tdpg.experiments.studies import open_storage
+from sb3_tdpg.zoo.studies import open_storage
 
 BLOCK = "policy: TRVPolicy, n_timesteps: 200, n_episodes: 2, n_envs: 1, mi_estimator: logdet, beta: 1.0"
 NO_EVALUATION = ["--eval-freq", "-1", "--verbose", "0"]
