@@ -38,10 +38,7 @@ class NamedTwice(LavaEnv):
 ARGUMENTS = {
     **{f"policy {name}": (dict(policy=name), f"policy='{name}'", r"\['TRVPolicy'\]", "takes vectors, images and dicts")
        for name in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy", "MlpLstmPolicy")},
-    "policy of PPO": (dict(policy=PPO.policy_aliases["MlpPolicy"]), "ActorCriticPolicy", "TRVPolicy"),
-    "policy a number": (dict(policy=3), "policy=3", "TRVPolicy"),
     "beta zero": (dict(beta=0.0), "beta=0.0", "positive number", "inf"),
-    "beta negative": (dict(beta=-1.0), "beta=-1.0", "positive number"),
     "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
     "beta a string": (dict(beta="0.1"), "beta='0.1'", "a number", "'lin_1e-3'", "auto"),
     "beta a text that ends at zero": (dict(beta="lin_0.5"), "beta=0.0", "positive number"),
@@ -50,7 +47,6 @@ ARGUMENTS = {
     "nuisance a number": (dict(nuisance=3), "nuisance=3: 3 is no perturbation", "a function of the observations"),
     "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
     "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
-    "cost_limit of all": (dict(cost_limit="100%"), "cost_limit='100%'", "between 0 and 100 %", "'95%'"),
     "cost_limit a text": (dict(cost_limit="0.95"), "cost_limit='0.95'", "'95%'"),
     "cost_limit beside a number for beta": (
         dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"
@@ -94,7 +90,6 @@ ARGUMENTS = {
     "n_episodes below n_envs": (dict(env=lava(6), n_episodes=4), "n_episodes=4", r"use 6"),
     "n_episodes no multiple of n_envs of an id": (dict(n_envs=6, n_episodes=20), "use 18 or 24"),
     "n_episodes one": (dict(n_episodes=1), "n_episodes=1", "at least 2"),
-    "n_episodes zero": (dict(n_episodes=0), "n_episodes=0", "integer of at least"),
     "n_episodes a float": (dict(n_episodes=20.0), "n_episodes=20.0", "integer"),
     "n_envs zero": (dict(n_envs=0), "n_envs=0", "integer of at least 1"),
     "n_envs for an environment": (dict(env=lava(20), n_envs=10), "n_envs=10", "leave n_envs out"),
@@ -112,7 +107,6 @@ ARGUMENTS = {
         dict(n_episodes=None, epoch_steps=9), "epoch_steps=9", "two episodes", "n_episodes=2"
     ),
     "nuisance without scenes": (dict(nuisance={"env_kwargs": []}), r"'env_kwargs': \[\]", "hold keywords"),
-    "nuisance with a number for scenes": (dict(nuisance={"env_kwargs": 3}), "'env_kwargs': 3", "a list of such"),
     "nuisance with an unknown keyword": (
         dict(nuisance={"env_kwargs": [{"bar": 3}]}), r"'env_kwargs': \[\{'bar': 3\}\]", "unexpected keyword .*'bar'"
     ),
@@ -124,13 +118,11 @@ ARGUMENTS = {
         dict(nuisance={"vector_noise": [1, 2, 3]}), r"\[1, 2, 3\]", "the lowest and the highest"
     ),
     "gamma zero": (dict(gamma=0.0), "gamma=0.0", r"\(0, 1\]"),
-    "gamma above one": (dict(gamma=1.01), "gamma=1.01", r"\(0, 1\]"),
     "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),
     "max_grad_norm negative": (dict(max_grad_norm=-1.0), "max_grad_norm=-1.0", "positive", "inf"),
     "max_grad_norm NaN": (dict(max_grad_norm=math.nan), "max_grad_norm=nan", "positive", "inf"),
     "target_kl zero": (dict(target_kl=0.0), "target_kl=0.0", "positive", "inf"),
     "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "non-negative"),
-    "learning_rate NaN": (dict(learning_rate=math.nan), "learning_rate=nan", "not negative|positive|finite"),
     "learning_rate a string": (dict(learning_rate="1e-3"), "learning_rate='1e-3'", "number"),
     "learning_rate a schedule that goes below zero": (
         dict(learning_rate=lambda progress: progress - 0.5), "learning_rate=-0.5", "non-negative"
@@ -176,7 +168,6 @@ ARGUMENTS = {
     "action_mean_init too long": (
         dict(policy_kwargs=dict(action_mean_init=[0.1, 0.2])), r"action_mean_init=\[0.1, 0.2\]", "1 numbers", "Box"
     ),
-    "net_arch a list": (dict(policy_kwargs=dict(net_arch=[64, 64])), "net_arch", r"\['action_head', 'encoder'\]"),
     "trv_dim zero": (dict(policy_kwargs=dict(trv_dim=0)), "trv_dim=0", "at least 1"),
     "trv_dim a float": (dict(policy_kwargs=dict(trv_dim=2.5)), "trv_dim=2.5", "integer"),
     "variance floor negative": (
@@ -206,9 +197,6 @@ def test_a_bad_argument_is_refused_with_the_mend(case):
 def test_an_unknown_argument_is_told_with_the_nearest_name_or_its_equivalent(name, mend):
     with pytest.raises(TypeError, match=f"no argument '{name}'{mend}"):
         TDPG("TRVPolicy", **{name: 3})
-
-
-# -- files -----------------------------------------------------------------------------------------------------
 
 
 def half(path):
@@ -265,31 +253,27 @@ def test_a_damaged_model_is_told_in_a_line_that_names_it(write, tmp_path, capsys
         assert not out.exists()
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no_such_model"):
-        TDPG.load(tmp_path / "no_such_model", device="cpu")
-
-
-def test_a_model_of_ppo_is_refused(tmp_path):
-    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"TRVPolicy.*class that saved it"):
-        TDPG.load(tmp_path / "model", device="cpu")
-
-
 @pytest.mark.parametrize(("kwargs", "error", "message"), [
     (dict(env=lava(horizon=7)), ValueError, r"horizon=7.*made for horizon=5.*same shape"),
     (dict(env=lava(6)), ValueError, "use 18 or 24"),
     (dict(env=lava(), beta=-1.0), ValueError, "beta=-1.0 must be a positive number"),
     (dict(mi_estimator="mine"), ValueError, "has no networks for mi_estimator='mine'"),
-], ids=["horizon", "n_envs", "beta", "estimator"])  # fmt: skip
+    (dict(baseline="value"), ValueError, "has no networks for baseline"),
+    (dict(n_episode=100), TypeError, r"n_episode.*n_episodes"),
+], ids=lambda value: " ".join(value) if isinstance(value, dict) else "")  # fmt: skip
 def test_a_model_is_not_loaded_with_what_does_not_fit_and_not_taken_for_damaged(kwargs, error, message, tmp_path):
-    tiny_tdpg().save(tmp_path / "model")
+    tiny_tdpg(beta=math.inf).save(tmp_path / "model")
     with pytest.raises(error, match=message) as refused:
         TDPG.load(tmp_path / "model", **kwargs, device="cpu")
     assert "damaged" not in str(refused.value)
 
 
-# -- a model that stands ---------------------------------------------------------------------------------------
+def test_what_is_no_model_of_tdpg_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no_such_model"):
+        TDPG.load(tmp_path / "no_such_model", device="cpu")
+    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"TRVPolicy.*class that saved it"):
+        TDPG.load(tmp_path / "model", device="cpu")
 
 
 @pytest.mark.parametrize(("env", "message"), [
@@ -305,11 +289,6 @@ def test_an_environment_that_does_not_fit_cannot_be_set_and_leaves_the_old_one(e
     model.learn(100)
 
 
-def test_a_dict_is_refused_by_predict():
-    with pytest.raises(ValueError, match=r"(?i)observation"):
-        tiny_tdpg().predict({"a": np.zeros(2, np.float32)})
-
-
 POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete(2), lr_schedule=lambda _: 1e-3)
 
 
@@ -320,9 +299,7 @@ POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete
     (SelectionCallback, dict(mi_limit=math.nan), "mi_limit is NaN"),
     (SelectionCallback, dict(mi_limit=-0.1), "mi_limit=-0.1 must not be negative"),
     (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=0), "save_freq=0 must be at least 1"),
-    (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=-1), "save_freq=-1 must be at least 1"),
     (TRVPolicy, dict(POLICY, horizon=0), "horizon.*at least 1"),
-    (TRVPolicy, dict(POLICY, horizon=-1), "horizon.*at least 1"),
     (TRVPolicy, dict(POLICY, horizon=2.5), "horizon.*at least 1"),
 ])  # fmt: skip
 def test_a_callback_or_a_policy_of_its_own_refuses_a_bad_argument(make, kwargs, message):
