@@ -47,11 +47,7 @@ def make_model(**kwargs):
         buffer.add_step(
             np.full(n, t),
             alive,
-            observations=rng.normal(size=(n, 2)),
-            states=rng.normal(size=(n, 2)),
-            noise=rng.normal(size=(n, Z)),
-            trvs=rng.normal(size=(n, Z)),
-            means=rng.normal(size=(n, Z)),
+            **{name: rng.normal(size=(n, 2)) for name in ("observations", "states", "noise", "trvs", "means")},
             stds=rng.uniform(0.5, 1, (n, Z)),
             actions=rng.normal(size=(n, 1)),
             costs=rng.normal(size=n),
