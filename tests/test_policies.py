@@ -290,7 +290,7 @@ def test_a_saved_policy_predicts_the_same(tmp_path):
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array")  # a scalar action
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
 @pytest.mark.parametrize("space", ACTION_SPACES.values(), ids=ACTION_SPACES)
-def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encoder_gradient, tmp_path):
+def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encoder_gradient):
     # ToyEnv asserts that each action is in the space.
     model = tiny_tdpg(toy_vec_env(action_space=space), encoder_gradient=encoder_gradient, beta=0.1)
     before = parameters(model.policy)
@@ -303,10 +303,6 @@ def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encode
         assert space.contains(action)
         batch, _ = model.predict(np.stack([observation] * 5), deterministic=deterministic)
         assert batch.shape == (5, *space.shape)
-    model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", device="cpu")
-    expected, _ = model.predict(observation, deterministic=True)
-    np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], expected)
 
 
 @pytest.mark.parametrize("name", ["box", "discrete", "multi_discrete", "multi_binary"])
