@@ -39,6 +39,7 @@ def test_vectors_are_learnt_from_with_one_update_an_epoch():
     assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, None)
     assert (model.clip_range(1.0), model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "logdet")
     assert not model.normalize_advantage
+    assert [model.lr_schedule(progress) for progress in (1.0, 0.0)] == pytest.approx([2e-3, 2e-5])
     assert model.rollout_buffer.n_envs == model.env.num_envs == 500
 
 
