@@ -22,7 +22,7 @@ from small_problems import (
 )
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.logger import HParam, configure
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -129,17 +129,6 @@ def test_evaluation_in_mid_rollout_does_not_disturb_the_training(tmp_path):
     TDPG.load(tmp_path / "best_model", device="cpu")
 
 
-def test_a_callback_can_stop_the_training_in_mid_rollout_and_the_model_learns_on():
-    model = tiny_tdpg()
-    calls = []
-    train_epochs(model, 5, callback=AtEveryStep(lambda c: calls.append(1) or c.n_calls < 8))
-    assert len(calls) == 8
-    assert model.epoch == 1
-    train_epochs(model, 2, reset_num_timesteps=False)
-    assert model.epoch == 3
-    assert (model.rollout_buffer.states[0, :, 1] == 0).all()  # the rollouts begin at the start of an episode
-
-
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_progress_has_lines_where_there_is_no_terminal(monkeypatch, capsys, is_terminal):
@@ -185,10 +174,6 @@ def test_the_log_has_what_the_paper_plots_and_the_single_steps_go_to_tensorboard
     np.testing.assert_allclose(scalars["rollout/ep_cost_mean"], costs, rtol=1e-5)
     np.testing.assert_allclose(scalars["mi/total"], np.sum(information, axis=1), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(scalars["mi/t03"], np.array(information)[:, 3], rtol=1e-4, atol=1e-6)
-    # The values that train() records are written with the next epoch.
-    objective = costs[0] + 75 * information[0].sum()
-    assert scalars["train/objective"][0] == pytest.approx(objective, rel=1e-4)
-
     header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
     assert expected <= set(header)
     assert not per_step & set(header)
@@ -277,17 +262,6 @@ def test_an_environment_that_leaves_out_its_state_is_refused_with_the_mend():
         train_epochs(tiny_tdpg(env), 1)
 
 
-def test_the_recipe_for_hyperparameters_in_tensorboard_works_with_the_defaults(tmp_path):
-    """The recipe is from SB3's documentation."""
-    pytest.importorskip("tensorboard")
-    model = TDPG("TRVPolicy", "Lava-v0", device="cpu")
-    logger = configure(str(tmp_path), ["tensorboard"])
-    values = {"learning rate": model.learning_rate, "gamma": model.gamma, "clip range": model.clip_range(1.0)}
-    logger.record("hparams", HParam(values, {"rollout/ep_rew_mean": 0.0}), exclude=("stdout", "log", "json", "csv"))
-    logger.dump(0)
-    assert [model.lr_schedule(progress) for progress in (1.0, 0.0)] == pytest.approx([2e-3, 2e-5])
-
-
 def test_the_first_deterministic_evaluation_warns_that_it_is_another_policy():
     model = tiny_tdpg()
     with pytest.warns(UserWarning, match=r"deterministic=True .* not the policy that was trained") as warned:
@@ -296,6 +270,8 @@ def test_the_first_deterministic_evaluation_warns_that_it_is_another_policy():
     assert len([w for w in warned if "deterministic=True" in str(w.message)]) == 1
 
 
-def test_the_tuple_that_a_gymnasium_reset_returns_is_refused():
+def test_a_dict_and_the_tuple_that_a_gymnasium_reset_returns_are_refused():
     with pytest.raises(ValueError, match="mixing Gym API with SB3 VecEnv API"):
         tiny_tdpg().predict(LavaEnv().reset())
+    with pytest.raises(ValueError, match=r"(?i)observation"):
+        tiny_tdpg().predict({"a": np.zeros(2, np.float32)})
