@@ -94,16 +94,6 @@ def test_a_folder_with_another_run_is_refused_before_any_run_begins_and_left_alo
     assert not (tmp_path / "new").exists()
 
 
-def test_the_command_line_tells_bad_input_in_one_line_with_exit_code_2(demo, capsys):
-    assert main(["demo", "--out", str(demo[0]), "--n-timesteps", "900", "--n-eval-episodes", "8"]) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("error: ")
-    assert "settings" in error
-    with pytest.raises(SystemExit) as refused:
-        main(["demo", "--n-timesteps", "0"])
-    assert refused.value.code == 2
-
-
 def test_an_interrupted_run_goes_on_to_the_same_result(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_tdpg.experiments.runs.MAX_CHECKPOINT_EPOCHS", 2)
     complete_run(tiny_run(), tmp_path / "whole", LAVA, n_eval_episodes=4)
