@@ -152,10 +152,8 @@ def test_a_card_that_is_written_is_not_given_other_settings_or_another_name(card
 
 @pytest.mark.parametrize(("n", "low", "high"), [(0, 0, 0.27753), (1, 0.01788, 0.40415)])
 def test_shares_of_failures_have_wilsons_interval(n, low, high):
-    failure = [True] * n + [False] * (10 - n)
-    records = pd.DataFrame(
-        dict(model="PG", scenario="Training", cost=0.0, failure=failure, seed=0, deterministic=False)
-    )
+    failed = [True] * n + [False] * (10 - n)
+    records = pd.DataFrame(dict(model="PG", scenario="Training", cost=0.0, failure=failed, seed=0, deterministic=False))
     results = results_with_intervals(records)
     assert results.loc[0, ["failure_low", "failure_high"]].tolist() == pytest.approx([low, high], abs=1e-5)
     text = model_card(Publication(model=Path("model.zip"), env_id="Lava-v0", records=records), results, REPO_ID).text
@@ -184,9 +182,7 @@ def cut(share):
        r"config\.json does not describe a run \(.*\): give a run's folder")
       for text in ("{}", "[]", "3", "{", '{"settings": 3}')),
 ])  # fmt: skip
-def test_a_run_that_is_not_whole_is_refused_in_a_line_and_nothing_is_written(
-    name, damage, message, runs, tmp_path, capsys
-):
+def test_a_run_that_is_not_whole_is_refused_in_a_line_and_writes_nothing(name, damage, message, runs, tmp_path, capsys):
     copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
     damage(copy / name)
     line = error_line(capsys, "push", copy, "--repo-id", REPO_ID, "--dry-run", "--card", tmp_path / "card")
@@ -225,9 +221,7 @@ def test_records_that_are_not_of_one_policy_or_a_damaged_model_are_refused(runs,
     assert not (tmp_path / "card").exists()
 
 
-def test_an_interrupted_card_leaves_nothing_and_can_be_written_again_without_unpickling_the_model(
-    runs, tmp_path, monkeypatch
-):
+def test_an_interrupted_card_leaves_nothing_and_is_written_again_without_unpickling(runs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("sb3_tdpg.hub.transfer.model_card", Mock(side_effect=KeyboardInterrupt))
         write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
