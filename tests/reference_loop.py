@@ -23,6 +23,7 @@ from sb3_tdpg import TDPG
 from sb3_tdpg.common.networks import BatchedMLP
 
 GOAL, WALL, LAVA = 3.0, 0.0, 5.0  # m
+Tensors = list[th.Tensor]
 
 
 class Minibatch(NamedTuple):
@@ -47,10 +48,10 @@ class Randomness(NamedTuple):
 class Episode:
     """The record of an episode, with one entry for each time step."""
 
-    states: list[th.Tensor] = field(default_factory=list)  # (X,)
-    observations: list[th.Tensor] = field(default_factory=list)  # (X,)
-    trvs: list[th.Tensor] = field(default_factory=list)  # (Z,)
-    actions: list[th.Tensor] = field(default_factory=list)  # (U,)
+    states: Tensors = field(default_factory=list)  # (X,)
+    observations: Tensors = field(default_factory=list)  # (X,)
+    trvs: Tensors = field(default_factory=list)  # (Z,)
+    actions: Tensors = field(default_factory=list)  # (U,)
     costs: list[float] = field(default_factory=list)
 
 
@@ -155,17 +156,13 @@ class LoopTDPG:
                 loss.backward()
                 self.critic_optimizers[t].step()
 
-    def donsker_varadhan(
-        self, t: int, states: list[th.Tensor], trvs: list[th.Tensor], minibatch: Minibatch
-    ) -> th.Tensor:
+    def donsker_varadhan(self, t: int, states: Tensors, trvs: Tensors, minibatch: Minibatch) -> th.Tensor:
         """Estimate I[x_t; x~_t] in nats; the critic is called for one sample at a time."""
         joint = [self.critics[t](th.cat([states[i], trvs[i]]))[0] for i in minibatch.joint]
         marginal = [th.exp(self.critics[t](th.cat([states[i], trvs[j]]))[0]) for i, j in minibatch.marginal]
         return sum(joint) / len(joint) - th.log(sum(marginal) / len(marginal))
 
-    def information(
-        self, episodes: list[Episode], trvs: list[list[th.Tensor]], pairings: list[Minibatch]
-    ) -> list[th.Tensor]:
+    def information(self, episodes: list[Episode], trvs: list[Tensors], pairings: list[Minibatch]) -> Tensors:
         """Estimate I[x_t; x~_t] for every t; ``trvs`` are those of each episode at each time step."""
         return [
             self.donsker_varadhan(t, [e.states[t] for e in episodes], [e[t] for e in trvs], pairings[t])
@@ -194,7 +191,7 @@ class LoopTDPG:
         loss.backward()
         self.optimizer.step()
 
-    def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> list[th.Tensor]:
+    def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> Tensors:
         """Compute the TRVs of an episode again, as functions of the encoder's parameters."""
         trvs = [th.zeros(self.trv_dim)]
         for t in range(self.horizon):
