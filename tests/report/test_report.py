@@ -262,9 +262,8 @@ def test_models_of_stacked_observations_are_perturbed_before_the_stack(tmp_path)
     report_of(tmp_path, {"A": model}, "Pendulum-v1", **settings)
     records = pd.read_csv(tmp_path / "episodes.csv.xz").set_index("perturbation")["cost"]
     sensor = partial(PerturbedVecEnv, perturbation="vector_bias", severity=5, seed=0)
-    expected = evaluate_scenarios(
-        model, [Scenario("biased", "Pendulum-v1", short, sensor=sensor)], 3, deterministic=True
-    )
+    row = Scenario("biased", "Pendulum-v1", short, sensor=sensor)
+    expected = evaluate_scenarios(model, [row], 3, deterministic=True)
     np.testing.assert_allclose(records["vector_bias"], expected["cost"])
     assert (records["vector_bias"].to_numpy() != records["unperturbed"].to_numpy()).all()
 
