@@ -62,9 +62,7 @@ def test_a_long_horizon_with_few_episodes_has_enough_for_one_regression_that_all
     targets = cost_to_go(costs, 0.5)[living]
     assert advantages.var() < 0.3 * targets.var()
     # With a separate fit for each step, three episodes would have to predict the costs of three other episodes.
-    per_step = [
-        regression_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(0, 198)
-    ]
+    per_step = [regression_advantages(*(x[t : t + 2] for x in (costs, states, alive)), 0.5, 0.0)[0] for t in range(198)]
     assert advantages.var() < 0.5 * th.stack(per_step)[living[:198]].var()
 
 
