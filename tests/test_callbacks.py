@@ -284,9 +284,7 @@ def test_an_infinite_gradient_stops_the_training_before_the_step():
     (4, "vib", 0.1, False),
     (4, "mine", np.inf, False),  # without a penalty any number of episodes is enough
 ])  # fmt: skip
-def test_too_few_episodes_for_the_critics_are_reported_with_the_number_needed(
-    n_episodes, mi_estimator, beta, warns, recwarn
-):
+def test_too_few_episodes_for_the_critics_are_told_with_the_number(n_episodes, mi_estimator, beta, warns, recwarn):
     # There are two TRVs and two components of the state.
     train_epochs(tiny_tdpg(n_episodes=n_episodes, mi_estimator=mi_estimator, beta=beta), 1)
     messages = [str(w.message) for w in recwarn if "are too few for" in str(w.message)]
