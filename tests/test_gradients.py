@@ -273,16 +273,6 @@ def test_the_expected_gradient_is_that_of_the_true_expected_cost(encoder_gradien
                 assert truth > 20 * error  # the test can detect an error of 20 % in the gradient
 
 
-def test_the_pathwise_gradient_varies_less_than_the_score_gradient():
-    variances = []
-    for encoder_gradient in ("score", "pathwise"):
-        kwargs = dict(encoder_gradient=encoder_gradient, policy_kwargs=dict(optimizer_class=th.optim.SGD), seed=0)
-        gradients, model = gradients_of_epochs(30, 200, **kwargs)
-        of_encoder = [th.full_like(p, "encoder" in name).flatten() for name, p in model.policy.named_parameters()]
-        variances.append(gradients[:, th.cat(of_encoder) > 0].var(0).sum())
-    assert variances[1] < 0.7 * variances[0]
-
-
 def test_the_actions_density_is_taken_at_the_unclipped_action():
     # A gradient at clipped actions would be biased if actions are outside the bounds.
     env = LavaEnv(horizon=2)
