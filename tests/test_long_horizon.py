@@ -281,14 +281,12 @@ def test_a_saved_model_predicts_and_continues_the_same(tmp_path):
     loaded.learn(400, reset_num_timesteps=False)
 
 
-CAMERA_AND_JOINTS = spaces.Dict(
-    camera=spaces.Box(0, 255, (3, 36, 36), np.uint8), joints=spaces.Box(-1, 1, (2,), np.float32)
-)
+IMAGE_VECTOR = spaces.Dict(camera=spaces.Box(0, 255, (3, 36, 36), np.uint8), joints=spaces.Box(-1, 1, (2,), np.float32))
 
 
 @pytest.mark.parametrize("horizon", [4, 60])
 def test_a_camera_beside_joints_is_learnt_from(horizon, tmp_path):
-    env = ToyEnv(observation_space=CAMERA_AND_JOINTS, horizon=horizon)
+    env = ToyEnv(observation_space=IMAGE_VECTOR, horizon=horizon)
     model = TDPG("TRVPolicy", env, n_episodes=4, beta=10.0, seed=0).learn(2 * 4 * horizon)
     assert model.epoch == 2
     assert model.state_dim == 1  # the state from the environment, not the joints
@@ -304,7 +302,7 @@ def test_a_dict_of_vectors_is_its_own_state_and_one_with_an_image_is_not():
     model = tiny(env).learn(400)
     assert model.state_dim == 3
     assert set(model.policy.norm.norms) == {"angles", "speed"}
-    camera = ToyEnv(observation_space=CAMERA_AND_JOINTS, gives_state=False, horizon=60)
+    camera = ToyEnv(observation_space=IMAGE_VECTOR, gives_state=False, horizon=60)
     with pytest.raises(ValueError, match="needs the true state"):
         tiny(camera)
 
