@@ -85,9 +85,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-def test_the_wheel_holds_every_module_environment_template_and_hyperparameter_file_and_nothing_else(
-    wheel: Path,
-) -> None:
+def test_the_wheel_holds_every_module_template_and_hyperparameter_file_and_nothing_else(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {"sb3_tdpg/py.typed", "sb3_tdpg/hub/card.md"}
     expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("envs/**/*.py")}
@@ -100,7 +98,7 @@ def test_the_wheel_holds_every_module_environment_template_and_hyperparameter_fi
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"sb3_tdpg"}
 
 
-def test_the_installed_wheel_makes_lava_and_has_its_own_files_and_the_version_that_it_reports(
+def test_the_installed_wheel_makes_lava_from_its_own_files_and_tells_its_version(
     installed: Path, tmp_path: Path
 ) -> None:
     show = (
