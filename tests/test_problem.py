@@ -58,9 +58,7 @@ def test_a_bad_state_is_named_as_well():
 
 @pytest.mark.parametrize("reward", [-1e30, 1e19, np.inf])
 def test_a_reward_that_is_too_large_is_named_with_environment_and_step(reward):
-    with pytest.raises(
-        ValueError, match=r"environment 1 returned the reward [-+.\de]+ at step 1 of its episode: it must"
-    ):
+    with pytest.raises(ValueError, match=r"environment 1 returned the reward [-+.\de]+ at step 1 of its episode"):
         train_epochs(broken_model(reward=reward), 1)
 
 
