@@ -10,37 +10,27 @@ from sb3_tdpg import TDPG, SelectionCallback, TrainingDivergedError
 from sb3_tdpg.auto_weight import LEVEL_EPOCHS, WINDOW, AutoWeight
 
 
+def values_of(weight, costs, information=4.0):
+    """Update a weight with the costs of epochs; return its value after each of them."""
+    return [weight.update(cost, information) or weight.value for cost in costs]
+
+
 @pytest.mark.parametrize(("limit", "above", "met", "below"), [(10.0, 12.0, 9.0, 5.0), (-400.0, -100.0, -450.0, -490.0)])
 def test_the_weight_waits_for_the_limit_then_grows_below_it_and_shrinks_above(limit, above, met, below):
     """Costs are negative returns, so they are negative in environments with positive rewards."""
-    weight = AutoWeight(cost_limit=limit)
-    for _ in range(5):
-        weight.update(cost=above, information=4.0)
-        assert weight.value == 0.0
-    weight.update(cost=met, information=4.0)
-    start = weight.value
+    *before, start, larger, smaller = values_of(AutoWeight(limit), [above] * 5 + [met, below, above])
+    assert before == [0.0] * 5
     assert start * 4.0 == pytest.approx(abs(limit))
-    weight.update(cost=below, information=4.0)
-    assert weight.value > start
-    larger = weight.value
-    weight.update(cost=above, information=4.0)
-    assert 0 < weight.value < larger
+    assert larger > start
+    assert 0 < smaller < larger
 
 
 def test_a_limit_close_to_the_best_cost_moves_the_weight_as_fast_as_a_distant_one():
     for limit, best, above in ((-475.0, -500.0, -450.0), (-200.0, -500.0, 100.0)):
-        weight = AutoWeight(cost_limit=limit, by_slack=True)
-        weight.update(cost=best, information=4.0)
-        start = weight.value
+        target = (best + limit) / 2
+        start, *values = values_of(AutoWeight(limit, by_slack=True), [best, best, target, above, 1e9])
         assert start * 4.0 == pytest.approx(limit - best)
-        weight.update(cost=best, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
-        weight.update(cost=(best + limit) / 2, information=4.0)  # the target cost
-        assert weight.value == pytest.approx(start * math.exp(0.3 * 0.3))
-        weight.update(cost=above, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5)))
-        weight.update(cost=1e9, information=4.0)
-        assert weight.value == pytest.approx(start * math.exp(0.3 * (0.3 - 1.5 - 3)))
+        assert np.log(np.divide(values, start)) / 0.3 == pytest.approx([0.3, 0.3, 0.3 - 1.5, 0.3 - 1.5 - 3])
 
 
 def test_a_constant_in_every_cost_does_not_change_the_weight_of_a_share():
@@ -66,10 +56,7 @@ def test_costs_that_never_change_have_a_penalty_unless_they_are_zero(cost, is_pe
 
 
 def test_a_slack_limit_does_not_let_the_weight_grow_without_end():
-    weight = AutoWeight(cost_limit=10.0)
-    for _ in range(500):
-        weight.update(cost=0.0, information=0.0)
-    assert weight.value == pytest.approx(10.0 * 1000.0)
+    assert values_of(AutoWeight(10.0), [0.0] * 500, information=0.0)[-1] == pytest.approx(10.0 * 1000.0)
 
 
 def test_costs_that_are_not_finite_leave_the_weight_alone():
@@ -139,13 +126,8 @@ def test_before_the_limit_is_met_the_information_is_measured_but_not_penalised()
 
 def test_the_weight_falls_at_most_by_twice_the_rate():
     """One bad epoch must not cancel the effect of many good epochs."""
-    weight = AutoWeight(cost_limit=10.0)
-    weight.update(10.0, 1.0)
-    before = weight.value
-    weight.update(1e6, 1.0)
-    assert weight.value == pytest.approx(before * math.exp(-0.6))
-    weight.update(-1e6, 1.0)
-    assert weight.value == pytest.approx(before * math.exp(-0.6 + 0.3))
+    start, *values = values_of(AutoWeight(10.0), [10.0, 1e6, -1e6])
+    assert np.log(np.divide(values, start)) == pytest.approx([-0.6, -0.6 + 0.3])
 
 
 def costs_that_level_off(first, best, n_falling=20, n_level=20):
@@ -156,25 +138,21 @@ def costs_that_level_off(first, best, n_falling=20, n_level=20):
 @pytest.mark.parametrize(("first", "best"), [(200.0, 10.0), (-20.0, -500.0), (50.0, -50.0)])
 def test_a_share_is_of_the_improvement_of_costs_of_either_sign(first, best):
     weight = AutoWeight("90%")
-    for cost in costs_that_level_off(first, best):
-        weight.update(cost, information=4.0)
+    values_of(weight, costs_that_level_off(first, best))
     assert weight.limit == pytest.approx(first - 0.9 * (first - best))
     assert weight.first_cost == first
 
 
 def test_with_a_share_the_weight_starts_once_the_cost_has_levelled_off():
-    weight, values = AutoWeight("90%"), []
-    for cost in costs_that_level_off(100.0, 0.0):
-        weight.update(cost, information=4.0)
-        values.append(weight.value)
+    weight = AutoWeight("90%")
+    values = values_of(weight, [*costs_that_level_off(100.0, 0.0), 1e3])
     started = int(np.flatnonzero(values)[0])
     # When the mean over five epochs is below the mean ten epochs earlier by less than the slack.
     assert 20 < started < 20 + WINDOW + LEVEL_EPOCHS
     assert weight.information_before == 4.0
     assert values[started] == pytest.approx(0.1 * 100.0 / 4.0)  # the penalty equals the slack
     assert values[started + 1] > values[started]
-    weight.update(1e3, information=4.0)
-    assert weight.value == pytest.approx(values[-1] * math.exp(-0.9))
+    assert values[-1] == pytest.approx(values[-2] * math.exp(-0.9))
 
 
 def test_with_a_share_the_weight_starts_in_the_middle_of_a_training_that_still_improves():
@@ -188,9 +166,7 @@ def test_with_a_share_the_weight_grows_more_slowly_towards_the_end():
     growth = []
     for progress in (1.0, 0.5, 0.25, 0.0):
         weight = AutoWeight("90%")
-        for cost in [100.0] * 5 + [0.0] * 15:
-            weight.update(cost, information=4.0)
-        before = weight.value
+        before = values_of(weight, [100.0] * 5 + [0.0] * 15)[-1]
         weight.update(0.0, 4.0, progress)
         growth.append(math.log(weight.value / before))
     assert growth == pytest.approx([0.09, 0.09, 0.045, 0.0])
@@ -207,8 +183,7 @@ def test_the_limit_is_known_once_the_first_window_of_costs_is_full():
 
 def test_one_lucky_epoch_does_not_set_the_limit():
     weight = AutoWeight("90%")
-    for cost in [100.0] + [10.0] * 8 + [-90.0] + [10.0] * 8:
-        weight.update(cost, information=4.0)
+    values_of(weight, [100.0] + [10.0] * 8 + [-90.0] + [10.0] * 8)
     smoothed = (4 * 10.0 - 90.0) / WINDOW
     assert weight.limit == pytest.approx(100.0 - 0.9 * (100.0 - smoothed))
 
