@@ -26,7 +26,6 @@ LAVA = ["--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1", "-
 # Twenty epochs of 20 episodes, with a checkpoint in the tenth.
 SHORT = [*LAVA, "-params", "n_episodes:20", "-n", "2000"]
 FILES = sorted(Path(hyperparams.__file__).parent.glob("*.yml"))
-CARTPOLE = ["-params", "n_episodes:4", "batch_size:100", "-n", "100", "--eval-freq", "-1"]
 
 
 def folder_of(path, n=1, algo="tdpg", env="Lava-v0"):
@@ -47,23 +46,27 @@ def test_train_leaves_a_model_and_says_how_it_was_made(here):
     assert not list(folder.rglob("*.partial"))
 
 
-def test_our_environments_run_as_a_batch_for_any_algorithm(here, monkeypatch):
+def test_our_environments_run_as_a_batch_for_any_algorithm_and_others_get_their_keywords(here, monkeypatch):
     from sb3_tdpg.zoo.manager import TDPGExperimentManager
 
     made = []
     create_envs = TDPGExperimentManager.create_envs
 
-    def spy(self, *args, **kwargs):
-        made.append(create_envs(self, *args, **kwargs).unwrapped)
-        return made[-1]
+    def spy(self, n_envs, eval_env=False, no_log=False):
+        env = create_envs(self, n_envs, eval_env, no_log)
+        made.append((env.unwrapped, eval_env))
+        return env
 
     monkeypatch.setattr(TDPGExperimentManager, "create_envs", spy)
     arguments = ["train", "--algo", "ppo", "--env", "Lava-v0", "-n", "100", "--eval-freq", "-1"]
     assert main([*arguments, "-params", "n_envs:20", "batch_size:50"]) == 0
     assert main([*arguments, "-params", "n_envs:2", "batch_size:10", "--vec-env", "subproc"]) == 0
-    assert main(["train", "--env", "CartPole-v1", *CARTPOLE]) == 0
-    kinds = [(type(env).__name__, env.num_envs) for env in made]
-    assert kinds == [("BatchedVecEnv", 20), ("SubprocVecEnv", 2), ("DummyVecEnv", 4)]
+    pendulum = ["train", "--env", "Pendulum-v1", "-n", "100", "-params", "n_episodes:2", "batch_size:100"]
+    assert main([*pendulum, "--env-kwargs", "g:8.0", "--eval-env-kwargs", "g:5.0"]) == 0
+    kinds = [(type(env).__name__, env.num_envs) for env, is_evaluation in made if not is_evaluation]
+    assert kinds == [("BatchedVecEnv", 20), ("SubprocVecEnv", 2), ("DummyVecEnv", 2)]
+    gravities = {is_evaluation: env.get_attr("unwrapped")[0].g for env, is_evaluation in made[2:]}
+    assert gravities == {False: 8.0, True: 5.0}
     PPO.load(folder_of(here, algo="ppo") / "Lava-v0.zip", device="cpu")
 
 

@@ -24,23 +24,6 @@ def loaded(path, env, n=1):
     return TDPG.load(folder_of(path, n, env=env) / f"{env}.zip", device="cpu")
 
 
-def test_environments_get_the_keywords_of_the_command_line(here, monkeypatch):
-    from sb3_tdpg.zoo.manager import TDPGExperimentManager
-
-    gravities = {}
-    create_envs = TDPGExperimentManager.create_envs
-
-    def spy(self, n_envs, eval_env=False, no_log=False):
-        env = create_envs(self, n_envs, eval_env, no_log)
-        gravities["evaluation" if eval_env else "training"] = env.get_attr("unwrapped")[0].g
-        return env
-
-    monkeypatch.setattr(TDPGExperimentManager, "create_envs", spy)
-    command = ["train", "--env", "Pendulum-v1", "-n", "100", "-params", "n_episodes:2", "batch_size:100"]
-    assert main([*command, "--env-kwargs", "g:8.0", "--eval-env-kwargs", "g:5.0"]) == 0
-    assert gravities == dict(training=8.0, evaluation=5.0)
-
-
 def test_the_monitor_writes_the_keywords_of_the_block(here):
     keywords = "monitor_kwargs:dict(info_keywords=('TimeLimit.truncated',))"
     command = ["train", "--env", "Pendulum-v1", "-n", "400", "-params", "n_episodes:2", "batch_size:100", keywords]
