@@ -52,6 +52,7 @@ ARGUMENTS = {
     "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
     "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
     "cost_limit a text": (dict(cost_limit="0.95"), "cost_limit='0.95'", "'95%'"),
+    "cost_limit no number": (dict(cost_limit="x%"), "cost_limit='x%'", "'95%'"),
     "cost_limit and a number": (dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"),
     "n_epochs zero": (dict(n_epochs=0), "n_epochs=0", "integer of at least 1"),
     "batch_size above an epoch": (dict(batch_size=101), "batch_size=101", "between 10 and 100, the steps of an epoch"),

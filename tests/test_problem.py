@@ -70,7 +70,7 @@ def test_a_state_of_another_shape_is_named_with_its_environment(shape):
 
 
 @pytest.mark.parametrize("at_reset", [False, True])
-@pytest.mark.parametrize("make", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("make", [DummyVecEnv, SubprocVecEnv, lambda envs: SubprocVecEnv(envs[1:] * 2)], ids=words)
 def test_an_observation_of_a_wrong_shape_is_named(at_reset, make):
     model = broken_model(observation=np.zeros(3, np.float32), at_reset=at_reset, make=make)
     where = "environment 1 returned an observation of a " if make is DummyVecEnv else ""
