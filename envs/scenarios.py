@@ -148,11 +148,10 @@ PANDA_GRASP_CAMERA: tuple[Scenario, ...] = (
 
 PANDA_SQUEEZE: Mapping[str, Any] = MappingProxyType(dict(turn=(0.995, 0.999), basin=math.radians(65.0)))
 """
-Keywords of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv` that fit the squeezes of
-:class:`~sb3_tdpg.envs.panda_squeeze.PandaSqueezeEnv`, by :func:`~sb3_tdpg.envs.squeeze_fit.fit_squeeze` with 720
-squeezes. For the parts that turn, the model's error has a root mean square of 0.2 degrees and is at most 0.7 degrees.
-In 6 % of the squeezes, at angles between 62.6 and 67.4 degrees to the jaws, friction keeps the part from turning. The
-model neglects this.
+Keywords of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv` that fit 720 squeezes of
+:class:`~sb3_tdpg.envs.panda_squeeze.PandaSqueezeEnv`. For the parts that turn, the model's error has a root mean square
+of 0.2 degrees and is at most 0.7 degrees. In 6 % of the squeezes, at angles between 62.6 and 67.4 degrees to the jaws,
+friction keeps the part from turning. The model neglects this.
 """
 
 PAPER_ROWS: Mapping[str, Sequence[Scenario]] = MappingProxyType(
