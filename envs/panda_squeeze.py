@@ -11,7 +11,7 @@ from .base import BatchStep
 from .panda_arm import Configuration
 from .panda_view import SqueezeView
 from .pool import SharedEnv
-from .squeeze_bullet import SqueezeSimulation
+from .squeeze_bullet import INSERTED, SqueezeSimulation
 from .squeeze_insert import SqueezeInsertEnv
 from .squeeze_scene import SqueezeScene
 
@@ -111,8 +111,8 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
         step = super().step_batch(state, action, is_last=is_last)
         if not is_last:
             return step
-        outcomes = self._shared("inserts", self.yaw(step.state))
-        insertions = [dict(success=push.success, is_success=push.success, height=push.height) for push in outcomes]
+        heights = self._shared("inserts", self.yaw(step.state))
+        insertions = [dict(success=h < INSERTED, is_success=h < INSERTED, height=h) for h in heights]
         return step._replace(details=[{**more, **push} for more, push in zip(step.details, insertions, strict=True)])
 
     def render(self) -> np.ndarray | None:

@@ -58,18 +58,6 @@ class Squeezed(NamedTuple):
     tilt: float  # rad, between the part's vertical axis and the vertical
 
 
-class Inserted(NamedTuple):
-    """The pose of a part after the push into the slot."""
-
-    height: float  # m, height of the middle of the part's lower side above the table
-    yaw: float  # rad
-
-    @property
-    def success(self) -> bool:
-        """Whether the part is in the slot."""
-        return self.height < INSERTED
-
-
 class SqueezeSimulation(ArmSimulation):
     """
     Simulate squeezes with robot, table, part and slot in a separate Bullet world. The robot has no visual shapes.
@@ -148,20 +136,20 @@ class SqueezeSimulation(ArmSimulation):
         away = (position[0] - x, position[1] - y)
         return Squeezed(math.atan2(axes[1, 0], axes[0, 0]), away, math.acos(min(1.0, float(axes[2, 2]))))
 
-    def insert(self, yaw: float, watch: Watch | None = None) -> Inserted:
+    def insert(self, yaw: float, watch: Watch | None = None) -> float:
         """
         Press a part from the mouth of the slot into the slot, with closed jaws.
 
         :param yaw: Angle between part and slot, in rad.
         :param watch: As in :meth:`squeeze`.
+        :return: Height of the middle of the part's lower side above the table, in m; an inserted part is below
+            :data:`INSERTED`.
         """
         self._watch = watch
         self._put_part((*SLOT_PLACE, SLOT_HEIGHT + PART[2] / 2), yaw)
         self._put_arm(self._slot_high, fingers=JAW_BEFORE_PAD)
-        self._run(INSERT, self._slot_low, JAW_BEFORE_PAD, lambda: self._is_inserted() or self._presses_hard())
-        position, orientation = self._pose()
-        axes = self._axes(orientation)
-        return Inserted(position[2] - PART[2] / 2, math.atan2(axes[1, 0], axes[0, 0]))
+        self._run(INSERT, self._slot_low, JAW_BEFORE_PAD, lambda: self._height() < INSERTED or self._presses_hard())
+        return self._height()
 
     def squeezes(
         self, yaws: np.ndarray, jaws: np.ndarray, offsets: np.ndarray, watch: Watch | None = None
@@ -170,7 +158,7 @@ class SqueezeSimulation(ArmSimulation):
         given = zip(yaws.tolist(), jaws.tolist(), offsets.tolist(), strict=True)
         return [self.squeeze(yaw, jaw, (x, y), watch) for yaw, jaw, (x, y) in given]
 
-    def inserts(self, yaws: np.ndarray, watch: Watch | None = None) -> list[Inserted]:
+    def inserts(self, yaws: np.ndarray, watch: Watch | None = None) -> list[float]:
         """Press N parts with the given yaws, ``(N,)``, into the slot. See :meth:`insert`."""
         return [self.insert(yaw, watch) for yaw in yaws.tolist()]
 
@@ -193,8 +181,8 @@ class SqueezeSimulation(ArmSimulation):
     def _fingers_are_open(self) -> bool:
         return all(state[0] > FINGER_OPEN - 0.001 for state in self._states(FINGER_JOINTS))
 
-    def _is_inserted(self) -> bool:
-        return self._pose()[0][2] - PART[2] / 2 < INSERTED
+    def _height(self) -> float:
+        return self._pose()[0][2] - PART[2] / 2
 
     def _presses_hard(self) -> bool:
         """Return whether the hand presses on the part with more than ``PRESS_FORCE``."""
