@@ -16,8 +16,8 @@ BESIDE = 9.5  # m, distance between the side view's camera and the line of the r
 class BulletScene(BulletWorld):
     """Put floor, wall and ball into a separate Bullet world."""
 
-    def __init__(self, scene: BallScene, *, gui: bool = False) -> None:
-        super().__init__(gui=gui)
+    def __init__(self, scene: BallScene) -> None:
+        super().__init__()
         self.scene = scene
         self._add_plane(PLANE_HALF, floor_texture())
         self._wall = self._add_plane(WALL_SCALE * PLANE_HALF, scene.texture)
@@ -69,12 +69,10 @@ class BulletRenderer(BulletScene):
 
 
 class SideView(BulletScene):
-    """Draw a side view with the robot, for pictures and PyBullet's window, not for observations."""
+    """Draw a side view with the robot, for pictures, not for observations."""
 
-    def __init__(self, scene: BallScene, *, gui: bool = False) -> None:
-        super().__init__(scene, gui=gui)
-        if gui:
-            self.client.show_window(BESIDE, 0, -8, MIDDLE)
+    def __init__(self, scene: BallScene) -> None:
+        super().__init__(scene)
         self._move(self._wall, (WALL_X, 0.0, WALL_Z), self._upright)
         self._mast = self._add_box((0.06, 0.06, scene.camera_height / 2), (0.25, 0.25, 0.28))
         self._head = self._add_box((0.22, 0.16, 0.16), (0.15, 0.25, 0.55))

@@ -1,7 +1,6 @@
 """Define the ball-catching problem (Section IV-B of the paper), with a camera as the only sensor."""
 
 import os
-import time
 from functools import cached_property
 from importlib import import_module
 from typing import Any
@@ -62,10 +61,10 @@ class BallCatchEnv(SharedEnv):
     :param renderer: ``"fast"``, a batched ray caster, or ``"pybullet"``, the reference. Their images agree in 99.8 % of
         the pixels.
     :param n_processes: Number of processes that render a batch with PyBullet. This number does not change the results.
-    :param render_mode: ``None``, ``"rgb_array"`` (scene and camera image) or ``"human"`` (PyBullet's window).
+    :param render_mode: ``None`` or ``"rgb_array"`` (scene and camera image).
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 15}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}
     state_names = ("d (m)", "b_x (m)", "b_y (m)", "v_x (m/s)", "v_y (m/s)")
 
     def __init__(
@@ -133,7 +132,7 @@ class BallCatchEnv(SharedEnv):
         from .ball_bullet import SideView
 
         self.check_open()
-        return SideView(self.scene, gui=self.render_mode == "human")
+        return SideView(self.scene)
 
     def initial_state(self, n: int) -> np.ndarray:
         state = np.empty((n, 5))
@@ -176,14 +175,11 @@ class BallCatchEnv(SharedEnv):
         return images
 
     def render(self) -> np.ndarray | None:
-        """Return a picture of side view and camera image, ``(256, 772, 3)`` uint8, or update PyBullet's window."""
+        """Return a picture of side view and camera image, ``(256, 772, 3)`` uint8."""
         if self.render_mode is None:
             return None
         state = self._current_state()
         self._view.place(state[0])
-        if self.render_mode == "human":
-            time.sleep(self.dt)
-            return None
         images = self._world.images(self._seen_from(state))
         # The noise comes from a separate generator, so that rendering does not change an episode.
         (camera_image,) = self._with_noise(images, np.random.default_rng(0))

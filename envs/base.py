@@ -148,8 +148,6 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         self._time = 0
         self._state, observation = self.reset_batch(1)
-        if self.render_mode == "human":
-            self.render()
         return observation[0], {"state": self._state[0].copy()}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -167,6 +165,4 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         info = {"state": self._state[0].copy(), "cost": float(cost[0])}
         for more in details:
             info.update(more)
-        if self.render_mode == "human":
-            self.render()
         return observation[0], -float(cost[0]), terminated, False, info

@@ -2,7 +2,6 @@
 
 import functools
 import os
-import sys
 import tempfile
 import weakref
 from collections.abc import Sequence
@@ -24,37 +23,15 @@ class BulletClient:
     ``client.createMultiBody(...)`` calls ``pybullet.createMultiBody(..., physicsClientId=...)``. A process can have
     several clients; each world has its own bodies. A client is closed by :meth:`close`, by garbage collection, or when
     Python exits.
-
-    :param gui: Whether to open PyBullet's window. A process can have only one window.
-    :raises ValueError: if there is no display for the window.
-    :raises RuntimeError: if PyBullet has no free connection.
     """
 
-    def __init__(self, *, gui: bool = False) -> None:
-        if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            # Without a display PyBullet would end the whole process.
-            raise ValueError(
-                "render_mode='human' opens a window, but the environment variable DISPLAY is not set: run it in a "
-                "desktop session, or use render_mode='rgb_array'"
-            )
-        client_id = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        if client_id < 0:
-            raise RuntimeError(
-                "PyBullet gave no connection: too many environments of this process are open (close() those that "
-                "are done), or its one window is in use"
-            )
-        self.client_id = client_id
-        self._close = weakref.finalize(self, pybullet.disconnect, client_id)
+    def __init__(self) -> None:
+        self.client_id = pybullet.connect(pybullet.DIRECT)
+        self._close = weakref.finalize(self, pybullet.disconnect, self.client_id)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # copy and pickle look up such names before __init__ has run
-            raise AttributeError(name)
         attribute = getattr(pybullet, name)
-        if not callable(attribute):
-            return attribute  # a constant
-        if not self._close.alive:
-            raise RuntimeError("this environment has been closed: make a new one")
-        return functools.partial(attribute, physicsClientId=self.client_id)
+        return functools.partial(attribute, physicsClientId=self.client_id) if callable(attribute) else attribute
 
     def upload_texture(self, image: np.ndarray) -> int:
         """
@@ -75,21 +52,17 @@ class BulletClient:
         rgba = self.getCameraImage(width, height, view, projection, light, shadow=shadow, renderer=renderer)[2]
         return np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3]
 
-    def show_window(self, distance: float, yaw: float, pitch: float, target: tuple[float, float, float]) -> None:
-        """Point the camera of PyBullet's window."""
-        self.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)
-        self.resetDebugVisualizerCamera(distance, yaw, pitch, target)
-
     def close(self) -> None:
         """Close the world; a second call does nothing."""
         self._close()
+        self.client_id = -1  # the next client may get the old number
 
 
 class BulletWorld:
     """Base class of objects that have their own Bullet world, :attr:`client`."""
 
-    def __init__(self, *, gui: bool = False) -> None:
-        self.client = BulletClient(gui=gui)
+    def __init__(self) -> None:
+        self.client = BulletClient()
 
     def close(self) -> None:
         """Close the Bullet world; a second call does nothing."""

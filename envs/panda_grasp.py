@@ -1,6 +1,5 @@
 """Define the grasping problem (Section IV-C of the paper): lift a mug by its rim, given one depth image."""
 
-import time
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
@@ -29,20 +28,10 @@ WORKSPACE = np.array([0.5, 0.0])  # m, middle of the workspace
 
 
 class GraspWorld:
-    """The simulation and the camera of one process; each is created at its first use."""
+    """The simulation and the camera of one process."""
 
     def __init__(self, scene: PandaScene, motion: Motion) -> None:
-        self.scene, self.motion = scene, motion
-
-    @cached_property
-    def simulation(self) -> GraspSimulation:
-        """The robot, the table and the mug."""
-        return GraspSimulation(self.scene, self.motion)
-
-    @cached_property
-    def camera(self) -> DepthCamera:
-        """The depth camera."""
-        return DepthCamera(self.scene)
+        self.simulation, self.camera = GraspSimulation(scene, motion), DepthCamera(scene)
 
     def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
         """Grasp each mug in ``states``, ``(N, 4)``, with the hand at the pose in ``poses``, ``(N, 4)``."""
@@ -54,8 +43,8 @@ class GraspWorld:
 
     def close(self) -> None:
         """Close the Bullet worlds."""
-        for name in {"simulation", "camera"} & set(self.__dict__):
-            getattr(self, name).close()
+        self.simulation.close()
+        self.camera.close()
 
 
 class PandaGraspEnv(SharedEnv):
@@ -97,10 +86,10 @@ class PandaGraspEnv(SharedEnv):
     :param motion: ``"fast"``, or ``"reference"`` for the paper's slow motion.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch. This number does not change the results.
-    :param render_mode: ``None``, ``"rgb_array"`` (the scene and the depth image) or ``"human"`` (PyBullet's window).
+    :param render_mode: ``None`` or ``"rgb_array"`` (the scene and the depth image).
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 
     def __init__(
         self,
@@ -127,8 +116,15 @@ class PandaGraspEnv(SharedEnv):
             checks.between("frame_offset", frame_offset, -0.05, 0.05, " m"),
             checks.not_negative("friction", friction),
         )
-        self.camera_range = _check_camera(camera_range, camera_shift)
-        self.camera_shift = float(camera_shift)
+        self.camera_range, self.camera_shift = camera_range, float(camera_shift)
+        heights = np.full(2, self.camera_shift)
+        if camera_range is not None:
+            heights += checks.low_high("camera_range", camera_range, unit=" in m")
+        if not (abs(heights) <= MAX_CAMERA_SHIFT).all():
+            raise ValueError(
+                f"camera_range={camera_range} and camera_shift={camera_shift} must leave the camera within "
+                f"{MAX_CAMERA_SHIFT} m of its usual height: from further away the mug is not visible"
+            )
         self.motion = checks.one_of("motion", motion, MOTIONS)
         self.depth_noise_std = checks.not_negative("depth_noise_std", depth_noise_std, " (it is sigma, in m)")
         self.n_processes = checks.count("n_processes", n_processes)
@@ -146,9 +142,10 @@ class PandaGraspEnv(SharedEnv):
     @cached_property
     def _view(self) -> PandaView:
         self.check_open()
-        return PandaView(self.scene, gui=self.render_mode == "human")
+        return PandaView(self.scene)
 
     def initial_state(self, n: int) -> np.ndarray:
+        self._film = []
         state = np.zeros((n, self.state_space.shape[0]))
         state[:, :2] = WORKSPACE + self.np_random.uniform(-self.xy_half_width, self.xy_half_width, (n, 2))
         state[:, 3] = self.np_random.uniform(self.yaw_range[0], self.yaw_range[1], n)
@@ -195,23 +192,22 @@ class PandaGraspEnv(SharedEnv):
 
     def render(self) -> np.ndarray | None:
         """
-        Show the scene before or after the grasp.
+        Draw the scene before or after the grasp, and the depth image beside it: ``(256, 644, 3)`` uint8.
 
-        ``"rgb_array"``: return the scene and the depth image side by side, ``(256, 644, 3)`` uint8. Near points of the
-        depth image are bright. For a video, see :meth:`film`. ``"human"``: show the scene in PyBullet's window, and the
-        grasp in real time. The sensor noise in the picture comes from a separate generator, so that rendering does not
-        change an episode.
+        Near points of the depth image are bright. The sensor noise in the picture comes from a separate generator, so
+        that rendering does not change an episode. For a video, see :meth:`film`.
         """
         if self.render_mode is None:
             return None
-        state = self._current_state()
-        if self.render_mode == "human":
-            for configuration in self._shown():
-                self._view.place(configuration)
-                time.sleep(1 / self.metadata["render_fps"])
-            return None
-        self._view.place(self._shown()[-1])
-        return self._view.picture(self._depth_of(state[0]))
+        state = self._current_state()[0]
+        if self._film:
+            configuration = self._film[-1]
+        else:
+            *position, yaw = state[:4].tolist()
+            upright = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+            configuration = Configuration((*HOME, FINGER_OPEN, FINGER_OPEN), tuple(position), upright)
+        self._view.place(configuration)
+        return self._view.picture(self._depth_of(state))
 
     def film(self) -> Iterator[np.ndarray]:
         """
@@ -219,44 +215,13 @@ class PandaGraspEnv(SharedEnv):
 
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """
-        if self.render_mode != "rgb_array":
-            raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a video")
-        if self._time == 0:
-            raise ValueError("there is no grasp to show before step()")
-        _, _, to_z, to_w = self._film[0].orientation
-        camera = self._current_state()[0, 4:].tolist()
-        depth = self._depth_of([*self._film[0].position, 2 * np.arctan2(to_z, to_w), *camera])
+        if self.render_mode is None or not self._film:
+            raise ValueError(f"film() shows the last step(), with render_mode='rgb_array', not {self.render_mode!r}")
+        depth = self._depth_of(np.append(self._details[0]["mug"], self._current_state()[0, 4:]))
         for configuration in self._film:
             self._view.place(configuration)
             yield self._view.picture(depth)
 
-    def _shown(self) -> list[Configuration]:
-        """Return the configurations of the last grasp, or the robot at rest if there was no grasp."""
-        if self._time > 0:
-            return self._film
-        *position, yaw = self._current_state()[0, :4].tolist()
-        upright = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
-        return [Configuration((*HOME, FINGER_OPEN, FINGER_OPEN), tuple(position), upright)]
-
-    def _depth_of(self, state: np.ndarray | list[float]) -> np.ndarray:
-        (depth,) = self._with_noise(self._world.images(self._seen(np.array([state]))), np.random.default_rng(0))
+    def _depth_of(self, state: np.ndarray) -> np.ndarray:
+        (depth,) = self._with_noise(self._world.images(self._seen(state[None])), np.random.default_rng(0))
         return depth
-
-
-def _check_camera(camera_range: tuple[float, float] | None, shift: float) -> tuple[float, float] | None:
-    """Check that the mug is visible from every camera height; return the range as floats."""
-    limit, why = MAX_CAMERA_SHIFT, "from further away the mug is not visible"
-    try:
-        low, high = map(float, (0.0, 0.0) if camera_range is None else camera_range)
-    except (TypeError, ValueError):
-        low, high = np.nan, np.nan
-    if not -limit <= low <= high <= limit:
-        raise ValueError(
-            f"camera_range={camera_range} must be None or (low, high) in m, {-limit} <= low <= high <= {limit}; {why}"
-        )
-    if not (low + shift >= -limit and high + shift <= limit):
-        raise ValueError(
-            f"camera_shift={shift} with camera_range={camera_range} must leave the camera within {limit} m of its "
-            f"usual height: {why}"
-        )
-    return None if camera_range is None else (low, high)

@@ -130,8 +130,6 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
 
         :raises ValueError: if ``render_mode`` is not ``"rgb_array"``, or there was no ``step`` since ``reset``.
         """
-        if self.render_mode != "rgb_array":
-            raise ValueError(f"render_mode={self.render_mode!r} must be 'rgb_array' for a video")
-        if not self._film:
-            raise ValueError("there is no squeeze to show before step()")
+        if self.render_mode is None or not self._film:
+            raise ValueError(f"film() shows the last step(), with render_mode='rgb_array', not {self.render_mode!r}")
         yield from map(self._view.picture, list(self._film))

@@ -1,4 +1,4 @@
-"""Draw side views of the arm's scenes for pictures, videos and PyBullet's window, not for observations."""
+"""Draw side views of the arm's scenes for pictures and videos, not for observations."""
 
 import os
 from collections.abc import Callable
@@ -32,10 +32,8 @@ class ArmView(BulletWorld):
     viewpoint: tuple[float, float, float]
     near = 0.1
 
-    def __init__(self, load_robot: Callable[[BulletClient], int], *, gui: bool = False) -> None:
-        super().__init__(gui=gui)
-        if gui:
-            self.client.show_window(*self.viewpoint, self.middle)
+    def __init__(self, load_robot: Callable[[BulletClient], int]) -> None:
+        super().__init__()
         self.client.loadURDF(FLOOR_FILE, (0.0, 0.0, FLOOR_HEIGHT), useFixedBase=True)
         self.client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
         self._robot = load_robot(self.client)
@@ -58,8 +56,8 @@ class PandaView(ArmView):
     middle = (0.38, 0.0, 0.2)
     viewpoint = (0.82, 145.0, -18.0)  # robot, mug and handle are visible
 
-    def __init__(self, scene: PandaScene, *, gui: bool = False) -> None:
-        super().__init__(lambda client: int(client.loadURDF(ROBOT_FILE, useFixedBase=True)), gui=gui)
+    def __init__(self, scene: PandaScene) -> None:
+        super().__init__(lambda client: int(client.loadURDF(ROBOT_FILE, useFixedBase=True)))
         client = self.client
         self._mug = add_mug_picture(client, scene)
         self._scene = scene

@@ -124,20 +124,12 @@ class BatchedVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render the current state of every episode."""
-        return [self._rendered(state) for state in self._state]
-
-    def render(self, mode: str | None = None) -> np.ndarray | None:
-        """Tile the pictures of all episodes, like every ``VecEnv``; PyBullet's window shows only the first episode."""
-        if self.render_mode == "human" and mode in (None, "human"):
-            return self._rendered(self._state[0])
-        return super().render(mode)
-
-    def _rendered(self, state: np.ndarray) -> Any:
-        before, self.env._state = self.env._state, state[None]
-        try:
-            return self.env.render()
-        finally:
-            self.env._state = before
+        before, images = self.env._state, []
+        for state in self._state:
+            self.env._state = state[None]
+            images.append(self.env.render())
+        self.env._state = before
+        return images
 
 
 def _spec(env_id: str) -> EnvSpec:

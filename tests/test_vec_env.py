@@ -191,22 +191,6 @@ def test_a_number_of_environments_episodes_or_steps_below_one_is_refused(name, v
         make_episodes_env("Lava-v0", **{name: value})
 
 
-class Window(LavaEnv):
-    metadata = {**LavaEnv.metadata, "render_modes": ["human"]}
-
-    def render(self):
-        self.shown = self._current_state()
-
-
-def test_a_window_shows_the_first_episode():
-    env = BatchedVecEnv(Window(render_mode="human"), 3)
-    env.reset()
-    for mode in (None, "human"):
-        assert env.render(mode) is None
-        np.testing.assert_array_equal(env.env.shown[0], env.reset_infos[0]["state"])
-    assert env.env._state is None
-
-
 def test_pictures_of_a_batch_have_no_gripper():
     """Each episode has its own gripper, so that a picture of the batch must not show the first episode's gripper."""
     env = BatchedVecEnv(SqueezeInsertEnv(render_mode="rgb_array"), 2)

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pybullet
 import pytest
 
 from sb3_tdpg.envs.panda_squeeze import PandaSqueezeEnv
@@ -172,7 +173,7 @@ def test_a_film_shows_the_last_squeeze_and_the_insertion(env):
     watched = PandaSqueezeEnv(render_mode="rgb_array")
     watched.reset(seed=2)
     pictures = [watched.render()]
-    with pytest.raises(ValueError, match=r"no squeeze to show before step\(\)"):
+    with pytest.raises(ValueError, match=r"film\(\) shows the last step"):
         next(watched.film())
     episode(watched, 0.0, 0.0, 0.0, 0.0)
     assert 20 < len(watched._film) < 60  # of one squeeze and the insertion, not of the episode
@@ -184,7 +185,7 @@ def test_a_film_shows_the_last_squeeze_and_the_insertion(env):
     worlds = (watched._world, watched._view)
     watched.close()
     for world in worlds:  # of the physics and of the pictures
-        with pytest.raises(RuntimeError, match="closed"):
+        with pytest.raises(pybullet.error, match="Not connected"):
             world.client.getNumBodies()
-    with pytest.raises(ValueError, match="must be 'rgb_array' for a video"):
+    with pytest.raises(ValueError, match="render_mode='rgb_array', not None"):
         next(env.film())
