@@ -37,9 +37,8 @@ class LavaEnv(POMDPEnv):
     :param start_beta: ``(a, b)``: the robot starts at 5 m times a random number from Beta(a, b). With ``None`` it
         starts uniformly in [0, 5] m.
     :param action_cost: Weight of ``|u_t|`` in the stage cost: 0 in the paper's text, 1 in the other cost definition.
-    :param lava_stage_cost: Stage cost in the lava. ``None`` means the distance from the goal, which is 2 in the lava.
-    :param lava_terminal_cost: Terminal cost in the lava. ``None`` means 100 times the distance from the goal, which
-        makes 200 in the lava.
+    :param lava_stage_cost: Stage cost in the lava. The default is the distance from the goal.
+    :param lava_terminal_cost: Terminal cost in the lava. The default is 100 times the distance from the goal.
     :param horizon: Number of controls T.
     :param max_action: Bound of the action space ``[-max_action, max_action]``. The paper's action space is unbounded,
         but SB3 needs bounds. The default bound is large, because an action beyond it gives no gradient.
@@ -53,11 +52,11 @@ class LavaEnv(POMDPEnv):
         self,
         *,
         sensor_noise_std: float = 0.01,
-        sensor_bias: Sequence[float] | None = None,
+        sensor_bias: Sequence[float] = (0.0, 0.0),
         start_beta: Sequence[float] | None = None,
         action_cost: float = 0.0,
-        lava_stage_cost: float | None = None,
-        lava_terminal_cost: float | None = None,
+        lava_stage_cost: float = 2.0,
+        lava_terminal_cost: float = 200.0,
         horizon: int = 5,
         max_action: float = 100.0,
         render_mode: str | None = None,
@@ -65,21 +64,16 @@ class LavaEnv(POMDPEnv):
         super().__init__(horizon=horizon, render_mode=render_mode)
         sigma = " (it is sigma, not sigma^2)"
         self.sensor_noise_std = checks.not_negative("sensor_noise_std", sensor_noise_std, sigma)
-        if sensor_bias is not None and not (np.shape(sensor_bias) == (2,) and np.isfinite(sensor_bias).all()):
-            raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, in m and m per step, or None")
-        if start_beta is not None and not (
-            np.shape(start_beta) == (2,) and np.isfinite(start_beta).all() and min(start_beta) > 0
-        ):
+        if not (np.shape(sensor_bias) == (2,) and np.isfinite(sensor_bias).all()):
+            raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, in m and m per step")
+        if start_beta is not None and not (np.shape(start_beta) == (2,) and min(start_beta) > 0):
             raise ValueError(f"start_beta={start_beta!r} must be two positive numbers, for instance (2, 1), or None")
         max_action = checks.positive("max_action", max_action)
-        for name, value in dict(lava_stage_cost=lava_stage_cost, lava_terminal_cost=lava_terminal_cost).items():
-            if value is not None:
-                checks.finite(name, value)
-        self.sensor_bias = None if sensor_bias is None else np.array(sensor_bias, dtype=np.float64)
-        self.start_beta = None if start_beta is None else (float(start_beta[0]), float(start_beta[1]))
+        self.sensor_bias = np.array(sensor_bias, dtype=np.float64)
+        self.start_beta = start_beta
         self.action_cost = checks.not_negative("action_cost", action_cost)
-        self.lava_stage_cost = lava_stage_cost
-        self.lava_terminal_cost = lava_terminal_cost
+        self.lava_stage_cost = checks.finite("lava_stage_cost", lava_stage_cost)
+        self.lava_terminal_cost = checks.finite("lava_terminal_cost", lava_terminal_cost)
         self.state_space = spaces.Box(np.array([WALL, -np.inf]), np.array([LAVA, np.inf]), dtype=np.float64)
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.action_space = spaces.Box(-max_action, max_action, (1,), np.float32)
@@ -103,20 +97,14 @@ class LavaEnv(POMDPEnv):
 
     def sensor(self, state: np.ndarray) -> np.ndarray:
         noise = self.sensor_noise_std * self.np_random.standard_normal(state.shape)
-        mean = state if self.sensor_bias is None else state + self.sensor_bias
-        return (mean + noise).astype(np.float32)
+        return (state + self.sensor_bias + noise).astype(np.float32)
 
     def cost(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        distance = np.linalg.norm(state - GOAL, axis=1)
-        if self.lava_stage_cost is not None:
-            distance = np.where(state[:, 0] >= LAVA, self.lava_stage_cost, distance)
-        return distance + self.action_cost * np.abs(action[:, 0])
+        place_cost = np.where(state[:, 0] >= LAVA, self.lava_stage_cost, np.linalg.norm(state - GOAL, axis=1))
+        return place_cost + self.action_cost * np.abs(action[:, 0])
 
     def terminal_cost(self, state: np.ndarray) -> np.ndarray:
-        cost = 100.0 * np.linalg.norm(state - GOAL, axis=1)
-        if self.lava_terminal_cost is not None:
-            cost = np.where(state[:, 0] >= LAVA, self.lava_terminal_cost, cost)
-        return cost
+        return np.where(state[:, 0] >= LAVA, self.lava_terminal_cost, 100.0 * np.linalg.norm(state - GOAL, axis=1))
 
     def render(self) -> np.ndarray | None:
         """Draw wall (grey), lava, goal (green) and robot (blue) with its velocity (dark): ``(96, 480, 3)`` uint8."""
