@@ -18,7 +18,7 @@ from panda_film import panda_squeeze
 from PIL import Image
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.ball_catch import DT, BallCatchEnv
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import enlarge
 from sb3_tdpg.envs.lava import LavaEnv
@@ -155,7 +155,7 @@ def fly(texture: str = TRAINING_TEXTURE) -> tuple[list[np.ndarray], list[np.ndar
     env = BallCatchEnv(render_mode="rgb_array", texture=texture, robot_range=(-1.7, -1.7))
     observation, info = env.reset(seed=0)
     d, ball_x, _, speed_x, _ = info["state"]
-    lands = ball_x + speed_x * env.dt * env.horizon
+    lands = ball_x + speed_x * DT * env.horizon
     speed = (lands - d) / (env.control_gain * env.horizon)
     pictures, observations = [env.render()], [observation]
     for _ in range(env.horizon):

@@ -6,6 +6,7 @@ Coordinates: x points forward, y to the left and z upward. The floor is at z = 0
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,9 +26,9 @@ LIGHT = np.array([-50.0, 30.0, 100.0])  # PyBullet's default position of the lig
 class BallScene:
     """The wall, the ball and the camera of a scene."""
 
+    ball_color: ClassVar = (0.0, 1.0, 0.0)  # red, green and blue, each in [0, 1]
+    fov: ClassVar = 90.0  # field of view in degrees, the same in both directions
     texture: np.ndarray  # of the wall, (H, W, 3) uint8
-    ball_color: tuple[float, ...]  # red, green and blue, each in [0, 1]
     ball_radius: float
     camera_height: float  # above the floor
     camera_pitch: float  # upward tilt in degrees
-    fov: float  # field of view in degrees, the same in both directions

@@ -23,9 +23,9 @@ def not_negative(name: str, value: float, hint: str = "") -> float:
     return finite(name, value, value >= 0, f" and not negative{hint}")
 
 
-def between(name: str, value: float, low: float, high: float, unit: str, *, strict: bool = False) -> float:
-    """Check that a number is between two limits; return it as a float. ``strict`` excludes the limits."""
-    if not low <= value <= high or (strict and value in (low, high)):
+def between(name: str, value: float, low: float, high: float, unit: str) -> float:
+    """Check that a number is between two limits; return it as a float."""
+    if not low <= value <= high:
         raise ValueError(f"{name}={value} must be between {low:g} and {high:g}{unit}")
     return float(value)
 

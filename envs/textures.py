@@ -8,7 +8,6 @@ end.
 """
 
 import colorsys
-import functools
 import os
 import re
 from collections.abc import Callable
@@ -123,14 +122,6 @@ TEST_TEXTURES = tuple(name for name in _BUILT_IN if name != TRAINING_TEXTURE)
 """The seven test backgrounds, in the order of Table II; the seventh has the hue of the training texture."""
 
 
-@functools.cache
-def built_in_texture(name: str) -> np.ndarray:
-    """Return the texture with this name, ``(S, S, 3)``; the array is shared and read-only."""
-    texture = _paint(*_BUILT_IN[name])
-    texture.flags.writeable = False
-    return texture
-
-
 def floor_texture() -> np.ndarray:
     """Draw the chequerboard of PyBullet's floor, ``(512, 512, 3)``: squares of 1 m, pale blue and white."""
     side = np.arange(512) // 256
@@ -156,8 +147,8 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
         :func:`random_texture`, the path of an image file, or an array ``(H, W, 3)`` uint8. ``"<percent>%-<name>"``
         draws a built-in or random texture over the brick with this opacity, as in ``"40%-violet_dots"``.
     :return: The texture, ``(H, W, 3)`` uint8.
-    :raises FileNotFoundError: if there is no such file.
-    :raises ValueError: if a name is unknown, or if a file or an array is not an image.
+    :raises ValueError: if a name is unknown, or if an array is not an image.
+    :raises OSError: if Pillow cannot read the file.
     """
     if isinstance(texture, np.ndarray):
         if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
@@ -167,32 +158,19 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
             )
         return texture.copy()
     name = os.fspath(texture)
-    if name in _BUILT_IN:
-        return built_in_texture(name)
-    if match := re.fullmatch(r"random-(\d+)", name):
-        return random_texture(int(match[1]))
-    if match := re.fullmatch(r"(\d+)%-(.+)", name):
-        share, upper = int(match[1]) / 100, match[2]
-        if share > 1 or not (upper in _BUILT_IN or re.fullmatch(r"random-\d+", upper)):
-            allowed = f"one of {list(_BUILT_IN)} or 'random-<seed>'"
-            raise ValueError(f"texture={name!r} must be '<0 to 100>%-<name>' with {allowed}")
-        blend = (1 - share) * built_in_texture(TRAINING_TEXTURE) + share * load_texture(upper)
+    if match := re.fullmatch(rf"(?:(\d?\d|100)%-)?({'|'.join(_BUILT_IN)}|random-(\d+))", name):
+        percent, upper, seed = match.groups()
+        picture = _paint(*_BUILT_IN[upper]) if seed is None else random_texture(int(seed))
+        if percent is None:
+            return picture
+        share = int(percent) / 100
+        blend = (1 - share) * load_texture(TRAINING_TEXTURE) + share * picture
         return np.rint(blend).astype(np.uint8)
     path = Path(name).expanduser()
     if not path.is_file():
-        if path.suffix or path != Path(path.name):
-            raise FileNotFoundError(f"texture={name!r}: there is no such image file")
         raise ValueError(
-            f"texture={name!r} is unknown: use one of {list(_BUILT_IN)}, 'random-<seed>', '<percent>%-<name>', "
-            "or the path of an image file"
+            f"texture={name!r} is no file and no known name: use one of {list(_BUILT_IN)}, 'random-<seed>', "
+            "'<0 to 100>%-<name>' with one of these names, or the path of an image file"
         )
-    try:
-        with Image.open(path) as image:
-            if image.mode.startswith("I"):  # 16-bit grey: Pillow would clip values above 255
-                return np.rint(np.asarray(image)[..., None].repeat(3, axis=2) / 257).astype(np.uint8)
-            return np.array(image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow's exception for a broken file depends on the format
-        raise ValueError(
-            f"texture={name!r} cannot be read as an image ({error}): use an intact PNG, JPEG or other file that Pillow "
-            "opens"
-        ) from error
+    with Image.open(path) as image:
+        return np.array(image.convert("RGB"))

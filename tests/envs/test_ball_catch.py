@@ -7,7 +7,7 @@ from PIL import Image
 
 import sb3_tdpg  # noqa: F401  (registers the environments)
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.ball_catch import DT, BallCatchEnv
 from sb3_tdpg.envs.scenarios import BALL_CATCH, BALL_CATCH_VARYING_LAUNCH, BALL_PUBLISHED_READING, BALL_VARYING_LAUNCH
 from sb3_tdpg.envs.textures import TEST_TEXTURES
 
@@ -76,7 +76,7 @@ def test_a_launch_that_varies_fills_its_ranges_and_moves_the_landing_point():
     np.testing.assert_allclose(states[:, [1, 3]].min(axis=0), [7.0, -5.0], atol=0.01)
     np.testing.assert_allclose(states[:, [1, 3]].max(axis=0), [9.0, -4.0], atol=0.01)
     np.testing.assert_array_equal(states[:, [2, 4]], np.tile([1.0, 7.85], (20_000, 1)))
-    lands = states[:, 1] + states[:, 3] * env.horizon * env.dt
+    lands = states[:, 1] + states[:, 3] * env.horizon * DT
     assert lands.std() > 0.5
     assert -1.34 < lands.min() < lands.max() < 2.34
 
@@ -145,7 +145,7 @@ def test_minmax_spreads_each_image_over_the_whole_range_and_clip_leaves_its_cont
 def test_two_environments_in_one_process_do_not_disturb_each_other():
     env, controls = BallCatchEnv(renderer="pybullet"), np.random.default_rng(0).normal(size=6)
     _, alone, _ = run_episode(env, controls)
-    other = BallCatchEnv(renderer="pybullet", texture="blue_tiles", ball_color=(1, 1, 0))
+    other = BallCatchEnv(renderer="pybullet", texture="blue_tiles")
     run_episode(other, -controls, seed=9)
     np.testing.assert_array_equal(run_episode(env, controls)[1], alone)
     other.close()

@@ -12,8 +12,7 @@ from sb3_tdpg.envs.textures import TEST_TEXTURES, TRAINING_TEXTURE, load_texture
 
 def scene(**changes):
     defaults = dict(
-        texture=load_texture(TRAINING_TEXTURE), ball_color=(0.0, 1.0, 0.0), ball_radius=0.235, camera_height=2.0,
-        camera_pitch=30.0, fov=90.0,
+        texture=load_texture(TRAINING_TEXTURE), ball_radius=0.235, camera_height=2.0, camera_pitch=30.0
     )  # fmt: skip
     return BallScene(**{**defaults, **changes})
 
@@ -48,13 +47,11 @@ def test_the_renderers_agree_in_500_states_with_each_texture(texture):
 
 
 @pytest.mark.parametrize(("changes", "lowest"), [
-    (dict(ball_color=(1.0, 0.5, 0.2), ball_radius=0.5), 0.995),
+    (dict(ball_radius=0.5), 0.995),
     (dict(camera_height=0.7), 0.995),
     (dict(camera_pitch=-20.0), 0.99),
     (dict(camera_pitch=40.0, camera_height=2.5), 0.99),  # the strongest perturbation of the scene
     (dict(camera_pitch=70.0), 0.995),
-    (dict(fov=40.0), 0.995),
-    (dict(fov=120.0), 0.98),  # the sides of the floor are in view
     (dict(texture=np.random.default_rng(0).integers(0, 256, (75, 200, 3), dtype=np.uint8)), 0.995),
 ], ids=words)  # fmt: skip
 def test_the_renderers_agree_in_other_scenes_too(changes, lowest):
@@ -79,7 +76,7 @@ def test_the_renderers_agree_far_from_the_task(robot, ball, height, changes, low
     assert within_two > lowest
 
 
-def test_an_image_does_not_depend_on_the_batch_that_it_is_drawn_in_and_is_not_overwritten():
+def test_an_image_does_not_depend_on_the_batch_that_it_is_drawn_in():
     states = random_states(150)
     renderer = FastRenderer(scene())
     together = renderer.images(states)

@@ -54,7 +54,7 @@ def test_a_texture_gives_way_to_another_one_by_its_share():
 
 @pytest.mark.parametrize("name", ["140%-violet_dots", "40%-drawing.png", "40%-20%-violet_dots"])
 def test_a_blend_that_cannot_be_made_is_refused(name):
-    with pytest.raises(ValueError, match=r"must be '<0 to 100>%-<name>'"):
+    with pytest.raises(ValueError, match=r"'<0 to 100>%-<name>'"):
         load_texture(name)
 
 

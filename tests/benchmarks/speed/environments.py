@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg import make_episodes_env
 from sb3_tdpg.envs.ball_bullet import BulletRenderer
-from sb3_tdpg.envs.ball_catch import BallCatchEnv
+from sb3_tdpg.envs.ball_catch import DT, BallCatchEnv
 from sb3_tdpg.envs.ball_fast import FastRenderer
 from tests.benchmarks.speed.measure import SEED, Row, Sizes, compare, seconds
 
@@ -44,7 +44,7 @@ def bench_camera(sizes: Sizes) -> Iterable[Row]:
     states = [env.reset_batch(n)[0]]
     for remaining in range(env.horizon, 0, -1):
         state = states[-1]
-        lands = state[:, 1] + state[:, 3] * env.dt * remaining
+        lands = state[:, 1] + state[:, 3] * DT * remaining
         action = (lands - state[:, 0]) / (env.control_gain * remaining)
         states.append(env.step_batch(state, action[:, None], is_last=False).state)
     fast, reference = FastRenderer(env.scene), BulletRenderer(env.scene)
