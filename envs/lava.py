@@ -70,7 +70,7 @@ class LavaEnv(POMDPEnv):
             raise ValueError(f"start_beta={start_beta!r} must be two positive numbers, for instance (2, 1), or None")
         max_action = checks.positive("max_action", max_action)
         self.sensor_bias = np.array(sensor_bias, dtype=np.float64)
-        self.start_beta = start_beta
+        self.start_beta = None if start_beta is None else (float(start_beta[0]), float(start_beta[1]))
         self.action_cost = checks.not_negative("action_cost", action_cost)
         self.lava_stage_cost = checks.finite("lava_stage_cost", lava_stage_cost)
         self.lava_terminal_cost = checks.finite("lava_terminal_cost", lava_terminal_cost)

@@ -124,7 +124,8 @@ class BatchedVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render the current state of every episode."""
-        before, images = self.env._state, []
+        before = self.env._state
+        images: list[Any] = []
         for state in self._state:
             self.env._state = state[None]
             images.append(self.env.render())
