@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .panda_arm import FINGER_JOINTS, FINGER_OPEN, FINGERTIPS_BELOW_HAND, HOME, ArmSimulation, Phase, Pose, Watch
-from .panda_scene import ROBOT_FILE, PandaScene, add_mug_body
+from .panda_scene import CENTRE_OF_MASS, FRICTION, MUG_HEIGHT, ROBOT_FILE, add_mug_body
 
 FINGER_SPINNING_FRICTION = 0.1
 HAND_ABOVE_GRASP = 0.1  # m: the height of a grasp is the height of a point between the fingers, near their tips
@@ -53,16 +53,17 @@ class GraspSimulation(ArmSimulation):
     Every grasp starts from the same state of the world, so that the outcome depends only on state and pose.
     """
 
-    def __init__(self, scene: PandaScene, motion: Motion) -> None:
+    def __init__(self, cup_origin: np.ndarray, motion: Motion) -> None:
         super().__init__(motion.solver_iterations)
-        self.scene, self.motion, client = scene, motion, self.client
+        self.motion, client = motion, self.client
+        self._centre_of_mass = cup_origin + CENTRE_OF_MASS  # in the mug's frame; Bullet uses it as base position
         self._ends_early = motion.is_fast
         self._robot = int(client.loadURDF(ROBOT_FILE, useFixedBase=True, flags=self._unseen))
         for finger in FINGER_JOINTS:
             client.changeDynamics(
-                self._robot, finger, lateralFriction=scene.friction, spinningFriction=FINGER_SPINNING_FRICTION
+                self._robot, finger, lateralFriction=FRICTION, spinningFriction=FINGER_SPINNING_FRICTION
             )
-        self._body = add_mug_body(client, scene)
+        self._body = add_mug_body(client, cup_origin)
         self._put_arm(HOME)
         self._start = client.saveState()
 
@@ -74,7 +75,7 @@ class GraspSimulation(ArmSimulation):
         z += HAND_ABOVE_GRASP
         start_height = z + motion.start_height
         if motion.is_fast:
-            start_height = max(start_height, self.scene.mug_height + ABOVE_RIM + FINGERTIPS_BELOW_HAND)
+            start_height = max(start_height, MUG_HEIGHT + ABOVE_RIM + FINGERTIPS_BELOW_HAND)
         orientation = client.multiplyTransforms(
             (0.0, 0.0, 0.0), client.getQuaternionFromEuler((np.pi, 0.0, 0.0)),
             (0.0, 0.0, 0.0), client.getQuaternionFromEuler((0.0, 0.0, yaw + HAND_TURN)),
@@ -95,7 +96,7 @@ class GraspSimulation(ArmSimulation):
         self.client.restoreState(self._start)
         x, y, z, yaw = state.tolist()
         cos, sin = np.cos(yaw), np.sin(yaw)
-        to_right, ahead, upward = self.scene.centre_of_mass.tolist()
+        to_right, ahead, upward = self._centre_of_mass.tolist()
         self._put_body((x + cos * to_right - sin * ahead, y + sin * to_right + cos * ahead, z + upward), yaw)
 
     def _is_decided(self) -> bool:
@@ -111,7 +112,7 @@ class GraspSimulation(ArmSimulation):
         """Return origin ``(3,)``, axes ``(3, 3)`` and orientation (a quaternion) of the mug's frame."""
         centre, orientation = self.client.getBasePositionAndOrientation(self._body)
         axes = np.array(self.client.getMatrixFromQuaternion(orientation)).reshape(3, 3)
-        return np.array(centre) - axes @ self.scene.centre_of_mass, axes, orientation
+        return np.array(centre) - axes @ self._centre_of_mass, axes, orientation
 
     def _mug_state(self, yaw_before: float) -> np.ndarray:
         """Return the state of the mug; its yaw differs from ``yaw_before`` by at most half a turn."""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .bullet import BulletWorld
-from .panda_scene import PandaScene, add_mug_picture
+from .panda_scene import add_mug_picture
 
 IMAGE_SIZE = 128  # pixels per side
 
@@ -22,10 +22,10 @@ class DepthCamera(BulletWorld):
     depth to 3e-6 m.
     """
 
-    def __init__(self, scene: PandaScene) -> None:
+    def __init__(self, cup_origin: np.ndarray) -> None:
         super().__init__()
         client = self.client
-        self._mug = add_mug_picture(client, scene)
+        self._mug = add_mug_picture(client, cup_origin)
         view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
         projection = client.computeProjectionMatrix(*EDGES, NEAR, FAR)
         self._camera = IMAGE_SIZE, IMAGE_SIZE, view, projection

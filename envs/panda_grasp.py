@@ -11,7 +11,6 @@ from . import checks
 from .panda_arm import FINGER_OPEN, HOME, Configuration, Watch
 from .panda_bullet import LIFTED, MOTIONS, GraspSimulation, Motion, Outcome
 from .panda_camera import IMAGE_SIZE, DepthCamera
-from .panda_scene import PandaScene
 from .panda_view import PandaView
 from .pool import SharedEnv
 
@@ -30,8 +29,8 @@ WORKSPACE = np.array([0.5, 0.0])  # m, middle of the workspace
 class GraspWorld:
     """The simulation and the camera of one process."""
 
-    def __init__(self, scene: PandaScene, motion: Motion) -> None:
-        self.simulation, self.camera = GraspSimulation(scene, motion), DepthCamera(scene)
+    def __init__(self, cup_origin: np.ndarray, motion: Motion) -> None:
+        self.simulation, self.camera = GraspSimulation(cup_origin, motion), DepthCamera(cup_origin)
 
     def grasps(self, states: np.ndarray, poses: np.ndarray, watch: Watch | None = None) -> list[Outcome]:
         """Grasp each mug in ``states``, ``(N, 4)``, with the hand at the pose in ``poses``, ``(N, 4)``."""
@@ -78,11 +77,8 @@ class PandaGraspEnv(SharedEnv):
         This distance is the fifth state component.
     :param camera_shift: Constant distance by which the camera is raised in all trials, in m. This distance is not part
         of the state.
-    :param mug_scale: Size of the mug, as a multiple of the size of the paper's mug (93 mm across, 81 mm high).
     :param frame_offset: Distance from the origin of the mug's frame to the cup's axis, in m. Positive values are away
         from the handle.
-    :param friction: Friction coefficient of the mug and of the fingers. (Bullet multiplies the coefficients of two
-        bodies that touch.)
     :param motion: ``"fast"``, or ``"reference"`` for the paper's slow motion.
     :param depth_noise_std: Standard deviation of the noise on each pixel, in m.
     :param n_processes: Number of processes that share a batch. This number does not change the results.
@@ -98,9 +94,7 @@ class PandaGraspEnv(SharedEnv):
         yaw_range: tuple[float, float] = (-np.pi / 4, np.pi / 4),
         camera_range: tuple[float, float] | None = None,
         camera_shift: float = 0.0,
-        mug_scale: float = 1.0,
         frame_offset: float = 0.012,
-        friction: float = 0.5,
         motion: str = "fast",
         depth_noise_std: float = 0.0,
         n_processes: int = 1,
@@ -111,11 +105,8 @@ class PandaGraspEnv(SharedEnv):
             "xy_half_width", xy_half_width, 0.0, 0.15, " m: further out the mug leaves the image"
         )
         self.yaw_range = checks.low_high("yaw_range", yaw_range, unit=" in rad")
-        self.scene = PandaScene(
-            checks.between("mug_scale", mug_scale, 0.5, 1.5, ": it is a multiple of the paper's size"),
-            checks.between("frame_offset", frame_offset, -0.05, 0.05, " m"),
-            checks.not_negative("friction", friction),
-        )
+        frame_offset = checks.between("frame_offset", frame_offset, -0.05, 0.05, " m")
+        self.cup_origin = np.array([0.0, -frame_offset, 0.0])  # in the mug's frame
         self.camera_range, self.camera_shift = camera_range, float(camera_shift)
         heights = np.full(2, self.camera_shift)
         if camera_range is not None:
@@ -137,12 +128,12 @@ class PandaGraspEnv(SharedEnv):
         self._film: list[Configuration] = []  # the last grasp, recorded only with a render_mode
 
     def _make_world(self) -> tuple[Any, ...]:
-        return GraspWorld, self.scene, MOTIONS[self.motion]
+        return GraspWorld, self.cup_origin, MOTIONS[self.motion]
 
     @cached_property
     def _view(self) -> PandaView:
         self.check_open()
-        return PandaView(self.scene)
+        return PandaView(self.cup_origin)
 
     def initial_state(self, n: int) -> np.ndarray:
         self._film = []

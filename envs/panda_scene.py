@@ -3,10 +3,13 @@ Define the grasping scene as data, for the simulation and all pictures.
 
 Coordinates: the robot is at the origin and looks along +x. The y axis points to the robot's left, z upward. The table's
 top is at z = 0. Lengths are in metres, angles in radians.
+
+In the cup's frame, the z axis is the cup's axis, and the handle points along +y. The state of the environment is the
+pose of another frame, the mug's frame, whose origin is beside the cup's axis. ``cup_origin``, ``(3,)``, is the origin
+of the cup's frame in the mug's frame.
 """
 
 import os
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,7 +28,8 @@ MUG_COLOR = (0.9, 0.22, 0.18, 1.0)
 # PyBullet's mug, scaled to the size of the paper's mug: 93 mm across and 81 mm high. It is wider than the open gripper,
 # so that it can be grasped only by its rim, with one finger inside.
 MESH_SCALE = np.array([1.134, 1.134, 0.81])
-MESH_RADIUS, MESH_HEIGHT = 0.041, 0.1  # of the cup in the file
+MUG_RADIUS = float(0.041 * MESH_SCALE[0])  # outer radius of the cup
+MUG_HEIGHT = float(0.1 * MESH_SCALE[2])  # of the rim above the table
 N_STAVES = 12  # with base and handle the mug has 16 shapes; PyBullet silently drops further shapes
 WALL_THICKNESS = 0.0075
 BASE_HEIGHT = 0.006
@@ -37,99 +41,56 @@ HANDLE_BARS = (
 )
 BAR_HALF_WIDTH, BAR_THICKNESS = 0.0055, 0.0085
 MASS = 0.1  # kg
+FRICTION = 0.5  # of the mug and of the fingers; Bullet multiplies the coefficients of two bodies that touch
 INERTIA = 2e-4  # kg m^2, about each axis
 CENTRE_OF_MASS = np.array([0.0, 0.004, 0.03645])  # in the cup's frame; it is slightly towards the handle
 
 
-@dataclass(frozen=True)
-class PandaScene:
+def mug_shapes() -> list[dict[str, Any]]:
     """
-    The size, the frame and the friction of the mug.
+    Return the mug's shapes in the cup's frame: a disc, twelve staves around it and three bars for the handle.
 
-    In the cup's frame, the z axis is the cup's axis, and the handle points along +y. The state of the environment is
-    the pose of another frame, the mug's frame, whose origin is beside the cup's axis.
-
-    The parameters are those of :class:`~sb3_tdpg.envs.panda_grasp.PandaGraspEnv`.
+    Bullet would replace a moving mesh by its convex hull, and the hull of a cup is not hollow.
     """
-
-    mug_scale: float
-    frame_offset: float
-    friction: float
-
-    @property
-    def mesh_scale(self) -> np.ndarray:
-        """Scale factors of the mesh file, ``(3,)``."""
-        return self.mug_scale * MESH_SCALE
-
-    @property
-    def mug_radius(self) -> float:
-        """Outer radius of the cup."""
-        return float(self.mesh_scale[0] * MESH_RADIUS)
-
-    @property
-    def mug_height(self) -> float:
-        """Height of the rim above the table."""
-        return float(self.mesh_scale[2] * MESH_HEIGHT)
-
-    @property
-    def cup_origin(self) -> np.ndarray:
-        """Origin of the cup's frame in the mug's frame, ``(3,)``."""
-        return np.array([0.0, -self.frame_offset, 0.0])
-
-    @property
-    def centre_of_mass(self) -> np.ndarray:
-        """Centre of mass in the mug's frame, ``(3,)``, which Bullet uses as base position."""
-        return self.cup_origin + self.mug_scale * CENTRE_OF_MASS
-
-    def collision_shapes(self) -> list[dict[str, Any]]:
-        """
-        Return the mug's shapes in the cup's frame: a disc, twelve staves around it and three bars for the handle.
-
-        Bullet would replace a moving mesh by its convex hull, and the hull of a cup is not hollow.
-        """
-        radius, height, thickness = self.mug_radius, self.mug_height, self.mug_scale * WALL_THICKNESS
-        base = self.mug_scale * BASE_HEIGHT
-        # Only the base touches the table: the staves begin at half the height of the base.
-        shapes = [dict(radius=0.93 * radius, length=base, position=(0.0, 0.0, base / 2), yaw=0.0)]
-        stave = (thickness / 2, radius * np.tan(np.pi / N_STAVES), (height - base / 2) / 2)
-        for yaw in 2 * np.pi * np.arange(N_STAVES) / N_STAVES:
-            across = radius - thickness / 2
-            position = (across * np.cos(yaw), across * np.sin(yaw), base / 2 + stave[2])
-            shapes.append(dict(half_extents=stave, position=position, yaw=yaw))
-        scale_x, scale_y, scale_z = self.mesh_scale
-        half_width, half_thickness = BAR_HALF_WIDTH * scale_x, BAR_THICKNESS * min(scale_x, scale_z) / 2
-        for (y_0, z_0), (y_1, z_1) in np.array(HANDLE_BARS) * (scale_y, scale_z):
-            bar = (half_width, (y_1 - y_0) / 2 + half_thickness, (z_1 - z_0) / 2 + half_thickness)
-            shapes.append(dict(half_extents=bar, position=(0.0, (y_0 + y_1) / 2, (z_0 + z_1) / 2), yaw=0.0))
-        return shapes
+    # Only the base touches the table: the staves begin at half the height of the base.
+    shapes = [dict(radius=0.93 * MUG_RADIUS, length=BASE_HEIGHT, position=(0.0, 0.0, BASE_HEIGHT / 2), yaw=0.0)]
+    stave = (WALL_THICKNESS / 2, MUG_RADIUS * np.tan(np.pi / N_STAVES), (MUG_HEIGHT - BASE_HEIGHT / 2) / 2)
+    for yaw in 2 * np.pi * np.arange(N_STAVES) / N_STAVES:
+        across = MUG_RADIUS - WALL_THICKNESS / 2
+        position = (across * np.cos(yaw), across * np.sin(yaw), BASE_HEIGHT / 2 + stave[2])
+        shapes.append(dict(half_extents=stave, position=position, yaw=yaw))
+    scale_x, scale_y, scale_z = MESH_SCALE
+    half_width, half_thickness = BAR_HALF_WIDTH * scale_x, BAR_THICKNESS * min(scale_x, scale_z) / 2
+    for (y_0, z_0), (y_1, z_1) in np.array(HANDLE_BARS) * (scale_y, scale_z):
+        bar = (half_width, (y_1 - y_0) / 2 + half_thickness, (z_1 - z_0) / 2 + half_thickness)
+        shapes.append(dict(half_extents=bar, position=(0.0, (y_0 + y_1) / 2, (z_0 + z_1) / 2), yaw=0.0))
+    return shapes
 
 
-def add_mug_picture(client: BulletClient, scene: PandaScene) -> int:
+def add_mug_picture(client: BulletClient, cup_origin: np.ndarray) -> int:
     """Add the mug's visual mesh; return the id of a body whose base position is the origin of the mug's frame."""
     shape = client.createVisualShape(
         client.GEOM_MESH,
         fileName=MUG_FILE,
-        meshScale=scene.mesh_scale.tolist(),
-        visualFramePosition=scene.cup_origin.tolist(),
+        meshScale=MESH_SCALE.tolist(),
+        visualFramePosition=cup_origin.tolist(),
         rgbaColor=MUG_COLOR,
         specularColor=(0.3, 0.3, 0.3),
     )
     return int(client.createMultiBody(baseVisualShapeIndex=shape))
 
 
-def add_mug_body(client: BulletClient, scene: PandaScene) -> int:
+def add_mug_body(client: BulletClient, cup_origin: np.ndarray) -> int:
     """Add the mug's collision shapes; return the id of a body whose base position is the mug's centre of mass."""
-    shapes = scene.collision_shapes()
+    shapes = mug_shapes()
     body = client.createCollisionShapeArray(
         [client.GEOM_BOX if "half_extents" in shape else client.GEOM_CYLINDER for shape in shapes],
         halfExtents=[shape.get("half_extents", (0.0, 0.0, 0.0)) for shape in shapes],
         radii=[shape.get("radius", 0.0) for shape in shapes],
         lengths=[shape.get("length", 0.0) for shape in shapes],
-        collisionFramePositions=[(scene.cup_origin + shape["position"]).tolist() for shape in shapes],
+        collisionFramePositions=[(cup_origin + shape["position"]).tolist() for shape in shapes],
         collisionFrameOrientations=[client.getQuaternionFromEuler([0.0, 0.0, shape["yaw"]]) for shape in shapes],
     )
-    mug = client.createMultiBody(MASS, body, baseInertialFramePosition=scene.centre_of_mass.tolist())
-    client.changeDynamics(
-        mug, -1, lateralFriction=scene.friction, spinningFriction=0.0, localInertiaDiagonal=[INERTIA] * 3
-    )
+    mug = client.createMultiBody(MASS, body, baseInertialFramePosition=(cup_origin + CENTRE_OF_MASS).tolist())
+    client.changeDynamics(mug, -1, lateralFriction=FRICTION, spinningFriction=0.0, localInertiaDiagonal=[INERTIA] * 3)
     return int(mug)

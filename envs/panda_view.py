@@ -7,7 +7,7 @@ import numpy as np
 
 from .bullet import UNTURNED, BulletClient, BulletWorld, beside
 from .panda_arm import ARM_JOINTS, FINGER_JOINTS, Configuration
-from .panda_scene import ASSETS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
+from .panda_scene import ASSETS, MUG_RADIUS, ROBOT_FILE, TABLE_FILE, TABLE_POSITION, add_mug_picture
 from .squeeze_scene import SqueezeScene, add_part, add_slot, load_robot
 
 HEIGHT, WIDTH = 256, 384  # pixels of the view
@@ -56,15 +56,15 @@ class PandaView(ArmView):
     middle = (0.38, 0.0, 0.2)
     viewpoint = (0.82, 145.0, -18.0)  # robot, mug and handle are visible
 
-    def __init__(self, scene: PandaScene) -> None:
+    def __init__(self, cup_origin: np.ndarray) -> None:
         super().__init__(lambda client: int(client.loadURDF(ROBOT_FILE, useFixedBase=True)))
         client = self.client
-        self._mug = add_mug_picture(client, scene)
-        self._scene = scene
+        self._mug = add_mug_picture(client, cup_origin)
+        self._cup_origin = cup_origin
         # A disc is the mug's shadow, because TinyRenderer draws none on the table. Without a shadow the picture does
         # not show whether the mug is lifted.
         shadow = client.createVisualShape(
-            client.GEOM_CYLINDER, radius=scene.mug_radius, length=0.001, rgbaColor=SHADOW_COLOR, specularColor=[0, 0, 0]
+            client.GEOM_CYLINDER, radius=MUG_RADIUS, length=0.001, rgbaColor=SHADOW_COLOR, specularColor=[0, 0, 0]
         )
         self._shadow = int(client.createMultiBody(baseVisualShapeIndex=shadow))
 
@@ -73,7 +73,7 @@ class PandaView(ArmView):
         super().place(configuration)
         client, mug = self.client, (configuration.position, configuration.orientation)
         client.resetBasePositionAndOrientation(self._mug, *mug)
-        right, ahead, _ = self._scene.cup_origin.tolist()
+        right, ahead, _ = self._cup_origin.tolist()
         (x, y, _), _ = client.multiplyTransforms(*mug, (right, ahead, 0.0), UNTURNED)
         client.resetBasePositionAndOrientation(self._shadow, (x, y, 0.0), UNTURNED)
 

@@ -12,6 +12,9 @@ from .drawing import paint_box
 SIZE = 6.0  # cm, side of the square table
 START = (2.0, 6.0)  # cm, range of both coordinates
 HOLE = np.array([1.2, 1.2])  # cm
+TOLERANCE = 0.4  # cm, distance from the hole up to which the terminal cost is zero
+FRICTION = 0.2  # coefficient of the fence
+MAX_ACTION = 2.5  # cm in each direction
 
 
 class PegCornerEnv(POMDPEnv):
@@ -19,21 +22,18 @@ class PegCornerEnv(POMDPEnv):
     Slide a peg on a fenced table until it is over a hole near one corner.
 
     State ``x = (x, y)``: position of the peg on a table of 6 cm by 6 cm. The peg starts uniformly in [2, 6]^2 cm.
-    Action ``u``: at most ``max_action`` in each direction. The peg moves by ``actuator_gain`` times the action. The
-    fence stops the peg. If a displacement would cross one side of the fence by a distance ``b``, friction subtracts
-    :math:`\mu b` from the component of the displacement along that side. With :math:`d_t = \lVert x_t - g \rVert`,
-    ``g = (1.2, 1.2)`` cm, and T = 4 controls, the costs are
+    Action ``u``: at most 2.5 cm in each direction. The peg moves by ``actuator_gain`` times the action. The fence stops
+    the peg. If a displacement would cross one side of the fence by a distance ``b``, friction subtracts ``0.2 b`` from
+    the component of the displacement along that side. With :math:`d_t = \lVert x_t - g \rVert`, ``g = (1.2, 1.2)`` cm,
+    and T = 4 controls, the costs are
 
     .. math::
-        c_t = d_t, \qquad c_T = 30 \max(0, d_T - \text{tolerance}).
+        c_t = d_t, \qquad c_T = 30 \max(0, d_T - 0.4).
 
     A policy that uses the sensor can move the peg straight to the hole. From any start, an open-loop policy can push
     the peg into the corner with three moves, and move it to the hole with the fourth.
 
-    :param friction: Friction coefficient :math:`\mu` of the fence.
-    :param tolerance: Distance from the hole up to which the terminal cost is zero, in cm.
     :param sensor_noise_std: Standard deviation of the sensor noise in cm.
-    :param max_action: Bound of the action in each direction, in cm.
     :param actuator_gain: Ratio of the peg's displacement to the action.
     :param horizon: Number of controls T.
     :param render_mode: ``None`` or ``"rgb_array"``.
@@ -46,23 +46,17 @@ class PegCornerEnv(POMDPEnv):
     def __init__(
         self,
         *,
-        friction: float = 0.2,
-        tolerance: float = 0.4,
         sensor_noise_std: float = 0.01,
-        max_action: float = 2.5,
         actuator_gain: float = 1.0,
         horizon: int = 4,
         render_mode: str | None = None,
     ) -> None:
         super().__init__(horizon=horizon, render_mode=render_mode)
-        self.friction = checks.not_negative("friction", friction)
-        self.tolerance = checks.not_negative("tolerance", tolerance)
         self.sensor_noise_std = checks.not_negative("sensor_noise_std", sensor_noise_std)
         self.actuator_gain = checks.positive("actuator_gain", actuator_gain)
-        max_action = checks.positive("max_action", max_action)
         self.state_space = spaces.Box(0.0, SIZE, (2,), np.float64)
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        self.action_space = spaces.Box(-max_action, max_action, (2,), np.float32)
+        self.action_space = spaces.Box(-MAX_ACTION, MAX_ACTION, (2,), np.float32)
 
     def initial_state(self, n: int) -> np.ndarray:
         return self.np_random.uniform(*START, (n, 2))
@@ -72,7 +66,7 @@ class PegCornerEnv(POMDPEnv):
         aim = state + move
         beyond = np.abs(aim - np.clip(aim, 0.0, SIZE))
         # A push against one side slows the motion along this side, which is the other component.
-        move = np.sign(move) * np.maximum(0.0, np.abs(move) - self.friction * beyond[:, ::-1])
+        move = np.sign(move) * np.maximum(0.0, np.abs(move) - FRICTION * beyond[:, ::-1])
         return np.clip(state + move, 0.0, SIZE)
 
     def sensor(self, state: np.ndarray) -> np.ndarray:
@@ -85,7 +79,7 @@ class PegCornerEnv(POMDPEnv):
         return self._distance(state)
 
     def terminal_cost(self, state: np.ndarray) -> np.ndarray:
-        return 30.0 * np.maximum(0.0, self._distance(state) - self.tolerance)
+        return 30.0 * np.maximum(0.0, self._distance(state) - TOLERANCE)
 
     def render(self) -> np.ndarray | None:
         """Draw the table from above: fence (grey), hole (dark), peg (blue): ``(200, 200, 3)`` uint8."""

@@ -148,8 +148,7 @@ OF_SCENES = {
         (dict(gravity=5.0), False),
     ],
     PandaGraspEnv: [
-        (dict(mug_scale=0.9), True), (dict(frame_offset=0.0), True), (dict(depth_noise_std=0.01), True),
-        (dict(friction=0.9), False), (dict(motion="reference"), False),
+        (dict(frame_offset=0.0), True), (dict(depth_noise_std=0.01), True), (dict(motion="reference"), False),
     ],
 }  # fmt: skip
 
@@ -295,9 +294,7 @@ REFUSED = {
     PandaGraspEnv: [
         (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.15 m"),
         (dict(yaw_range=(1.0, -1.0)), r"yaw_range=\(1.0, -1.0\) must be \(low, high\) of finite numbers in rad"),
-        (dict(mug_scale=0.0), "mug_scale=0.0 must be between 0.5 and 1.5"),
         (dict(frame_offset=1.0), "frame_offset=1.0 must be between -0.05 and 0.05 m"),
-        (dict(friction=-1.0), "friction=-1.0 must be finite and not negative"),
         (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
         (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
         (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
@@ -323,8 +320,8 @@ REFUSED = {
         (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
     ],
     PegCornerEnv: [
-        ({name: -1.0}, f"{name}=-1.0 must be finite")
-        for name in ("friction", "tolerance", "sensor_noise_std", "max_action", "actuator_gain")
+        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite"),
+        (dict(actuator_gain=-1.0), "actuator_gain=-1.0 must be finite"),
     ],
 }  # fmt: skip
 

@@ -7,9 +7,9 @@ from panda_oracle import random_states
 from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.panda_camera import DISTANCE, EDGES, FAR, IMAGE_SIZE, NEAR, PITCH, TARGET, YAW, DepthCamera
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
-from sb3_tdpg.envs.panda_scene import TABLE_FILE, TABLE_POSITION, PandaScene, add_mug_picture
+from sb3_tdpg.envs.panda_scene import TABLE_FILE, TABLE_POSITION, add_mug_picture
 
-SCENE = PandaScene(mug_scale=1.0, frame_offset=0.012, friction=0.5)
+CUP_ORIGIN = np.array([0.0, -0.012, 0.0])
 
 # By hand: 0.4 m from the target, which is seen at an angle of 45 degrees from the side of the robot's left hand.
 EYE = np.array([0.3, 0.2, 0.02 + 0.4 * np.sqrt(0.5)])
@@ -32,7 +32,7 @@ def pixel(camera, point):
 
 @pytest.fixture(scope="module")
 def camera():
-    camera = DepthCamera(SCENE)
+    camera = DepthCamera(CUP_ORIGIN)
     yield camera
     camera.close()
 
@@ -88,7 +88,7 @@ def test_the_image_is_a_part_of_what_pybullet_draws_of_mug_and_table_with_a_fiel
     states = random_states(10, half_width=0.075)
     client = BulletClient()
     client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
-    mug = add_mug_picture(client, SCENE)
+    mug = add_mug_picture(client, CUP_ORIGIN)
     view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
     projection = client.computeProjectionMatrixFOV(90.0, 4 / 3, NEAR, FAR)
     far = 998.6538  # 1000 m in the single precision of the projection

@@ -24,7 +24,6 @@ def test_the_fence_stops_the_peg_and_friction_brakes_the_motion_along_it():
     # 1.5 cm beyond the left side: friction takes 0.2 * 1.5 = 0.3 cm off the other component.
     np.testing.assert_allclose(moved([[1.0, 4.0]], (-2.5, -1.0)), [[0.0, 3.3]])
     np.testing.assert_allclose(moved([[1.0, 4.0]], (-2.5, 0.2)), [[0.0, 4.0]])  # it sticks
-    np.testing.assert_allclose(moved([[1.0, 4.0]], (-2.5, -1.0), friction=0.0), [[0.0, 3.0]])
 
 
 def test_three_pushes_into_the_corner_and_a_move_find_the_hole_from_everywhere():

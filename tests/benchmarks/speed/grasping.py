@@ -53,7 +53,7 @@ class GraspTrials:
 
     def rebuild(self) -> None:
         """Make the world anew."""
-        GraspSimulation(self.env.scene, MOTIONS["fast"]).close()
+        GraspSimulation(self.env.cup_origin, MOTIONS["fast"]).close()
 
     def split(self, repetitions: int) -> str:
         """Trials in a second, and where the time goes: medians."""
@@ -77,7 +77,7 @@ def bench_grasp(sizes: Sizes) -> Iterable[Row]:
     trials = GraspTrials(max(10, sizes.n_episodes // 10))
     some = max(1, trials.n // 10)
     few = GraspTrials(some)
-    slow = GraspSimulation(trials.env.scene, MOTIONS["reference"])
+    slow = GraspSimulation(trials.env.cup_origin, MOTIONS["reference"])
     yield compare(
         "grasp: the fast motion against the paper's",
         lambda: seconds(lambda: trials.grasp(trials.env._world.simulation), trials.n),
@@ -90,7 +90,7 @@ def bench_grasp(sizes: Sizes) -> Iterable[Row]:
         lambda: seconds(trials.rebuild),
         sizes.repetitions,
     )
-    with_table = DepthCamera(trials.env.scene)
+    with_table = DepthCamera(trials.env.cup_origin)
     with_table.client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
     yield compare(
         "depth image: the mug drawn before a known table against mug and table",
