@@ -51,9 +51,6 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
     state_names: tuple[str, ...]
     #: Whether the constructor has a keyword ``n_processes``, the number of processes that share the work of a batch.
     shares_work: bool = False
-    #: Names of cached properties that hold a Bullet world or processes. Each is created at its first use, in the
-    #: process that uses it.
-    resources: frozenset[str] = frozenset()
     #: Additional entries of each episode's info after the last call of :meth:`dynamics`; the sequence can be empty.
     _details: Sequence[Mapping[str, Any]] = ()
 
@@ -64,22 +61,6 @@ class POMDPEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._state: np.ndarray | None = None  # (1, X)
         self._time = 0
-        self._is_closed = False
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes without Bullet worlds and processes, because a copy creates its own."""
-        return {name: value for name, value in self.__dict__.items() if name not in self.resources}
-
-    def check_open(self) -> None:
-        """Raise a ``RuntimeError`` if the environment has been closed."""
-        if self._is_closed:  # a BulletClient raises the same error, but there may be none yet
-            raise RuntimeError("this environment has been closed: make a new one")
-
-    def close(self) -> None:
-        """Close Bullet worlds, processes and windows; a second call does nothing."""
-        self._is_closed = True
-        for name in self.resources & set(self.__dict__):
-            getattr(self, name).close()
 
     @abstractmethod
     def initial_state(self, n: int) -> np.ndarray:

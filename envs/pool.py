@@ -17,6 +17,9 @@ import numpy as np
 
 from .base import POMDPEnv
 
+# Cached properties of an environment that hold a Bullet world or processes. Each is created at its first use, in the
+# process that uses it.
+RESOURCES = {"_world", "_pool", "_view"}
 SHARES = 8  # number of parts of a batch per process; small parts let all processes end at about the same time
 
 
@@ -60,10 +63,23 @@ class SharedEnv(POMDPEnv):
     """Base class of environments that can use several processes, each with its own object, such as a Bullet world."""
 
     shares_work = True
-    resources = frozenset({"_world", "_pool", "_view"})
     n_processes: int
+    _is_closed = False
 
-    # A world is created at its first use, in the process that uses it.
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes without Bullet worlds and processes, because a copy creates its own."""
+        return {name: value for name, value in self.__dict__.items() if name not in RESOURCES}
+
+    def check_open(self) -> None:
+        """Raise a ``RuntimeError`` if the environment has been closed."""
+        if self._is_closed:
+            raise RuntimeError("this environment has been closed: make a new one")
+
+    def close(self) -> None:
+        """Close Bullet worlds and processes; a second call does nothing."""
+        self._is_closed = True
+        for name in RESOURCES & set(self.__dict__):
+            getattr(self, name).close()
 
     @abstractmethod
     def _make_world(self) -> tuple[Any, ...]:
