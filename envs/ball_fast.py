@@ -56,10 +56,6 @@ class FastRenderer:
         self._behind, self._floor_depth = self._draw_floor()
         self._behind_packed = pack(self._behind.transpose(1, 2, 0))
         self._nearest_floor = self._floor_depth.min(axis=1)
-        # These arrays are reused: the operating system would provide new ones page by page, which takes longer than the
-        # arithmetic.
-        size = CHUNK * IMAGE_SIZE**2
-        self._scratch = tuple(np.empty(size, dtype) for dtype in (np.float32, np.float32, np.int32, np.uint32))
 
     def _prepare_rays(self) -> None:
         """Make a ray (x, y, z) of depth 1 for each pixel; x and z depend on the pixel's row, y on its column."""
@@ -127,40 +123,33 @@ class FastRenderer:
     def _draw_walls(self, images: np.ndarray, distance: np.ndarray, depth: np.ndarray) -> None:
         """Draw the wall in each image, given its distance ``(N,)`` and its depth in each row of pixels, ``(N, 64)``."""
         # (64,); first and last differ only in rows that show the sides of the floor
-        first, last = self._floor_depth.min(axis=1), self._floor_depth.max(axis=1)
+        first, last = self._nearest_floor, self._floor_depth.max(axis=1)
         with_wall = np.flatnonzero((depth < last).any(axis=0))
         if not len(with_wall):
             return
         rows = slice(with_wall[0], with_wall[-1] + 1)
-        colours, shifted = self._wall_colours(distance, rows)
+        colours = self._wall_colours(distance, rows)
         depth, first, last, behind = depth[:, rows], first[rows], last[rows], self._behind_packed[rows]
         image, row = np.nonzero(depth >= last)
         colours[image, row] = behind[row]
         image, row = np.nonzero((depth >= first) & (depth < last))
-        if len(image):
-            is_wall = depth[image, row, None] < self._floor_depth[rows][row]
-            colours[image, row] = np.where(is_wall, colours[image, row], behind[row])
+        is_wall = depth[image, row, None] < self._floor_depth[rows][row]
+        colours[image, row] = np.where(is_wall, colours[image, row], behind[row])
         for channel in range(3):
             # The cast keeps the lowest byte. An assignment would have the same result but take six times as long.
-            np.right_shift(colours, np.uint32(8 * channel), out=shifted)
-            np.copyto(images[:, channel, rows], shifted, casting="unsafe")
+            np.copyto(images[:, channel, rows], colours >> np.uint32(8 * channel), casting="unsafe")
 
-    def _wall_colours(self, distance: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Return the packed colours of the wall, ``(N, rows, 64)``, and an array of the same shape as scratch space."""
+    def _wall_colours(self, distance: np.ndarray, rows: slice) -> np.ndarray:
+        """Return the packed colours of the wall, ``(N, rows, 64)``."""
         u = self._u_at_zero + np.multiply.outer(distance, self._u_per_metre[rows])  # (N, rows)
         u -= np.floor(u)
         line = (u * self._texels_u).astype(np.int32) * np.int32(self._texels_v)
-        shape = (*u.shape, IMAGE_SIZE)
-        v, whole, texel, colours = (buffer[: np.prod(shape)].reshape(shape) for buffer in self._scratch)
         # The error of single precision is less than a thousandth of a texel.
-        np.multiply(distance.astype(np.float32)[:, None, None], self._v_per_metre[rows], out=v)
-        np.add(v, np.float32(PLANE_COPIES / 2), out=v)
-        np.floor(v, out=whole)
-        np.subtract(v, whole, out=v)
-        np.multiply(v, np.float32(self._texels_v), out=v)
-        np.copyto(texel, v, casting="unsafe")
-        np.add(texel, line[..., None], out=texel)
-        return self._wall_texels.take(texel, mode="clip", out=colours), texel.view(np.uint32)
+        v = distance.astype(np.float32)[:, None, None] * self._v_per_metre[rows]  # (N, rows, 64)
+        v += np.float32(PLANE_COPIES / 2)
+        v -= np.floor(v)
+        v *= np.float32(self._texels_v)
+        return self._wall_texels.take(v.astype(np.int32) + line[..., None], mode="clip")
 
     def _draw_balls(self, images: np.ndarray, state: np.ndarray, wall_depth: np.ndarray) -> None:
         """Draw the balls, each in the smallest window that contains it; windows of equal size are drawn together."""
@@ -224,8 +213,7 @@ class FastRenderer:
         pixel = rows.take(row) * IMAGE_SIZE + columns.take(ball * window + found % window)
         depth = (along.take(row) - np.sqrt(discriminant.take(found))) / self._ray_length_squared.take(pixel)
         is_seen = (depth > NEAR) & (depth < np.minimum(behind, FAR).take(row))
-        if not is_seen.all():
-            row, ball, pixel, depth = row[is_seen], ball[is_seen], pixel[is_seen], depth[is_seen]
+        row, ball, pixel, depth = row[is_seen], ball[is_seen], pixel[is_seen], depth[is_seen]
         # The normal is (depth * ray - centre) / radius.
         towards_light = (depth * self._ray_to_light.take(pixel) - (centre @ TO_LIGHT[::2]).take(ball)) / radius
         upward = (depth * z.take(row) - centre[:, 1].take(ball)) / radius
