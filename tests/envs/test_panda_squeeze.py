@@ -147,8 +147,6 @@ def test_the_corners_of_a_part_turned_by_the_tolerance_meet_the_edge_of_the_cham
         assert edge == pytest.approx(PART[0] / 2 * math.sin(tolerance) + PART[1] / 2 * math.cos(tolerance))
 
 
-
-
 def test_squeezes_do_not_depend_on_their_order(env):
     rng = np.random.default_rng(0)
     given = rng.uniform(-1.5, 1.5, 40), rng.uniform(-3.0, 3.0, 40), rng.uniform(-0.003, 0.003, (40, 2))
