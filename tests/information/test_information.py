@@ -246,7 +246,6 @@ def test_what_is_no_estimator_is_refused_with_the_list(estimator):
     ("nwj", dict(gradient_steps=0)),
     ("nwj", dict(held_out=1.0)),
     ("nwj", dict(held_out=-0.1)),
-    ("vib", dict(n_components=0)),
 ], ids=str)  # fmt: skip
 def test_a_keyword_out_of_its_range_is_refused(name, kwargs):
     with pytest.raises(ValueError, match=f"mi_kwargs: {next(iter(kwargs))}="):
