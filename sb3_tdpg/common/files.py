@@ -14,7 +14,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-SECONDS_UNTIL_LOCKED = 10.0  # a new folder is locked only a moment after it was made
+SECONDS_UNTIL_ABANDONED = 3600.0  # writing a file takes less
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -29,42 +29,21 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
     Yield a temporary path; the file written there replaces the target when the block ends without an error.
 
     Missing folders are created. Several processes may replace the same target at once. After a power cut the target has
-    the old or the new content, never a part of it. The next call for the same target removes the temporary files of a
-    killed process.
+    the old or the new content, never a part of it. Temporary files of a killed process are removed an hour later.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
-        with suppress(OSError), _locked(left):  # the folder is gone, or another process writes to it
-            if time.time() - left.stat().st_mtime > SECONDS_UNTIL_LOCKED:
+        with suppress(OSError):  # another process has removed the folder
+            if time.time() - left.stat().st_mtime > SECONDS_UNTIL_ABANDONED:
                 shutil.rmtree(left)
     # The path is in a separate folder, because a compressed file contains its own name, which must not vary.
-    with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder, ExitStack() as stack:
-        with suppress(OSError):  # not every system can lock a folder
-            stack.enter_context(_locked(Path(folder)))
+    with TemporaryDirectory(prefix=f"{path.name}.", suffix=".partial", dir=path.parent) as folder:
         partial = Path(folder, path.name)
-        try:
-            yield partial
-        except OSError as e:  # for instance of a full disk
-            if e.errno is not None and e.filename is None:
-                e.filename = str(path)
-            raise
+        yield partial
         for written in [partial, *partial.rglob("*")] if partial.is_dir() else [partial]:
             _flush(written)
         os.replace(partial, path)
         _flush(path.parent)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder until the block or this process ends; raise an ``OSError`` if another process has locked it."""
-    if fcntl is None:
-        raise OSError("this system cannot lock a folder")
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _flush(path: Path) -> None:
@@ -93,8 +72,10 @@ def kept_by_this_process(folder: Path) -> Iterator[None]:
         pass
     with ExitStack() as stack:
         if fcntl is not None:
+            descriptor = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, descriptor)
             try:
-                stack.enter_context(_locked(folder))
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as e:
                 raise ValueError(f"another process is writing to {folder}: wait for it, or give another folder") from e
         try:

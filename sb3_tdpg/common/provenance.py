@@ -14,7 +14,6 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from functools import partial
 from importlib import metadata
-from itertools import zip_longest
 from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_DIFFERENCES = 3
-MAX_LENGTH = 60  # of a value in a message
 PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "numpy", "pandas", "pybullet")
 
 
@@ -103,35 +101,23 @@ def differences(found: Any, wanted: Any) -> str:
 
     :return: for example ``settings.learning_rate: 0.001 there, 0.0005 here; settings.normalize: not there, true here``
     """
-    lines = list(_differences(found, wanted))
-    if len(lines) > MAX_DIFFERENCES:
-        lines[MAX_DIFFERENCES:] = [f"and {len(lines) - MAX_DIFFERENCES} more"]
+    old, new = dict(_leaves(found)), dict(_leaves(wanted))
+    keys = [key for key in sorted({*old, *new}) if old.get(key) != new.get(key)]
+    lines = [f"{key}: {old.get(key, 'not')} there, {new.get(key, 'not')} here" for key in keys[:MAX_DIFFERENCES]]
+    if len(keys) > MAX_DIFFERENCES:
+        lines.append(f"and {len(keys) - MAX_DIFFERENCES} more")
     return "; ".join(lines)
 
 
-def _differences(found: Any, wanted: Any, where: str = "") -> Iterator[str]:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in sorted({*found, *wanted}):
-            inside = f"{where}.{key}" if where else key
-            yield from _differences(found.get(key, _MISSING), wanted.get(key, _MISSING), inside)
-    elif all(isinstance(value, list) and any(isinstance(row, dict) for row in value) for value in (found, wanted)):
-        for i, (old, new) in enumerate(zip_longest(found, wanted, fillvalue=_MISSING)):
-            yield from _differences(old, new, f"{where}[{i}]")
-    elif found != wanted:
-        texts = ["" if value is _MISSING else json.dumps(value) for value in (found, wanted)]
-        start = max(0, len(os.path.commonprefix(texts)) - MAX_LENGTH // 2)  # noqa: RUF071  (characters)
-        old, new = (_excerpt(text, start) for text in texts)
-        yield f"{where}: {old or 'not'} there, {new or 'not'} here"
-
-
-_MISSING = object()  # None is a value
-
-
-def _excerpt(text: str, start: int) -> str:
-    """Return ``MAX_LENGTH`` characters of a text from ``start`` on; if fewer follow, return the last ``MAX_LENGTH``."""
-    start = max(0, min(start, len(text) - MAX_LENGTH))
-    end = start + MAX_LENGTH
-    return f"{'...' * (start > 0)}{text[start:end]}{'...' * (end < len(text))}"
+def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the path and the JSON text of all values in nested dicts and lists of dicts."""
+    if isinstance(value, list) and any(isinstance(row, dict) for row in value):
+        value = dict(enumerate(value))
+    if not isinstance(value, dict):
+        yield where, json.dumps(value)
+        return
+    for key, item in value.items():
+        yield from _leaves(item, f"{where}.{key}" if where else str(key))
 
 
 def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
