@@ -254,14 +254,3 @@ BASELINES: dict[str, AdvantageFunction | None] = {
     "regression": regression_advantages,
     "value": None,  # the algorithm uses the method of its own ValueFunction
 }
-
-
-def get_baseline(name: str) -> AdvantageFunction | None:
-    """
-    Return the function that computes the advantages; ``None`` for ``"value"``, a network (:class:`ValueFunction`).
-
-    :raises ValueError: if no baseline has this name.
-    """
-    if name not in BASELINES:
-        raise ValueError(f"baseline={name!r} is unknown: use one of {sorted(BASELINES)}")
-    return BASELINES[name]

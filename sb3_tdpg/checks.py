@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_tdpg.advantages import get_baseline
+from sb3_tdpg.advantages import BASELINES
 from sb3_tdpg.auto_weight import share_of
 from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.information import get_estimator_class
@@ -68,7 +68,8 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
     for rate in _values(schedule_of("learning_rate", settings["learning_rate"])):
         check_learning_rate(rate)
     get_estimator_class(settings["mi_estimator"])
-    get_baseline(settings["baseline"])
+    if settings["baseline"] not in BASELINES:
+        raise ValueError(f"baseline={settings['baseline']!r} is unknown: use one of {sorted(BASELINES)}")
     n_episodes, epoch_steps = settings["n_episodes"], settings["epoch_steps"]
     check_count("n_epochs", settings["n_epochs"])
     for name in ("n_episodes", "epoch_steps", "batch_size", "bptt_steps", "n_threads"):
@@ -83,49 +84,49 @@ def check_arguments(settings: Mapping[str, Any]) -> None:
         raise ValueError(
             f"n_episodes={n_episodes} must be at least 2: the baseline and the information are estimated from a batch"
         )
-    clip_ranges = _values(settings["clip_range"])
     # A schedule may fall to 0, and rl-zoo3 loads models for evaluation with a schedule that is always 0.
     lowest_is_allowed = callable(settings["clip_range"])
-    for clip_range in clip_ranges:
-        is_number = isinstance(clip_range, (int, float, np.number))
-        if not (is_number and (clip_range > 0 or (clip_range == 0 and lowest_is_allowed))):
+    for clip_range in _values(settings["clip_range"]):
+        if not (is_number(clip_range) and (clip_range > 0 or (clip_range == 0 and lowest_is_allowed))):
             raise ValueError(
                 f"clip_range={clip_range!r} must be a positive number, or a function of the remaining progress that "
                 "returns one; float('inf') turns the clipping off"
             )
-    for name in ("gamma", "gae_lambda", "max_grad_norm", "target_kl"):
-        if not isinstance(settings[name], (int, float, np.number)):
-            raise ValueError(f"{name}={settings[name]!r} must be a number")
-    seed = settings["seed"]
-    if not (seed is None or (isinstance(seed, (int, np.integer)) and 0 <= seed < 2**32)):
-        raise ValueError(f"seed={seed!r} must be an integer from 0 to 2**32 - 1, or None")
     encoder_gradient = settings["encoder_gradient"]
     if encoder_gradient not in ENCODER_GRADIENTS:
         raise ValueError(f"encoder_gradient={encoder_gradient!r} is unknown: use one of {list(ENCODER_GRADIENTS)}")
-    if not 0.0 < settings["gamma"] <= 1.0:
-        raise ValueError(f"gamma={settings['gamma']} must be in (0, 1]; the paper's problems have gamma=1")
-    if not 0.0 <= settings["gae_lambda"] <= 1.0:
-        raise ValueError(f"gae_lambda={settings['gae_lambda']} must be in [0, 1]; 1 leaves the gradient unbiased")
-    if not settings["max_grad_norm"] > 0:
-        raise ValueError(
-            f"max_grad_norm={settings['max_grad_norm']} must be positive; float('inf') turns the clipping off"
-        )
-    if not settings["target_kl"] > 0:
-        raise ValueError(f"target_kl={settings['target_kl']} must be positive; float('inf') sets no limit")
+    for name, is_valid, wanted in (
+        ("gamma", lambda x: 0 < x <= 1, "a number in (0, 1]; the paper's problems have gamma=1"),
+        ("gae_lambda", lambda x: 0 <= x <= 1, "a number in [0, 1]; 1 leaves the gradient unbiased"),
+        ("max_grad_norm", lambda x: x > 0, "a positive number; float('inf') turns the clipping off"),
+        ("target_kl", lambda x: x > 0, "a positive number; float('inf') sets no limit"),
+    ):
+        if not (is_number(settings[name]) and is_valid(settings[name])):
+            raise ValueError(f"{name}={settings[name]!r} must be {wanted}")
 
 
-def check_batch_size(settings: Mapping[str, Any], epoch_size: int, *, time_varying: bool) -> None:
+def is_number(value: Any) -> bool:
+    """Return whether a value is a Python or NumPy number."""
+    return isinstance(value, (int, float, np.number))
+
+
+def check_batches(settings: Mapping[str, Any], epoch_size: int, *, time_varying: bool) -> None:
     """
-    Check the minibatch size, and that several updates on the same rollouts use clipping.
+    Check ``bptt_steps`` and ``batch_size``, and that several updates on the same rollouts use clipping.
 
     :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name, and the ``horizon``.
     :param epoch_size: Number of steps of an epoch.
     :param time_varying: Whether each time step has weights of its own.
     """
-    batch_size, n_epochs, clip_range = settings["batch_size"], settings["n_epochs"], settings["clip_range"]
-    least, why = MIN_BATCH_STEPS, ""
+    batch_size, n_epochs, horizon = settings["batch_size"], settings["n_epochs"], settings["horizon"]
+    bptt_steps, least, why = settings["bptt_steps"], MIN_BATCH_STEPS, ""
     if time_varying:
-        least, why = 2 * settings["horizon"], "each time step has weights of its own (policy_kwargs: time_varying)"
+        least, why = 2 * horizon, "each time step has weights of its own (policy_kwargs: time_varying)"
+        if bptt_steps is not None and bptt_steps < horizon:
+            raise ValueError(
+                f"bptt_steps={bptt_steps} cuts the horizon of {horizon} steps into parts, but {why}: give "
+                "policy_kwargs=dict(time_varying=False), or leave bptt_steps out"
+            )
         if epoch_size < least:
             raise ValueError(
                 f"epoch_steps={settings['epoch_steps']} is less than two episodes, and {why}: give n_episodes=2 or "
@@ -137,28 +138,10 @@ def check_batch_size(settings: Mapping[str, Any], epoch_size: int, *, time_varyi
             f"batch_size={batch_size} must be between {least} and {epoch_size}, the steps of an epoch{why}"
         )
     n_updates = n_epochs * (1 if batch_size is None else math.ceil(epoch_size / batch_size))
-    if n_updates > 1 and math.isinf(_values(clip_range)[0]):
+    if n_updates > 1 and math.isinf(_values(settings["clip_range"])[0]):
         raise ValueError(
             f"n_epochs={n_epochs} and batch_size={batch_size} make {n_updates} updates on the same rollouts, which "
             "needs clipping: give clip_range=0.2, as in PPO, or make one update"
-        )
-
-
-def check_segments(bptt_steps: int | None, horizon: int) -> None:
-    """Raise a ``ValueError`` if ``bptt_steps`` is below the horizon of a policy with separate weights for each step."""
-    if bptt_steps is not None and bptt_steps < horizon:
-        raise ValueError(
-            f"bptt_steps={bptt_steps} cuts the horizon of {horizon} steps into parts, and all steps must share their "
-            "weights: give policy_kwargs=dict(time_varying=False), or leave bptt_steps out"
-        )
-
-
-def check_n_envs(env: Any, n_envs: int) -> None:
-    """Raise a ``ValueError`` if the number of environments in ``env`` differs from ``n_envs``."""
-    if (given := getattr(env, "num_envs", 1)) != n_envs:
-        raise ValueError(
-            f"n_envs={n_envs} applies to an environment given by its id, but the environment given has {given}: leave "
-            "n_envs out"
         )
 
 
@@ -212,8 +195,8 @@ def check_beta_argument(beta: Any, cost_limit: Any) -> None:
                 "select an epoch under a cost limit, use SelectionCallback)"
             )
         return
-    is_number = isinstance(cost_limit, (int, float, np.number)) and math.isfinite(cost_limit) and cost_limit != 0
-    if not (cost_limit is None or is_number or share_of(cost_limit) is not None):
+    is_cost = is_number(cost_limit) and math.isfinite(cost_limit) and cost_limit != 0
+    if not (cost_limit is None or is_cost or share_of(cost_limit) is not None):
         raise ValueError(
             f"cost_limit={cost_limit!r} must be a finite number other than 0 (the weight is adapted in fractions of "
             "it), or a share of the improvement to keep between 0 and 100 %, as text: '95%'"
@@ -222,7 +205,7 @@ def check_beta_argument(beta: Any, cost_limit: Any) -> None:
 
 def check_beta(beta: float) -> float:
     """Return beta, or raise a ``ValueError`` if it is not a positive number."""
-    if not (isinstance(beta, (int, float, np.number)) and beta > 0):  # NaN compares false
+    if not (is_number(beta) and beta > 0):  # NaN compares false
         raise ValueError(
             f"beta={beta!r} must be a positive number (or a function of the remaining progress that returns one): the "
             "weight of the cost against the information. float('inf') gives plain policy gradient, 'auto' adapts the "
@@ -233,7 +216,7 @@ def check_beta(beta: float) -> float:
 
 def check_learning_rate(rate: float) -> None:
     """Raise a ``ValueError`` if the learning rate is negative or not a finite number."""
-    if not (isinstance(rate, (int, float, np.number)) and 0 <= rate < math.inf):
+    if not (is_number(rate) and 0 <= rate < math.inf):
         raise ValueError(
             f"learning_rate={rate!r} must be a finite, non-negative number, or a function of the remaining "
             "progress that returns one (in YAML write 1.0e-3: YAML reads 1e-3 as text)"
@@ -264,12 +247,6 @@ def check_start(what: str, space: spaces.Space) -> None:
             raise ValueError(f"the {what} space {part} must begin with 0: SB3 takes and returns 0 to n - 1")
 
 
-def nearest_multiples(n: int, divisor: int) -> str:
-    """Return the multiples of ``divisor`` nearest to ``n`` as a string."""
-    below = n // divisor * divisor
-    return f"{below + divisor}" if below == 0 else f"{below} or {below + divisor}"
-
-
 def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
     """Call ``make`` with the user's keywords, or raise a ``ValueError`` that suggests a similar keyword."""
     what = f"{name}={kwargs!r} must be a dict of keywords of {make.func.__name__}"
@@ -284,10 +261,8 @@ def with_keywords(name: str, kwargs: dict[str, Any], make: partial[Any]) -> Any:
         raise ValueError(f"{what}: {e}{next(filter(None, hints), '')}") from e
 
 
-def check_single(observation: Any, space: spaces.Space) -> None:
-    """Raise a ``ValueError`` for a dict if the space is not a ``Dict``, and for the tuple that ``reset`` returns."""
-    if isinstance(observation, dict) and not isinstance(space, spaces.Dict):
-        raise ValueError(f"the observation is a dict, but the policy was made for {space}")
+def check_single(observation: Any) -> None:
+    """Raise a ``ValueError`` for the tuple that ``reset`` returns."""
     if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
         raise ValueError(
             "the observation is a tuple. You are probably mixing Gym API with SB3 VecEnv API: an environment's "
@@ -312,13 +287,6 @@ def check_time(t: np.ndarray, horizon: int) -> None:
             f"{horizon} steps: pass episode_start=True at the first step of an episode (or state=None), or "
             "train a policy that goes on for any number of steps with policy_kwargs=dict(time_varying=False)"
         )
-
-
-def check_floors(**floors: float | None) -> None:
-    """Raise a ``ValueError`` if a lower bound of a variance is negative."""
-    for name, floor in floors.items():
-        if floor is not None and not floor >= 0:
-            raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
 
 
 def check_action_mean(means: Sequence[float], space: spaces.Space) -> np.ndarray:

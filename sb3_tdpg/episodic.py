@@ -29,7 +29,7 @@ from sb3_tdpg.advantages import ValueFunction
 from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBuffer
 from sb3_tdpg.callbacks import MINECallback, TDPGProgressBar
-from sb3_tdpg.checks import nearest_multiples, refuse_others, warn_if_short
+from sb3_tdpg.checks import refuse_others, warn_if_short
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.random_state import RandomState
 from sb3_tdpg.common.threads import threads
@@ -113,8 +113,8 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         if self.n_episodes is not None and self.n_episodes % env.num_envs != 0:
             raise ValueError(
                 f"n_episodes={self.n_episodes} must be a multiple of the number of environments ({env.num_envs}), so "
-                f"that each environment runs the same number of episodes: use "
-                f"{nearest_multiples(self.n_episodes, env.num_envs)}"
+                "that each environment runs the same number of episodes: use "
+                f"{max(1, round(self.n_episodes / env.num_envs)) * env.num_envs}"
             )
         problem = read_problem(env, **of_images(self.policy_kwargs))
         if self.horizon not in (0, problem.horizon) or self.state_dim not in (0, problem.state_dim):

@@ -27,7 +27,6 @@ from torch.nn import functional as F
 from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each_part
 from sb3_tdpg.checks import (
     check_action_mean,
-    check_floors,
     check_memory,
     check_net_arch,
     check_single,
@@ -139,7 +138,9 @@ class TRVPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         check_count("horizon", horizon)
-        check_floors(encoder_var_floor=encoder_var_floor, action_var_floor=action_var_floor)
+        for name, floor in dict(encoder_var_floor=encoder_var_floor, action_var_floor=action_var_floor).items():
+            if floor is not None and not floor >= 0:
+                raise ValueError(f"policy_kwargs: {name}={floor} must not be negative")
         kind = observation_kind(observation_space, normalize_images=normalize_images)
         defaults = POLICY_DEFAULTS[preset or kind]
         super().__init__(
@@ -450,7 +451,7 @@ class TRVPolicy(BasePolicy):
         :raises ValueError: if the observation has a wrong shape, or an episode is longer than the horizon of a
             time-varying policy.
         """
-        check_single(observation, self.observation_space)
+        check_single(observation)
         if deterministic and not self._has_warned:
             self._has_warned = True
             warnings.warn(

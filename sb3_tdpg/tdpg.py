@@ -21,14 +21,13 @@ from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdpg import losses
-from sb3_tdpg.advantages import ValueFunction, get_baseline
+from sb3_tdpg.advantages import BASELINES, ValueFunction
 from sb3_tdpg.auto_weight import AutoWeight
 from sb3_tdpg.buffers import EpisodeBatch, EpisodeBuffer, RunningEpisodes, each_part
 from sb3_tdpg.checks import (
     check_arguments,
-    check_batch_size,
+    check_batches,
     check_beta,
-    check_segments,
     refuse_others,
     schedule_of,
     with_keywords,
@@ -223,11 +222,9 @@ class TDPG(EpisodicAlgorithm):
         )  # fmt: skip
         policy = with_keywords("policy_kwargs", self.policy_kwargs, make_policy)
         self.policy = cast(TRVPolicy, policy).to(self.device)
-        if self.policy.time_varying:
-            check_segments(self.bptt_steps, self.horizon)
         if self._has_default_batch_size:
             self.batch_size = self._defaults.minibatch(self.horizon, self.epoch_size)
-        check_batch_size(vars(self), self.epoch_size, time_varying=self.policy.time_varying)
+        check_batches(vars(self), self.epoch_size, time_varying=self.policy.time_varying)
         if self.baseline == "value":
             if self.env is not None and "values_see_changes" not in vars(self):  # a loaded model keeps its network
                 self.values_see_changes = cast(Problem, self._problem).state_is_observation
@@ -447,7 +444,7 @@ class TDPG(EpisodicAlgorithm):
 
     def _advantages(self, batch: EpisodeBatch) -> th.Tensor:
         """Compute the advantages, ``(T, N)``; a value network is fitted to the rollouts first."""
-        baseline = get_baseline(self.baseline) or cast(ValueFunction, self.value_function).advantages
+        baseline = BASELINES[self.baseline] or cast(ValueFunction, self.value_function).advantages
         advantages = baseline(batch.costs, batch.states, batch.alive, self.gamma, self.gae_lambda)
         if self.value_function is not None:
             self.logger.record("train/explained_variance", self.value_function.explained)

@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_tdpg.checks import check_action_space, check_n_envs
+from sb3_tdpg.checks import check_action_space
 from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.checks import count as check_count
@@ -189,8 +189,11 @@ def made_env(env: GymEnv | str | None, n_envs: int | None, **sizes: Any) -> GymE
     """
     if isinstance(env, str):
         env = make_episodes_env(env, n_envs, **sizes)
-    elif n_envs is not None:
-        check_n_envs(env, n_envs)
+    elif n_envs is not None and (given := getattr(env, "num_envs", 1)) != n_envs:
+        raise ValueError(
+            f"n_envs={n_envs} applies to an environment given by its id, but the environment given has {given}: leave "
+            "n_envs out"
+        )
     if env is not None:
         check_action_space(env.action_space)
     return env

@@ -21,7 +21,7 @@ import torch as th
 from gymnasium.utils import seeding
 
 from sb3_tdpg import TDPG
-from sb3_tdpg.advantages import get_baseline
+from sb3_tdpg.advantages import BASELINES
 from sb3_tdpg.buffers import STORED, EpisodeBatch, EpisodeBuffer
 from tests.reference_loop import Episode, LoopTDPG, Minibatch, Randomness, mean_baseline, unbatch
 
@@ -119,7 +119,7 @@ def run_both(case: Case) -> Recorded:
         loop_information = [value.item() for value in loop.information(episodes, trvs, logged)]
     advantages = mean_baseline(episodes)
     if case.baseline != "mean":
-        advantages = get_baseline(case.baseline)(batch.costs, batch.states, batch.alive, 1.0).T.tolist()
+        advantages = BASELINES[case.baseline](batch.costs, batch.states, batch.alive, 1.0).T.tolist()
     loop.update(episodes, randomness.trv_noise, randomness.pairings, advantages)
     critics = unbatch(model.estimator.critic)
     return Recorded(model, batch, information, critics, loop, episodes, loop_information)
