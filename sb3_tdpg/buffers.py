@@ -54,12 +54,6 @@ class EpisodeBatch(NamedTuple):
         """Select episodes or segments by their columns."""
         return EpisodeBatch(*(each_part(lambda v: v[:, columns], x) for x in self))
 
-    def partition(self, n_parts: int) -> Sequence[th.Tensor | slice]:
-        """Divide the columns at random into nearly equal parts; a single part has all columns in order."""
-        if n_parts == 1:
-            return [slice(None)]
-        return th.randperm(self.costs.shape[1], device=self.costs.device).tensor_split(n_parts)
-
     def segments(self, n_steps: int) -> EpisodeBatch:
         """
         Cut the episodes into segments, and drop segments that begin after the end of their episode.

@@ -108,9 +108,9 @@ class SelectionCallback(TDPGCallback):
     :param save_path: File of the selected model (``.zip``); a ``.json`` file beside it holds the epoch, cost and
         information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, a limit is NaN, or ``mi_limit`` is negative. It is also raised at the
-        start of a training if a ``VecNormalize`` normalises the observations with statistics that still change
-        (``training=True``). Let the policy normalise the observations instead (``normalize_observations``).
+    :raises ValueError: if neither limit is given. It is also raised at the start of a training if a ``VecNormalize``
+        normalises the observations with statistics that still change (``training=True``). Let the policy normalise the
+        observations instead (``normalize_observations``).
     """
 
     def __init__(
@@ -126,11 +126,6 @@ class SelectionCallback(TDPGCallback):
                 "give cost_limit (selects the lowest information below that cost), mi_limit (the lowest cost below "
                 "that information), or both"
             )
-        for name, limit in (("cost_limit", cost_limit), ("mi_limit", mi_limit)):
-            if limit is not None and np.isnan(limit):
-                raise ValueError(f"{name} is NaN")
-        if mi_limit is not None and mi_limit < 0:
-            raise ValueError(f"mi_limit={mi_limit} must not be negative")
         self.cost_limit = cost_limit
         self.mi_limit = mi_limit
         self.save_path = None if save_path is None else _zip_path(save_path)
@@ -200,13 +195,9 @@ class SelectionCallback(TDPGCallback):
         :raises ValueError: if no epoch met the limits.
         """
         if self.best is None or self._best_policy is None:
-            limits = ", ".join(
-                f"{name} < {limit}"
-                for name, limit in (("cost", self.cost_limit), ("information", self.mi_limit))
-                if limit is not None
-            )
             raise ValueError(
-                f"no epoch met the limits ({limits}): train longer or loosen them; the model keeps its last policy"
+                f"no epoch met the limits (cost_limit={self.cost_limit}, mi_limit={self.mi_limit}): train longer or "
+                "loosen them; the model keeps its last policy"
             )
         model.policy.load_state_dict(self._best_policy)
         return self.best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -163,18 +164,15 @@ def schedule_of(name: str, value: Any) -> Schedule | Any:
     """
     if not isinstance(value, str):
         return value
-    kind, *ends = value.split("_")
+    match = re.fullmatch(r"lin_([^_]+)(?:_([^_]+))?", value)
     try:
-        start, end = map(float, (*ends, "0")[:2])
-    except ValueError:
-        start = end = math.nan
-    if kind != "lin" or len(ends) > 2 or not math.isfinite(start + end):
+        return LinearSchedule(float(match[1]), float(match[2] or 0), 1.0)  # type: ignore[index]
+    except (TypeError, ValueError) as e:
         auto = ", or 'auto'" if name == "beta" else ""
         raise ValueError(
             f"{name}={value!r} must be a number, a function, or a text such as 'lin_1e-3' (falls to 0) or "
             f"'lin_1e-3_1e-5'{auto} (in YAML write the number 1.0e-3: YAML reads 1e-3 as text)"
-        )
-    return LinearSchedule(start, end, 1.0)
+        ) from e
 
 
 def _values(number_or_schedule: Any) -> list[Any]:

@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
@@ -151,13 +150,6 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return with_nuisance(env, self.nuisance)
 
     # -- what the rollouts need ----------------------------------------------------------------------------------
-
-    def _clipped(self, actions: np.ndarray) -> np.ndarray:
-        """Return the actions in the shape of the action space, clipped to its bounds: ``(E, *action)``."""
-        actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
-        if isinstance(self.action_space, spaces.Box):
-            return np.clip(actions, self.action_space.low, self.action_space.high)
-        return actions
 
     def _first_observations(self, env: VecEnv) -> Any:
         if self._last_obs is None:

@@ -36,11 +36,9 @@ def clipped_policy_loss(
     the same rollouts: a sample has no gradient once its probability ratio has left the clip range in the direction that
     lowers the loss. The clip range is ``[1 - clip_range, 1 + clip_range]``.
 
-    :param log_prob: log-probabilities under the current policy, ``(T, N)``
+    The other arguments are those of :func:`policy_gradient_loss`.
+
     :param old_log_prob: log-probabilities under the policy of the rollouts, ``(T, N)``
-    :param advantages: advantages of costs, not of rewards; a positive value means a higher cost than expected,
-        ``(T, N)``
-    :param alive: 1 while an episode runs, then 0, ``(T, N)``
     :param clip_range: Largest change of the probability ratio from 1.
     :return: the loss, a scalar
     """
@@ -59,10 +57,8 @@ def policy_distance(
     """
     Measure the distance of the policy from the policy of the rollouts, as SB3's PPO does.
 
-    :param log_prob: log-probabilities under the current policy, ``(T, N)``
-    :param old_log_prob: log-probabilities under the policy of the rollouts, ``(T, N)``
-    :param alive: 1 while an episode runs, then 0, ``(T, N)``
-    :param clip_range: See :func:`clipped_policy_loss`.
+    The arguments are those of :func:`clipped_policy_loss`.
+
     :return: approximate Kullback-Leibler divergence in nats (http://joschu.net/blog/kl-approx.html), and share of
         clipped samples; both are scalars
     """

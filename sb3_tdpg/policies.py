@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from functools import partial
 from inspect import signature
 from typing import Any, cast
 
@@ -35,7 +34,7 @@ from sb3_tdpg.checks import (
 from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, BatchedLinear, TimeMLP, bounded_variance
 from sb3_tdpg.common.running_norms import Changes
 from sb3_tdpg.envs.checks import count as check_count
-from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
+from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, PolicyDefaults, default, fill_in_extractor, fill_in_trvs
 
 # These limits allow standard deviations of up to 7.4 for a TRV and 55 for an action.
@@ -299,15 +298,20 @@ class TRVPolicy(BasePolicy):
             actions = self._action_distribution(parameters).get_actions(deterministic)
         return PolicyStep(actions, trv, mean, std, noise)
 
+    def clipped(self, actions: np.ndarray) -> np.ndarray:
+        """Return the actions in the shape of the action space, clipped to its bounds: ``(N, *action)``."""
+        actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        if isinstance(self.action_space, spaces.Box):
+            return np.clip(actions, self.action_space.low, self.action_space.high)
+        return actions
+
     def encoder_density(
         self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray
     ) -> tuple[th.Tensor, th.Tensor]:
         """
         Return the mean and the standard deviation of q(x~_t | x~_{t-1}, y_t), ``(N, Z)`` each.
 
-        :param observation: observations y_t, ``(N, *obs)``
-        :param prev_trv: previous TRVs x~_{t-1}, ``(N, Z)``; zero at the start of an episode
-        :param t: time step of each episode, ``(N,)``
+        The arguments are those of :meth:`step`.
         """
         features = self._features(observation)
         parameters = self.encoder.at_times(th.cat([prev_trv, features], dim=1), t)
@@ -342,7 +346,7 @@ class TRVPolicy(BasePolicy):
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Extract the features of every observation: ``(T, N, F)``."""
-        flat = each_part(partial(flat_steps, self.features_extractor), batch.observations)
+        flat = each_part(lambda x: x.flatten(0, 1), batch.observations)
         return self._features(flat).unflatten(0, batch.alive.shape)
 
     def episode_action_density(self, trvs: th.Tensor) -> Distribution:
@@ -477,7 +481,5 @@ class TRVPolicy(BasePolicy):
             check_time(t, self.horizon)
         with th.inference_mode():
             step = self.step(observation_tensor, th.as_tensor(prev_trv, device=first.device), t, deterministic)
-        actions = step.actions.cpu().numpy().reshape((-1, *self.action_space.shape))  # type: ignore[misc]
-        if isinstance(self.action_space, spaces.Box):
-            actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        actions = self.clipped(step.actions.cpu().numpy())
         return (actions if is_vectorized else actions.squeeze(axis=0)), (step.trvs.cpu().numpy(), t + 1)

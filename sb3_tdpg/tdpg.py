@@ -310,7 +310,7 @@ class TDPG(EpisodicAlgorithm):
                 step = self.policy.step(obs_as_tensor(obs, self.device), trvs, np.minimum(episodes.t, self.horizon - 1))
             actions = step.actions.cpu().numpy()
             with named_shapes(env):
-                new_obs, rewards, dones, infos = cast(Any, env.step(self._clipped(actions)))
+                new_obs, rewards, dones, infos = cast(Any, env.step(self.policy.clipped(actions)))
             check_numbers("reward", np.nan_to_num(rewards), (), episodes.t)  # train() reports NaN
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -451,6 +451,10 @@ class TDPG(EpisodicAlgorithm):
         return advantages
 
     def _minibatches(self, batch: EpisodeBatch) -> Sequence[th.Tensor | slice]:
+        """Divide the columns at random into nearly equal parts; a single part has all columns in order."""
         n_columns = batch.costs.shape[1]
         n_parts = 1 if self.batch_size is None else math.ceil(batch.alive.sum().item() / self.batch_size)
-        return batch.partition(min(n_parts, max(1, n_columns // 2)))  # the information needs two columns in each part
+        n_parts = min(n_parts, max(1, n_columns // 2))  # the information needs two columns in each part
+        if n_parts == 1:
+            return [slice(None)]
+        return th.randperm(n_columns, device=self.device).tensor_split(n_parts)

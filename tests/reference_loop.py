@@ -230,7 +230,7 @@ def to_float32(x: float) -> float:
 def unbatch(mlp: BatchedMLP) -> list[nn.Sequential]:
     """Copy a batched network into one ``nn.Sequential`` for each of its maps."""
     networks = []
-    for m in range(mlp.n_maps):
+    for m in range(len(mlp.layers[0].weight)):
         modules: list[nn.Module] = []
         for layer in mlp.layers:
             linear = nn.Linear(*layer.weight.shape[1:])

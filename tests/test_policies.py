@@ -140,7 +140,7 @@ def test_a_gate_keeps_the_last_trvs_where_it_is_closed_and_replaces_them_where_i
     th.testing.assert_close(means(-30.0), prev_trv)
     th.testing.assert_close(means(30.0), th.tanh(candidate))
     th.testing.assert_close(means(0.0), (prev_trv + th.tanh(candidate)) / 2)
-    assert make_policy(gate=False, trv_dim=2).encoder.sizes[-1] == 4
+    assert make_policy(gate=False, trv_dim=2).encoder.mlp.layers[-1].bias.shape[-1] == 4
     with pytest.raises(ValueError, match="gate=True and skip=True"):
         make_policy(gate=True, skip=True, trv_dim=3)
 

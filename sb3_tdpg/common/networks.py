@@ -57,7 +57,6 @@ class BatchedMLP(nn.Module):
 
     def __init__(self, n_maps: int, sizes: Sequence[int], activation_fn: type[nn.Module] = nn.ELU) -> None:
         super().__init__()
-        self.n_maps = n_maps
         self.layers = nn.ModuleList(BatchedLinear(n_maps, i, o) for i, o in pairwise(sizes))
         self.activation = activation_fn()
 
@@ -119,9 +118,6 @@ class TimeMLP(nn.Module):
         self, horizon: int, sizes: Sequence[int], activation_fn: type[nn.Module] = nn.ELU, *, time_varying: bool = True
     ) -> None:
         super().__init__()
-        self.horizon = horizon
-        self.sizes = tuple(sizes)
-        self.activation_fn = activation_fn
         self.time_varying = time_varying
         self.mlp = BatchedMLP(horizon if time_varying else 1, sizes, activation_fn)
 
