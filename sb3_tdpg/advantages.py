@@ -154,11 +154,8 @@ class ValueFunction(nn.Module):
 
     def fit(self, states: th.Tensor, targets: th.Tensor, alive: th.Tensor, gamma: float) -> float:
         """
-        Fit the network to the targets of an epoch.
+        Fit the network to the costs-to-go of an epoch, ``(T, N)``.
 
-        :param states: true state x_t, ``(T, N, X)``
-        :param targets: costs-to-go to predict, ``(T, N)``
-        :param alive: 1 while an episode runs, then 0, ``(T, N)``
         :return: share of the variance of the targets that the network explained before this fit
         """
         living = alive.bool()

@@ -94,14 +94,6 @@ class PolicyStep(NamedTuple):
     noise: th.Tensor  # (N, Z)
 
 
-class RebuiltTRVs(NamedTuple):
-    """The TRVs of episodes, rebuilt from the stored noise so that gradients flow through the recurrence."""
-
-    trvs: th.Tensor  # (T, N, Z)
-    means: th.Tensor  # (T, N, Z)
-    stds: th.Tensor  # (T, N, Z)
-
-
 class EpisodeBuffer(RolloutBuffer):
     """
     A rollout buffer of ``(T, N, ...)`` arrays, indexed by time step and episode (in SB3: time step and environment).
@@ -173,11 +165,7 @@ class EpisodeBuffer(RolloutBuffer):
         self.stds[:, self.stds.shape[1] // 2 :] = 1.0
 
     def clear_episodes(self, episodes: np.ndarray) -> None:
-        """
-        Clear the costs of some episodes, and mark their steps as not alive.
-
-        :param episodes: columns of these episodes, ``(n,)``
-        """
+        """Clear the costs of the episodes in some columns, ``(n,)``, and mark their steps as not alive."""
         self.costs[:, episodes] = 0.0
         self.alive[:, episodes] = 0.0
 

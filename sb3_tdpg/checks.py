@@ -46,12 +46,7 @@ def nearest_name(name: str, names: Iterable[str]) -> str:
 
 
 def refuse_others(others: Mapping[str, Any], names: Iterable[str]) -> None:
-    """
-    Raise a ``TypeError`` for an unknown argument, and suggest the equivalent of a PPO argument or the nearest name.
-
-    :param others: The unknown arguments.
-    :param names: The names of TDPG's arguments.
-    """
+    """Raise a ``TypeError`` for unknown arguments; suggest the equivalent of a PPO argument or the nearest name."""
     for name in others:
         of_ppo = next(iter(get_close_matches(name, OF_PPO, n=1, cutoff=0.85)), None)
         hint = f": use {OF_PPO[of_ppo]} (see 'Coming from PPO' in the docs)" if of_ppo else nearest_name(name, names)
@@ -59,12 +54,7 @@ def refuse_others(others: Mapping[str, Any], names: Iterable[str]) -> None:
 
 
 def check_arguments(settings: Mapping[str, Any]) -> None:
-    """
-    Check all arguments that do not depend on the environment.
-
-    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name; other keys are ignored.
-    :raises ValueError: for the first argument that is out of range.
-    """
+    """Raise a ``ValueError`` for the first bad argument of TDPG that does not depend on the environment."""
     check_beta_argument(settings["beta"], settings["cost_limit"])
     for rate in _values(schedule_of("learning_rate", settings["learning_rate"])):
         check_learning_rate(rate)
@@ -112,13 +102,7 @@ def is_number(value: Any) -> bool:
 
 
 def check_batches(settings: Mapping[str, Any], epoch_size: int, *, time_varying: bool) -> None:
-    """
-    Check ``bptt_steps`` and ``batch_size``, and that several updates on the same rollouts use clipping.
-
-    :param settings: Arguments of :class:`~sb3_tdpg.TDPG` by name, and the ``horizon``.
-    :param epoch_size: Number of steps of an epoch.
-    :param time_varying: Whether each time step has weights of its own.
-    """
+    """Check ``bptt_steps`` and ``batch_size``, and that several updates on the same rollouts use clipping."""
     batch_size, n_epochs, horizon = settings["batch_size"], settings["n_epochs"], settings["horizon"]
     bptt_steps, least, why = settings["bptt_steps"], MIN_BATCH_STEPS, ""
     if time_varying:

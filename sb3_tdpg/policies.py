@@ -23,7 +23,7 @@ from torch import nn
 from torch.distributions import Normal
 from torch.nn import functional as F
 
-from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, RebuiltTRVs, each_part
+from sb3_tdpg.buffers import EpisodeBatch, PolicyStep, each_part
 from sb3_tdpg.checks import (
     check_action_mean,
     check_memory,
@@ -232,13 +232,7 @@ class TRVPolicy(BasePolicy):
     def _encoder_density(
         self, parameters: th.Tensor, features: th.Tensor, prev_trv: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Return the mean and the standard deviation of q(x~_t | x~_{t-1}, y_t), ``(..., Z)`` each.
-
-        :param parameters: the encoder's outputs, ``(..., 2 Z)``, or ``(..., 3 Z)`` with a gate
-        :param features: features of the observations, ``(..., F)``
-        :param prev_trv: previous TRVs x~_{t-1}, ``(..., Z)``
-        """
+        """Return the mean and the standard deviation of the TRVs from the encoder's outputs, ``(..., Z)`` each."""
         mean, log_var, *gates = parameters.chunk(3 if self.gate else 2, dim=-1)
         if self.skip:
             skipped = [features]
@@ -308,11 +302,7 @@ class TRVPolicy(BasePolicy):
     def encoder_density(
         self, observation: PyTorchObs, prev_trv: th.Tensor, t: np.ndarray
     ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Return the mean and the standard deviation of q(x~_t | x~_{t-1}, y_t), ``(N, Z)`` each.
-
-        The arguments are those of :meth:`step`.
-        """
+        """Return the mean and the standard deviation of q(x~_t | x~_{t-1}, y_t), ``(N, Z)`` each; see :meth:`step`."""
         features = self._features(observation)
         parameters = self.encoder.at_times(th.cat([prev_trv, features], dim=1), t)
         return self._encoder_density(parameters, features, prev_trv)
@@ -326,12 +316,7 @@ class TRVPolicy(BasePolicy):
         return self.extract_features(observation, self.features_extractor)
 
     def action_density(self, trv: th.Tensor, t: np.ndarray) -> Distribution:
-        """
-        Return the distribution pi(u_t | x~_t) of the actions; the next call overwrites it.
-
-        :param trv: TRVs x~_t, ``(N, Z)``
-        :param t: time step of each episode, ``(N,)``
-        """
+        """Return pi(u_t | x~_t) for TRVs ``(N, Z)`` at time steps ``(N,)``; the next call overwrites it."""
         return self._action_distribution(self.action_head.at_times(trv, t))
 
     def update_statistics(self, batch: EpisodeBatch) -> None:
@@ -380,18 +365,13 @@ class TRVPolicy(BasePolicy):
         return self.episode_action_density(trvs).log_prob(actions).unflatten(0, trvs.shape[:2])
 
     def stored_log_prob(self, batch: EpisodeBatch, encoder_gradient: str) -> th.Tensor:
-        """
-        Compute the log-probability of :meth:`evaluate_episodes` under the policy of the rollouts, from stored
-        densities.
-
-        :return: log-probabilities, ``(T, N)``
-        """
+        """Compute the result of :meth:`evaluate_episodes` under the policy of the rollouts, from stored densities."""
         log_prob = self.action_log_prob(batch.trvs, batch)
         if encoder_gradient == "pathwise":
             return log_prob
         return log_prob + Normal(batch.means, batch.stds, validate_args=False).log_prob(batch.trvs).sum(dim=-1)
 
-    def rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> RebuiltTRVs:
+    def rebuild_trvs(self, features: th.Tensor, batch: EpisodeBatch) -> EpisodeBatch:
         """
         Unroll Equation 15, ``x~_t = mean + std * eps_t``, with the stored noise.
 
@@ -399,6 +379,7 @@ class TRVPolicy(BasePolicy):
 
         :param features: features of the observations, ``(T, N, F)``
         :param batch: the rollouts, ``(T, N, ...)``
+        :return: the rollouts with TRVs, means and stds through which gradients flow along the recurrence
         """
         trv, noise = batch.prev_trvs[0], batch.noise
         steps = []
@@ -408,25 +389,26 @@ class TRVPolicy(BasePolicy):
             mean, std = self._encoder_density(parameters, features_t, trv)
             trv = mean + std * noise_t
             steps.append((trv, mean, std))
-        return RebuiltTRVs(*(th.stack(x) for x in zip(*steps, strict=True)))
+        trvs, means, stds = (th.stack(x) for x in zip(*steps, strict=True))
+        return batch._replace(trvs=trvs, means=means, stds=stds)
 
     def evaluate_episodes(
         self, batch: EpisodeBatch, encoder_gradient: str, rebuild: bool = False
-    ) -> tuple[th.Tensor, RebuiltTRVs | None]:
+    ) -> tuple[th.Tensor, EpisodeBatch | None]:
         """
         Compute the log-probability whose gradient trains the encoder and the action head.
 
         :param batch: whole episodes, or segments of them
         :param encoder_gradient: ``"score"`` or ``"pathwise"``, see :class:`~sb3_tdpg.TDPG`.
         :param rebuild: Whether to rebuild the TRVs from the noise even if the gradient does not need them.
-        :return: the log-probability, ``(T, N)``, and the rebuilt TRVs, if any
+        :return: the log-probability, ``(T, N)``, and the batch with rebuilt TRVs, if any
         """
         features = self.episode_features(batch)
         if encoder_gradient == "pathwise":
-            trvs = self.rebuild_trvs(features, batch)
-            return self.action_log_prob(trvs.trvs, batch), trvs
-        rebuilt = self.rebuild_trvs(features, batch) if rebuild else None
-        return self.trv_log_prob(features, batch) + self.action_log_prob(batch.trvs, batch), rebuilt
+            rebuilt = self.rebuild_trvs(features, batch)
+            return self.action_log_prob(rebuilt.trvs, batch), rebuilt
+        log_prob = self.trv_log_prob(features, batch) + self.action_log_prob(batch.trvs, batch)
+        return log_prob, self.rebuild_trvs(features, batch) if rebuild else None
 
     # -- the interface of SB3 ---------------------------------------------------------------------------------
 

@@ -160,8 +160,6 @@ def preset_of(observation_space: spaces.Space | None, horizon: int | None, **key
     """
     Return the name of the defaults for a problem: ``"vector"``, ``"image"``, ``"depth"`` or ``"long"``.
 
-    :param observation_space: The environment's observation space.
-    :param horizon: The environment's horizon T, if it is known.
     :param keywords: See :func:`~sb3_tdpg.features.observation_kind`.
     """
     kind = observation_kind(observation_space, **keywords)
@@ -201,11 +199,7 @@ def fill_in(
     """
     Replace arguments that are ``None`` by their defaults.
 
-    :param given: Arguments by name.
-    :param preset: Name of the defaults, see :func:`preset_of`.
-    :param cost_limit: The argument ``cost_limit``, see :func:`implied`.
-    :param n_envs: Number of environments; the default of ``n_episodes`` is a multiple of it.
-    :param horizon: Horizon T; the default of ``gamma`` depends on it.
+    The default of ``n_episodes`` is a multiple of ``n_envs``; that of ``gamma`` depends on the horizon.
     """
     defaults = DEFAULTS[preset]
     settings = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
@@ -243,10 +237,7 @@ def fill_in_trvs(
     """
     Return ``trv_dim``, ``skip`` and ``skip_changes`` with their defaults.
 
-    :param defaults: Defaults of the preset.
-    :param n_features: Number of features of an observation.
-    :raises ValueError: if there are fewer TRVs than features and changes that are added to them, or ``skip_changes`` is
-        True without ``skip``.
+    A ``ValueError`` is raised if there are fewer TRVs than features and changes that are added to them.
     """
     if trv_dim is not None:
         check_count("policy_kwargs: trv_dim", trv_dim)

@@ -143,13 +143,10 @@ def attribute_of(env: VecEnv | gym.Env, name: str) -> Any:
 
 def check_numbers(what: str, values: np.ndarray, shape: tuple[int, ...] | None, t: np.ndarray) -> None:
     """
-    Check the values that environments returned, before they reach a network.
+    Raise a ``ValueError`` if values of the environments, ``(E, *shape)``, cannot be given to a network.
 
-    :param what: Name of the values in the error message: "observation", "state" or "reward".
-    :param values: the values of all environments, ``(E, *shape)``
-    :param shape: Expected shape for one environment.
-    :param t: time step of each environment, ``(E,)``
-    :raises ValueError: if the shape differs, or a number is NaN, infinite or larger than 1e18 in absolute value.
+    They must have the shape of their space, and no number may be NaN, infinite or larger than 1e18 in absolute value.
+    ``t`` is the time step of each environment, ``(E,)``.
     """
     if values.shape[1:] != shape:
         raise ValueError(

@@ -415,8 +415,8 @@ class TDPG(EpisodicAlgorithm):
             loss = policy_loss
             if rebuilt is not None and mi_coef > 0.0:
                 # Equation 15: the critics are frozen, and the gradient flows through the rebuilt TRVs.
-                samples = part._replace(**rebuilt._asdict()).information_batch(self.pools_information)
-                mi_loss = mi_coef * losses.information_loss(self.estimator(samples))
+                information_t = self.estimator(rebuilt.information_batch(self.pools_information))
+                mi_loss = mi_coef * losses.information_loss(information_t)
                 loss = loss + mi_loss / cost_scale
                 self.logger.record_mean("train/mi_loss", mi_loss.item())
             self._check_finite("policy loss", policy_loss)

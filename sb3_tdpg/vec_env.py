@@ -146,12 +146,7 @@ def _creator(spec: EnvSpec) -> Any:
 
 
 def batched_class(env_id: str) -> type[POMDPEnv] | None:
-    """
-    Return the class behind a registered id whose episodes can be stepped as one batch; ``None`` for any other id.
-
-    :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    :raises gymnasium.error.Error: if the id is not registered.
-    """
+    """Return the class behind a registered id whose episodes can be stepped as one batch; ``None`` for other ids."""
     spec = _spec(env_id)
     creator = _creator(spec)
     is_ours = isinstance(creator, type) and issubclass(creator, POMDPEnv)
@@ -178,15 +173,7 @@ def largest_divisor(n_episodes: int, limit: int = 50) -> int:
 
 
 def made_env(env: GymEnv | str | None, n_envs: int | None, **sizes: Any) -> GymEnv | None:
-    """
-    Return the environment that a model was given, or make it from its id.
-
-    :param env: A registered id, an environment or a ``VecEnv``.
-    :param n_envs: Number of environments to make if ``env`` is an id.
-    :param sizes: Length of an epoch: ``n_episodes`` and ``epoch_steps``.
-    :raises ValueError: if ``env`` has another number of environments than ``n_envs``, or its action space is not
-        supported.
-    """
+    """Return the environment that a model was given, or make it from its id; ``sizes`` is the length of an epoch."""
     if isinstance(env, str):
         env = make_episodes_env(env, n_envs, **sizes)
     elif n_envs is not None and (given := getattr(env, "num_envs", 1)) != n_envs:

@@ -11,7 +11,7 @@ from small_problems import ToyEnv, parameters, same_parameters, tiny_tdpg, toy_v
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_tdpg import TDPG, TRVPolicy
-from sb3_tdpg.buffers import RebuiltTRVs, each_part
+from sb3_tdpg.buffers import each_part
 from sb3_tdpg.policies import MAX_TIME_VARYING_HORIZON
 
 T, N = 4, 6
@@ -68,7 +68,7 @@ def test_predicting_step_by_step_equals_the_batched_pass_over_whole_episodes(
     assert (noise == 0).all() == deterministic
 
     features = policy.extract_features(th.as_tensor(observations).flatten(0, 1), policy.features_extractor)
-    batch = SimpleNamespace(noise=noise, prev_trvs=th.zeros_like(noise))
+    batch = SimpleNamespace(noise=noise, prev_trvs=th.zeros_like(noise), _replace=SimpleNamespace)
     rebuilt = policy.rebuild_trvs(features.unflatten(0, (T, N)), batch)
     np.testing.assert_allclose(rebuilt.trvs.detach(), trvs, rtol=1e-4, atol=1e-6)
     for name in ("means", "stds"):
@@ -89,7 +89,7 @@ def test_segments_side_by_side_give_the_trvs_of_whole_episodes(n_steps):
     parts = batch._replace(trvs=trvs, prev_trvs=th.cat([th.zeros_like(trvs[:1]), trvs[:-1]])).segments(n_steps)
     features = model.policy.episode_features(parts).detach().requires_grad_()
     rebuilt = model.policy.rebuild_trvs(features, parts)
-    for name in RebuiltTRVs._fields:
+    for name in ("trvs", "means", "stds"):
         joined = getattr(rebuilt, name).unflatten(1, (-1, 4)).transpose(0, 1).flatten(0, 1)[:5]
         th.testing.assert_close(joined, getattr(whole, name), rtol=1e-4, atol=1e-5)
     # The gradient reaches the start of the segment.

@@ -33,7 +33,7 @@ def actions(policy: Any, batch: Any) -> list[Distribution]:
     :param batch: An :class:`~sb3_tdpg.buffers.EpisodeBatch`.
     :return: The distributions pi(. | x~_t), ``(T * N, ...)``: several for a ``MultiDiscrete`` space, otherwise one.
     """
-    trvs, *_ = policy.rebuild_trvs(policy.episode_features(batch), batch)
+    trvs = policy.rebuild_trvs(policy.episode_features(batch), batch).trvs
     densities = policy.episode_action_density(trvs).distribution
     return densities if isinstance(densities, list) else [densities]
 
