@@ -237,7 +237,8 @@ def fill_in_trvs(
     """
     Return ``trv_dim``, ``skip`` and ``skip_changes`` with their defaults.
 
-    A ``ValueError`` is raised if there are fewer TRVs than features and changes that are added to them.
+    A ``ValueError`` is raised if there are fewer TRVs than features and changes that are added to them, or if
+    ``skip_changes`` is True without ``skip``.
     """
     if trv_dim is not None:
         check_count("policy_kwargs: trv_dim", trv_dim)
