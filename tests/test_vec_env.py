@@ -121,6 +121,13 @@ def test_the_same_seed_gives_the_same_episodes_and_the_seed_is_used_once():
     assert not np.array_equal(first, second)
 
 
+def test_reset_options_are_refused_with_the_mend():
+    vec_env = lava_vec_env()
+    vec_env.set_options({"sensor_noise_std": 1.0})
+    with pytest.raises(ValueError, match="pass variations to its constructor"):
+        vec_env.reset()
+
+
 @pytest.mark.parametrize(("is_normalized", "wrap"), [
     (True, lambda env: VecNormalize(env, norm_reward=False)),
     (False, VecMonitor),
