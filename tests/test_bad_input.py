@@ -87,12 +87,6 @@ ARGUMENTS = {
     "gamma a text": (dict(gamma="1"), "gamma='1' must be a number"),
     "gae_lambda a text": (dict(gae_lambda="1"), "gae_lambda='1' must be a number"),
     "epoch of one episode": (dict(n_episodes=None, epoch_steps=9), "epoch_steps=9", "two episodes", "n_episodes=2"),
-    "nuisance without scenes": (dict(nuisance={"env_kwargs": []}), r"'env_kwargs': \[\]", "hold keywords"),
-    "nuisance misspelt": (dict(nuisance={"env_kwargs": [{"bar": 3}]}), "'env_kwargs': .*unexpected keyword .*'bar'"),
-    "nuisance that redraws a number": (
-        dict(nuisance={"env_kwargs": [{"sensor_noise_std": 1.0}], "redraw": 3}), "redraw=3", r"list .*'d \(m\)'"
-    ),
-    "nuisance that only redraws": (dict(nuisance={"redraw": ["d"]}), "'redraw' needs 'env_kwargs'"),
     "three severities": (dict(nuisance={"vector_noise": [1, 2, 3]}), r"\[1, 2, 3\]", "the lowest and the highest"),
     "gamma zero": (dict(gamma=0.0), "gamma=0.0", r"\(0, 1\]"),
     "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),

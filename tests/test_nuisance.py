@@ -152,14 +152,6 @@ def test_an_environment_that_comes_from_another_model_is_wrapped_once(tmp_path):
     train_epochs(model, 1)
 
 
-def test_another_environment_brings_its_own_scenes():
-    model = tiny_tdpg(make_episodes_env("Lava-v0", 20), nuisance={"env_kwargs": dict(sensor_bias=[10.0, -10.0])})
-    model.set_env(make_episodes_env("Lava-v0", 20, env_kwargs=dict(sensor_noise_std=0.0)))
-    seen = model.env.reset()
-    states = np.stack([info["state"] for info in model.env.reset_infos])
-    np.testing.assert_allclose(seen, states + np.array([10.0, -10.0]), rtol=1e-6)
-
-
 def test_a_nuisance_goes_inside_a_normalisation():
     normalized = VecNormalize(make_episodes_env("Lava-v0", 20), norm_reward=False)
     for env in (normalized, VecMonitor(normalized)):

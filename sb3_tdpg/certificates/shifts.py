@@ -188,7 +188,7 @@ class TrainingEpisodes:
         if shift.nuisance is not None:
             # The members are drawn once, since every call has the same number of episodes.
             plain, members = env.sensor, functools.cache(shift.nuisance)
-            env.sensor = lambda state: members(len(state))(plain(state), None, state)
+            env.sensor = lambda state: members(len(state))(plain(state))
         return env
 
 

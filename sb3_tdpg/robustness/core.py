@@ -22,7 +22,6 @@ Observations = Any
 """An array ``(n, *obs)``, or a dict of such arrays."""
 
 Drawn = dict[str, np.ndarray]
-States = np.ndarray | None
 
 
 def take(observations: Observations, which: Any) -> Observations:
@@ -47,9 +46,6 @@ class Members:
     :param seed: Seed of the generator. With ``None``, the seed is random until a call of :meth:`reseed`.
     :param children: Members that are reseeded, and begin episodes, together with this object.
     """
-
-    uses_states = False
-    """Whether a call needs the true states."""
 
     def __init__(self, n: int, *names: str, seed: int | None = None, children: Iterable["Members"] = ()) -> None:
         codes = [zlib.crc32(name.encode()) for name in names if name]
@@ -80,20 +76,17 @@ class Members:
         self.n, self.children = n, [child.repeat(n) for child in self.children]
         return self
 
-    def __call__(
-        self, observations: Observations, which: np.ndarray | None = None, states: States = None
-    ) -> Observations:
+    def __call__(self, observations: Observations, which: np.ndarray | None = None) -> Observations:
         """
         Perturb the next observations of some episodes, and return them as a new array.
 
         :param observations: The observations of these episodes, ``(n, *obs)``.
         :param which: Indices of the episodes, ``(n,)``. ``None`` means all.
-        :param states: The true states x_t, ``(n, X)``, if :attr:`uses_states`.
         """
         if which is None:  # no copies
-            return self._show(observations, np.arange(self.n), states, self._episode)
+            return self._show(observations, np.arange(self.n), self._episode)
         episode = {name: values[which] for name, values in self._episode.items()}
-        shown = self._show(observations, which, states, episode)
+        shown = self._show(observations, which, episode)
         for name, values in episode.items():
             self._episode[name][which] = values
         return shown
@@ -102,7 +95,7 @@ class Members:
         """Draw the values that n new episodes keep: arrays ``(n, ...)``."""
         return {}
 
-    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
+    def _show(self, observations: Observations, which: np.ndarray, episode: Drawn) -> Observations:
         """Perturb observations, and update the values in ``episode`` in place."""
         return each_part(np.copy, observations)
 
@@ -143,7 +136,7 @@ class Perturber(Members):
             drawn |= self.perturbation.draw(self._rng, n, self.value, self.sensor)
         return drawn
 
-    def _show(self, observations: Observations, which: np.ndarray, states: States, episode: Drawn) -> Observations:
+    def _show(self, observations: Observations, which: np.ndarray, episode: Drawn) -> Observations:
         if self.parts:
             return {**observations, **{key: part(observations[key], which) for key, part in self.parts.items()}}
         perturbed = (self._in_time if self.perturbation.timing else self._in_units)(observations, episode)

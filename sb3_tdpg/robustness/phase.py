@@ -110,9 +110,8 @@ class NuisancePhase(TDPGCallback):
     def perturbed(self, batch: Any) -> Any:
         """Draw a member of the nuisance for each of N episodes; return the perturbed observations: ``(T, N, *obs)``."""
         members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
-        states = batch.states.cpu().numpy()
         plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
-        steps = [members(take(plain, t), None, states[t]) for t in range(len(states))]
+        steps = [members(take(plain, t)) for t in range(len(batch.costs))]
         return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
 
     def _cut(self, batch: Any, observations: Any) -> Any:

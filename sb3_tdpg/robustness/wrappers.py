@@ -4,7 +4,7 @@ Perturb the observations or the actions of an SB3 ``VecEnv``.
 Dimension key: N environments side by side.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -75,10 +75,7 @@ class PerturbedVecEnv(VecEnvWrapper):
             self._perturber.reseed(env_seed + (self._depth << 32))
         self._perturber.begin(np.arange(self.num_envs))
         self.reset_infos = self.unwrapped.reset_infos
-        return observations if self._is_plant else self._perturber(observations, None, self._states(self.reset_infos))
-
-    def _states(self, infos: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
-        return np.stack([info["state"] for info in infos]) if self._perturber.uses_states else None
+        return observations if self._is_plant else self._perturber(observations)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Begin a step; perturb the actions if the perturbation is one of actions."""
@@ -93,16 +90,15 @@ class PerturbedVecEnv(VecEnvWrapper):
             self._perturber.begin(ended)
             return observations, rewards, dones, infos
         if not len(ended):
-            return self._perturber(observations, None, self._states(infos)), rewards, dones, infos
+            return self._perturber(observations), rewards, dones, infos
         # First perturb the last observations of the running and ended episodes, then the first ones of new episodes.
         last = each_part(np.copy, observations)
         reported = [i for i in ended if "terminal_observation" in infos[i]]
         for i in reported:
             put(last, i, infos[i]["terminal_observation"])
-        perturbed, infos = self._perturber(last, None, self._states(infos)), list(infos)
+        perturbed, infos = self._perturber(last), list(infos)
         for i in reported:
             infos[i] = {**infos[i], "terminal_observation": each_part(np.copy, take(perturbed, i))}
         self._perturber.begin(ended)
-        states = self._states([self.reset_infos[i] for i in ended])
-        put(perturbed, ended, self._perturber(take(observations, ended), ended, states))
+        put(perturbed, ended, self._perturber(take(observations, ended), ended))
         return perturbed, rewards, dones, infos

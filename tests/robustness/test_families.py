@@ -5,14 +5,13 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from perturbed_problems import countdown, perturbed, run
-from small_problems import LinearProblem, toy_vec_env
+from small_problems import toy_vec_env
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_tdpg import make_episodes_env
-from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.robustness import Perturbation, PerturbedVecEnv
 from sb3_tdpg.robustness.core import take
-from sb3_tdpg.robustness.families import Family, OneOf, SceneMembers
+from sb3_tdpg.robustness.families import Family, OneOf
 
 N = 40
 SOME = np.array([27, 3, 12, 31, 8, 19, 0, 35])
@@ -23,31 +22,12 @@ VECTOR = spaces.Box(-100, 100, (16,), np.float32)
 PARTS = spaces.Dict(camera=IMAGES, arm=VECTOR)
 
 
-class Lamp(LinearProblem):
-    """The sensor shows a position and the light of a lamp, eight times, in the unit of its scene."""
-
-    def __init__(self, unit):
-        super().__init__()
-        self.unit, self.observation_space = unit, VECTOR
-        self.state_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
-
-    def initial_state(self, n):
-        return self.np_random.uniform(1, 2, (n, 2))
-
-    def sensor(self, state):
-        return np.tile(self.unit * state, 8).astype(np.float32)
-
-
 def family(declared, space, **kwargs):
     return Family(declared, toy_vec_env(observation_space=space), **kwargs)
 
 
-def scenes(n, seed=None):
-    return SceneMembers([Lamp(1.0), Lamp(-1.0), Lamp(3.0)], [1], n, seed=seed)
-
-
 def one_of(n, seed=None):
-    return OneOf([scenes(n, seed), family({"vector_bias": 5}, VECTOR).members(n, seed)], n, seed)
+    return OneOf([family({name: 5}, VECTOR).members(n, seed) for name in ("vector_scale", "vector_bias")], n, seed)
 
 
 MEMBERS = {
@@ -56,7 +36,6 @@ MEMBERS = {
     "several": (VECTOR, family({"vector_bias": (1, 5)}, VECTOR).members),
     "a part": (PARTS, family({"vector_bias": 5}, PARTS).members),
     "several parts": (PARTS, family({"vector_bias": 5, "hue": 5}, PARTS).members),
-    "scenes": (VECTOR, scenes),
     "one of two": (VECTOR, one_of),
 }
 
@@ -79,11 +58,11 @@ def flat(seen):
 def shows(request):
     """Members of a family, and what they show of some episodes; the plain sensor shows the same every time."""
     space, draw = MEMBERS[request.param]
-    plain, states = sampled(space), np.random.default_rng(0).uniform(1, 2, (N, 2))
+    plain = sampled(space)
     members = draw(N, 0)
 
     def show(which, members=members):
-        return flat(members(take(plain, which), which, states[which]))
+        return flat(members(take(plain, which), which))
 
     return draw, members, show
 
@@ -120,7 +99,7 @@ def test_the_seed_names_the_members(shows):
 @pytest.mark.parametrize(("space", "draw"), MEMBERS.values(), ids=MEMBERS)
 def test_one_member_is_the_same_for_all_episodes(space, draw):
     def seen(seed, n=N):  # by n episodes that show what the first one shows
-        return flat(draw(1, seed).repeat(n)(take(sampled(space), np.zeros(n, int)), None, np.full((n, 2), 1.5)))
+        return flat(draw(1, seed).repeat(n)(take(sampled(space), np.zeros(n, int))))
 
     one = seen(1)
     assert (one == one[:1]).all()
@@ -173,7 +152,6 @@ def test_a_declared_family_changes_the_observations_and_keeps_shape_and_type(dec
     (3, IMAGES, "3 is no perturbation: expected the name"),
     ([3], IMAGES, "3 is no entry of a list"),
     ([("mine", lambda y, rng: y), ("actuator_gain", 3)], VECTOR, "perturbs actions and observations"),
-    ({"env_kwargs": dict(texture="violet_dots")}, IMAGES, "needs an environment that can observe a given state"),
 ])  # fmt: skip
 def test_a_wrong_declaration_is_explained(declared, space, fragment):
     with pytest.raises(ValueError, match=fragment):
@@ -210,35 +188,6 @@ def test_a_mixture_of_actions_is_one_of_the_plant():
     actions = np.full((50, 1), 0.5, np.float32)
     speeds, expected = (np.array([info["state"][1] for info in e.step(actions)[3]]) for e in (env, plain))
     assert len(np.unique((speeds / expected).round(3))) > 5
-
-
-def test_another_scene_is_seen_in_the_same_state_also_after_an_automatic_reset():
-    kwargs = [dict(texture="violet_dots"), dict(texture="grey_plaster")]
-    env = make_episodes_env("BallCatch-v0", 6, env_kwargs=dict(renderer="fast"), seed=0)
-    wrapped = PerturbedVecEnv(env, dict(env_kwargs=kwargs))
-    seen = [(wrapped.reset(), env.reset_infos)]
-    for _ in range(env.get_attr("horizon")[0] + 1):
-        images, _, dones, infos = wrapped.step(np.zeros((6, 1), np.float32))
-        seen.append((images, env.reset_infos if dones.all() else infos))
-        if dones.all():
-            seen.append((np.stack([info["terminal_observation"] for info in infos]), infos))
-    for images, infos in seen:
-        states = np.stack([info["state"] for info in infos])
-        others = [BallCatchEnv(renderer="fast", **each).sensor(states) for each in kwargs]
-        assert all(any((images[i] == other[i]).all() for other in others) for i in range(6))
-
-
-def test_a_scene_may_redraw_components_of_the_state():
-    env = make_episodes_env("BallCatch-v0", 6, env_kwargs=dict(renderer="fast"), seed=0)
-    declared = {"env_kwargs": dict(robot_range=(1.0, 1.0)), "redraw": ["d (m)"]}
-    seen = PerturbedVecEnv(env, declared).reset()
-    states = np.stack([info["state"] for info in env.reset_infos])
-    states[:, 0] = 1.0
-    np.testing.assert_array_equal(seen, BallCatchEnv(renderer="fast").sensor(states))
-    with pytest.raises(ValueError, match=r"redraw=\['e'\] must be .* of the state, some of \['d \(m\)'"):
-        PerturbedVecEnv(env, {**declared, "redraw": ["e"]})
-    with pytest.raises(ValueError, match="need the true state"):
-        Family(declared, env).members(1)(seen[:1])
 
 
 def test_the_scale_around_another_perturbation_is_that_of_the_plain_sensor():
