@@ -203,7 +203,6 @@ class _Writer:
         # The examples leave out perturbations of the timing, which one picture cannot show.
         of_sensor = [row for row in rows if row.kind == "sensor"]
         shown = [row for row in of_sensor if PERTURBATIONS[row.perturbation].kind == "image"]
-        shown += [row for row in rows if row.kind == "scene"]
         plan = self.plan
         if kind_of(self.space) == "image" and shown:
             names = list(dict.fromkeys(row.perturbation for row in shown))
@@ -281,7 +280,7 @@ def _check_fit(models: Models, rows: Sequence[Row]) -> None:
         named = {f"{label} {number}" if len(of_method) > 1 else label: each for number, each in enumerate(of_method)}
         check_models_fit(named, [rows[0].scenario])
     label, (first, *_) = next(iter(models.items()))
-    check_models_fit({label: first}, [row.scenario for row in rows[1:] if row.kind in ("own", "scene")])
+    check_models_fit({label: first}, [row.scenario for row in rows[1:] if row.kind == "own"])
 
 
 def _check_different(

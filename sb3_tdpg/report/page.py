@@ -168,23 +168,9 @@ def _severities_table(page: Page) -> str:
     perturbed = [row for row in page.rows if row.kind in PERTURBED]
     for name in dict.fromkeys(row.perturbation for row in perturbed):
         rows = [row for row in perturbed if row.perturbation == name]
-        if rows[0].kind != "scene":
-            what, parameter = PERTURBATIONS[name].summary, PERTURBATIONS[name].parameter
-            values = [f"{row.value:g}" for row in rows]
-        else:
-            training: Any = page.plan.env_kwargs
-            changed = [
-                {
-                    k: f"array {v.shape}" if isinstance(v, np.ndarray) else v
-                    for k, v in each.items()
-                    if not np.array_equal(training.get(k), v)
-                }
-                for each in (row.scenario.env_kwargs for row in rows)
-            ]
-            what, parameter = "the environment changes", ", ".join(f"`{key}`" for key in changed[0])
-            values = [", ".join(map(str, each.values())) for each in changed]
-        by_severity = {f"severity {row.severity}": value for row, value in zip(rows, values, strict=True)}
-        lines.append({"perturbation": escaped(name), "effect": what, "parameter": parameter, **by_severity})
+        by_severity = {f"severity {row.severity}": f"{row.value:g}" for row in rows}
+        what = dict(effect=PERTURBATIONS[name].summary, parameter=PERTURBATIONS[name].parameter)
+        lines.append({"perturbation": escaped(name), **what, **by_severity})
     return markdown_table(lines) if lines else ""
 
 

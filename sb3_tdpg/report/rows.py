@@ -10,13 +10,12 @@ from gymnasium import spaces
 
 from sb3_tdpg.common.provenance import jsonable
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
-from sb3_tdpg.robustness import applicable, scene_perturbations
-from sb3_tdpg.robustness.registry import N_SEVERITIES, PERTURBATIONS, find_applicable
+from sb3_tdpg.robustness.registry import N_SEVERITIES, applicable, find_applicable
 
 UNPERTURBED = "unperturbed"
 ALL = "all perturbations"
-PERTURBED = ("sensor", "plant", "scene")
-"""The kinds of rows with severities. They change observations, actions, or keywords of the environment."""
+PERTURBED = ("sensor", "plant")
+"""The kinds of rows with severities. They change observations or actions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,25 +61,16 @@ def make_rows(
     :raises ValueError: if a perturbation is unknown or does not apply, a severity does not exist, or two rows have the
         same name.
     """
-    scenes = scene_perturbations(env_id)
-    known = [*applicable(space, horizon, action_space), *scenes]
-    names = known if perturbations is None else list(dict.fromkeys(perturbations))
+    names = applicable(space, horizon, action_space) if perturbations is None else list(dict.fromkeys(perturbations))
     severities = sorted(set(severities))
     if not severities or not set(severities) <= set(range(1, N_SEVERITIES + 1)):
         raise ValueError(f"severities={list(severities)} must be integers from 1 to {N_SEVERITIES}")
     plain = Scenario(UNPERTURBED, env_id, env_kwargs)
     rows = [Row(UNPERTURBED, 0, "unperturbed", plain)]
     for name in names:
-        if name not in PERTURBATIONS and name not in scenes:
-            raise ValueError(f"perturbation={name!r} is unknown; this environment has {known}")
-        found = None if name in scenes else find_applicable(name, space, horizon, action_space)
-        for severity in severities:
-            if found is None:
-                scenario = Scenario(name, env_id, {**env_kwargs, **scenes[name][severity - 1]})
-                rows.append(Row(name, severity, "scene", scenario))
-            else:
-                kind = "plant" if found.kind == "action" else "sensor"
-                rows.append(Row(name, severity, kind, plain, found.value(severity)))
+        found = find_applicable(name, space, horizon, action_space)
+        kind = "plant" if found.kind == "action" else "sensor"
+        rows += [Row(name, severity, kind, plain, found.value(severity)) for severity in severities]
     # The first row is left out, because in a table of the paper it is the training row.
     for own in PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:] if scenarios is None else scenarios:
         kept = replace(own, env_kwargs={**env_kwargs, **own.env_kwargs}, n_episodes=None)

@@ -8,25 +8,19 @@ from sb3_tdpg.robustness import effects as effects  # fills the registry
 from sb3_tdpg.robustness.gallery import perturbation_gallery
 from sb3_tdpg.robustness.registry import (
     PERTURBATIONS,
-    SCENES,
     Perturbation,
     applicable,
     register,
-    scene_perturbations,
-    severity_table,
 )
 from sb3_tdpg.robustness.scale import observation_scale
 from sb3_tdpg.robustness.wrappers import PerturbedVecEnv
 
 __all__ = [
     "PERTURBATIONS",
-    "SCENES",
     "Perturbation",
     "PerturbedVecEnv",
     "applicable",
     "observation_scale",
     "perturbation_gallery",
     "register",
-    "scene_perturbations",
-    "severity_table",
 ]

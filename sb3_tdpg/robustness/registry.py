@@ -1,11 +1,10 @@
-"""Register perturbations: those of sensor and actuators in one registry, those of the scene in another."""
+"""Register the perturbations of sensor and actuators."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from gymnasium import spaces
 
 from sb3_tdpg.robustness.sensor import Sensor
@@ -17,12 +16,6 @@ KEEP, NOTHING = -1, -2  # in place of an age: the observation shown last, and a 
 Episode = Mapping[str, np.ndarray]  # the values drawn for the episodes of a batch, and their time
 Draw = Callable[[np.random.Generator, int, float, Sensor], dict[str, np.ndarray]]
 Apply = Callable[[np.ndarray, float, Episode, np.random.Generator], np.ndarray]
-
-
-def check_severities(name: str, severities: Sequence[Any]) -> None:
-    """Raise a ``ValueError`` unless there are five severities."""
-    if (n := len(severities)) != N_SEVERITIES:
-        raise ValueError(f"{name} has {n} severities, expected {N_SEVERITIES}: from the mildest to the strongest")
 
 
 @dataclass(frozen=True)
@@ -72,7 +65,8 @@ class Perturbation:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"kind={self.kind!r} of {self.name!r} must be one of {list(KINDS)}")
-        check_severities(repr(self.name), self.severities)
+        if (n := len(self.severities)) != N_SEVERITIES:
+            raise ValueError(f"{self.name!r} has {n} severities, expected 5: from the mildest to the strongest")
 
     def value(self, severity: int) -> float:
         """Return the value of the parameter at a severity, an integer from 1 to 5."""
@@ -156,45 +150,3 @@ def find_applicable(
 def applicable(space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None) -> list[str]:
     """Return the names of the perturbations that apply; see :meth:`Perturbation.objection`."""
     return [name for name, row in PERTURBATIONS.items() if row.objection(space, horizon, action_space) is None]
-
-
-def severity_table(kind: str | None = None) -> pd.DataFrame:
-    """Return a table of all perturbations, or those of one kind, with parameter and severities (columns 1 to 5)."""
-    rows = {
-        name: dict(kind=row.kind, parameter=row.parameter, **dict(zip("12345", row.severities)))  # noqa: B905
-        for name, row in PERTURBATIONS.items()
-        if kind in (None, row.kind)
-    }
-    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("perturbation")
-
-
-Severities = tuple[Mapping[str, Any], ...]  # the env_kwargs of each severity
-
-# The true state, and with it the task, must not change, so no entry moves a mug.
-SCENES: dict[str, dict[str, Severities]] = {
-    "BallCatch-v0": {
-        # A higher severity blends more of another texture into the training texture.
-        "texture": tuple(dict(texture=f"{share}%-turquoise_waves") for share in (20, 40, 60, 80, 100)),
-        # By default the camera is 2 m high and looks up by 30 degrees.
-        "camera_pose": tuple(
-            dict(camera_pitch=pitch, camera_height=height)
-            for pitch, height in ((31.0, 2.05), (32.0, 2.1), (34.0, 2.2), (37.0, 2.35), (40.0, 2.5))
-        ),
-    },
-    "PandaGrasp-v0": {
-        "camera_pose": tuple(dict(camera_shift=height) for height in (0.01, 0.02, 0.03, 0.045, 0.06)),
-    },
-}
-"""Keywords by environment, perturbation and severity. Add entries for your own environment."""
-
-
-def scene_perturbations(env_id: str) -> dict[str, Severities]:
-    """
-    Return the perturbations of an environment in :data:`SCENES`: by name, the ``env_kwargs`` of five severities.
-
-    :param env_id: A registered Gymnasium id, also in the ``module:id`` form.
-    """
-    rows = SCENES.get(env_id.rpartition(":")[2], {})
-    for name, severities in rows.items():
-        check_severities(f"SCENES[{env_id!r}][{name!r}]", severities)
-    return dict(rows)
