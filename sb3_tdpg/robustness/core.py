@@ -159,10 +159,9 @@ class Perturber(Members):
             nothing = self.sensor.parts[key].blank
             seen[of_all == NOTHING] = nothing
             if source.ndim == 2:
-                for fails, group in zip((source == NOTHING).T, self.sensor.groups, strict=True):
-                    if key in group:
-                        at = np.ix_(fails, group[key])
-                        seen.reshape(len(t), -1)[at] = nothing.ravel()[group[key]]
+                for fails, (failing, components) in zip((source == NOTHING).T, self.sensor.groups, strict=True):
+                    if key == failing:
+                        seen.reshape(len(t), -1)[np.ix_(fails, components)] = nothing.ravel()[components]
             result[key] = seen
         return result if isinstance(observations, dict) else result[""]
 

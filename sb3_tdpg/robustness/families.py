@@ -15,7 +15,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_tdpg.buffers import each_part
-from sb3_tdpg.problem import attribute_of, horizon_of
+from sb3_tdpg.problem import horizon_of
 from sb3_tdpg.robustness.core import Drawn, Members, Observations, Perturber, put, take
 from sb3_tdpg.robustness.registry import N_SEVERITIES, Perturbation, find_applicable
 from sb3_tdpg.robustness.scale import default_scale
@@ -130,7 +130,7 @@ class Family:
         elif not found.timing and (found.kind != "image" or self._given_scale is not None):
             of_parts = self._measured_scale  # not needed for images alone; measuring takes steps of the environment
             scale = None if of_parts is None else each_part(lambda part: factor * part, of_parts)
-        sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON, attribute_of(env, "observation_groups"))
+        sensor = Sensor(space, scale, horizon or UNKNOWN_HORIZON)
         return [partial(Perturber, found, severity, sensor) for severity in range(low, high + 1)]
 
 

@@ -4,7 +4,6 @@ Convert observations to the units of perturbations, so that a severity means the
 Dimension key: N environments, F stacked frames, C channels, H and W rows and columns, D components of a vector.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -54,7 +53,6 @@ class Sensor:
     space: Any
     scale: Any = None  # of the components of a vector, in the space's shape (in a Dict by key); see `observation_scale`
     horizon: int = UNKNOWN_HORIZON
-    named_groups: Mapping[str, Sequence[Any]] | None = None  # of the environment: indices, or keys of a Dict, by name
 
     @cached_property
     def parts(self) -> dict[str, "Sensor"]:
@@ -65,30 +63,20 @@ class Sensor:
         return {key: Sensor(part, scale.get(key), self.horizon) for key, part in self.space.items()}
 
     @cached_property
-    def groups(self) -> list[dict[str, np.ndarray]]:
+    def groups(self) -> list[tuple[str, np.ndarray]]:
         """
-        The components of the flattened observation that fail together, by part.
+        What can fail by itself: a part of a ``Dict``, a channel of an image, or a component of a vector.
 
-        The groups are those in ``named_groups``. If there are none, a group is a part of a ``Dict``, a channel of an
-        image or a component of a vector.
+        Each group is the key of its part and the indices of its components in the flattened part.
         """
-        whole = {key: np.arange(int(np.prod(part.space.shape or ()))) for key, part in self.parts.items()}
-        is_dict, named = isinstance(self.space, spaces.Dict), self.named_groups
-        groups: Any
-        known = whole if is_dict else whole[""]
-        if named is not None:
-            groups = named.values()
-            if unknown := [name for group in groups for name in group if name not in known]:
-                wanted = f"keys of the observation, {list(whole)}" if is_dict else f"indices from 0 to {len(known) - 1}"
-                raise ValueError(f"observation_groups={named} has {unknown}: use {wanted}")
-        elif is_dict:
-            groups = [[key] for key in whole]
-        elif self.is_image:
-            channels = np.moveaxis(whole[""].reshape(-1, *self.frame), -1 if self.channels_last else 1, 0)
-            groups = channels.reshape(len(channels), -1)
-        else:
-            groups = whole[""][:, None]
-        return [{key: whole[key] for key in group} if is_dict else {"": np.asarray(group)} for group in groups]
+        sizes = {key: int(np.prod(part.space.shape or ())) for key, part in self.parts.items()}
+        if isinstance(self.space, spaces.Dict):
+            return [(key, np.arange(size)) for key, size in sizes.items()]
+        components = np.arange(sizes[""])
+        if not self.is_image:
+            return [("", component) for component in components[:, None]]
+        channels = np.moveaxis(components.reshape(-1, *self.frame), -1 if self.channels_last else 1, 0)
+        return [("", channel.ravel()) for channel in channels]
 
     @property
     def blank(self) -> np.ndarray:

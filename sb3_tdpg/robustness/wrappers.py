@@ -30,8 +30,7 @@ class PerturbedVecEnv(VecEnvWrapper):
     seed of a training or a checkpoint also determines the perturbations. Put this wrapper inside a ``VecNormalize`` or
     a ``VecFrameStack``. A perturbation of actions can also be outside a ``VecNormalize``.
 
-    :param venv: The environments. Their attribute ``observation_groups`` may name the components that fail together:
-        ``{"imu": [0, 1, 2]}``, or ``{"imu": ["gyroscope"]}`` in a ``Dict``.
+    :param venv: The environments.
     :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or another declaration, such as a
         function or a dict; see :class:`~sb3_tdpg.robustness.families.Family`. With a dict, each episode has one of the
         entries.

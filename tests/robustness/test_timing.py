@@ -86,26 +86,12 @@ def test_all_parts_of_an_observation_are_of_the_same_time(name):
     assert (gyro != NOW).any()
 
 
-def test_groups_have_the_names_of_the_environment(monkeypatch):
-    monkeypatch.setattr(ClockEnv, "observation_groups", {"eyes": ["camera", "touch"]}, raising=False)
-    camera, gyro, touch = (times("group_failure", key=key) for key in ("camera", "gyro", "touch"))
-    np.testing.assert_array_equal(camera, touch)
-    assert (camera[-1] == -1).all()
-    assert (gyro == NOW).all()
-
-
 def test_groups_of_vectors_and_images():
-    def groups(space, named=None):
-        return [group[""].tolist() for group in Sensor(space, named_groups=named).groups]
+    def groups(space):
+        return [components.tolist() for _, components in Sensor(space).groups]
 
-    vector, image = spaces.Box(-1, 1, (3,), np.float32), spaces.Box(0, 255, (4, 4, 3), np.uint8)
-    assert groups(vector) == [[0], [1], [2]]
-    assert groups(vector, {"imu": [0, 2]}) == [[0, 2]]
-    assert groups(image) == [list(range(c, 48, 3)) for c in range(3)]
-    with pytest.raises(ValueError, match=r"has \[3\]: use indices from 0 to 2"):
-        groups(vector, {"imu": [0, 3]})
-    with pytest.raises(ValueError, match=r"has \['nose'\]: use keys of the observation"):
-        groups(DICT, {"face": ["nose"]})
+    assert groups(spaces.Box(-1, 1, (3,), np.float32)) == [[0], [1], [2]]
+    assert groups(spaces.Box(0, 255, (4, 4, 3), np.uint8)) == [list(range(c, 48, 3)) for c in range(3)]
 
 
 def test_nothing_is_zero_or_black_as_far_as_the_bounds_allow():
