@@ -6,7 +6,7 @@ Dimension key: T horizon, N episodes, Z TRVs, U action.
 
 from __future__ import annotations
 
-import math
+import copy
 from typing import Any
 
 import numpy as np
@@ -92,33 +92,18 @@ class NuisancePhase(TDPGCallback):
         self._epoch = self.tdpg.epoch
 
     def _on_rollout_start(self) -> None:  # the rollouts of the last epoch are still there
-        if self.tdpg.epoch > self._epoch:
-            self._remove_from_rollouts()
-            self._epoch = self.tdpg.epoch
-
-    def _on_training_end(self) -> None:
-        self._on_rollout_start()
-
-    def _remove_from_rollouts(self) -> None:
         model: Any = self.tdpg
+        if model.epoch == self._epoch:
+            return
+        self._epoch = model.epoch
         batch = model.rollout_buffer.episode_batch(whole_horizon=model.policy.time_varying)
         update_learning_rate(self.optimizer, model.lr_schedule(model._current_progress_remaining))
         model.policy.set_training_mode(True)
         self.logger.record("nuisance/action_kl", self.remove(batch))
         model.policy.set_training_mode(False)
 
-    def perturbed(self, batch: Any) -> Any:
-        """Draw a member of the nuisance for each of N episodes; return the perturbed observations: ``(T, N, *obs)``."""
-        members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
-        plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
-        steps = [members(take(plain, t)) for t in range(len(batch.costs))]
-        return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
-
-    def _cut(self, batch: Any, observations: Any) -> Any:
-        """Replace the observations of whole episodes; if the policy learns from segments, cut the episodes."""
-        model: Any = self.tdpg
-        batch = batch._replace(observations=observations)
-        return batch if model.policy.time_varying else batch.segments(model.bptt_steps or len(batch.costs))
+    def _on_training_end(self) -> None:
+        self._on_rollout_start()
 
     def remove(self, batch: Any) -> float:
         """
@@ -129,29 +114,36 @@ class NuisancePhase(TDPGCallback):
             nats per step.
         """
         policy, check_finite = self.tdpg.policy, self.tdpg._check_finite
-        minibatches = self._minibatches(batch)
-        with th.no_grad():  # the teacher is the present policy, for all gradient steps
-            whole = map(batch.select, minibatches)  # one at a time, since images need memory
-            teachers = [actions(policy, self._cut(part, part.observations)) for part in whole]
-        for columns, teacher in zip(minibatches, teachers, strict=True):
-            part = batch.select(columns)
-            seen = [self._cut(part, each) for each in (self.perturbed(part), part.observations)]
-            loss = th.stack([divergence(actions(policy, each), teacher, each) for each in seen]).sum()
+        teacher = copy.deepcopy(policy)
+        for _ in range(self.n_steps):
+            plain, perturbed = self._some(batch)
+            with th.no_grad():
+                target = actions(teacher, plain)
+            loss = th.stack([divergence(actions(policy, each), target, each) for each in (perturbed, plain)]).sum()
             check_finite("nuisance loss", loss)
             self.optimizer.zero_grad()
             loss.backward()
             check_finite("gradient", th.nn.utils.clip_grad_norm_(policy.parameters(), 1.0))
             self.optimizer.step()
-        fresh = batch.select(self._minibatches(batch)[0])
+        plain, perturbed = self._some(batch)
         with th.no_grad():
-            perturbed, plain = (self._cut(fresh, each) for each in (self.perturbed(fresh), fresh.observations))
             return divergence(actions(policy, perturbed), actions(policy, plain), plain).item()
 
-    def _minibatches(self, batch: Any) -> list[th.Tensor]:
-        """Draw the episodes of each gradient step, about ``BATCH_STEPS`` steps, with as few passes as possible."""
-        n_columns = batch.alive.shape[1]
-        size = min(n_columns, max(2, round(BATCH_STEPS * n_columns / batch.alive.sum().item())))
-        n_passes = math.ceil(self.n_steps * size / n_columns)
-        device = batch.alive.device
-        columns = th.cat([th.randperm(n_columns, device=device) for _ in range(n_passes)])
-        return [columns[i * size : (i + 1) * size] for i in range(self.n_steps)]
+    def _some(self, batch: Any) -> tuple[Any, Any]:
+        """Draw episodes with about ``BATCH_STEPS`` steps; return them as they are, and perturbed."""
+        model: Any = self.tdpg
+        n = batch.alive.shape[1]
+        size = min(n, max(2, round(BATCH_STEPS * n / batch.alive.sum().item())))
+        plain = batch.select(th.randperm(n, device=batch.alive.device)[:size])
+        both = plain, plain._replace(observations=self.perturbed(plain))
+        if model.policy.time_varying:
+            return both
+        plain, perturbed = (each.segments(model.bptt_steps or len(batch.costs)) for each in both)
+        return plain, perturbed
+
+    def perturbed(self, batch: Any) -> Any:
+        """Draw a member of the nuisance for each of N episodes; return the perturbed observations: ``(T, N, *obs)``."""
+        members = self.family.members(batch.alive.shape[1], seed=int(th.randint(2**31, ())))
+        plain = each_part(lambda x: x.cpu().numpy(), batch.observations)
+        steps = [members(take(plain, t)) for t in range(len(batch.costs))]
+        return each_part(lambda *parts: th.as_tensor(np.stack(parts), device=batch.alive.device), *steps)
