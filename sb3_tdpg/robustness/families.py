@@ -79,8 +79,6 @@ class Family:
 
     def members(self, n: int, seed: int | None = None) -> Members:
         """Draw a member for each of N episodes."""
-        if seed is not None and (isinstance(seed, bool) or seed < 0):
-            raise ValueError(f"seed={seed} must be None or an integer of at least 0")
         if len(self._makers) == 1:
             return self._makers[0](n, seed=seed)
         return OneOf([make(n, seed=seed, part=str(i)) for i, make in enumerate(self._makers)], n, seed)
@@ -95,10 +93,10 @@ class Family:
         if not (isinstance(entry, (list, tuple)) and len(entry) in (2, 3)):
             raise ValueError(f"{entry!r} is no entry of a list: expected None or (name, severity)")
         name, value, *factor = entry
-        if not callable(value):
-            return self._named(name, value, *factor)
-        self._kinds.add(False)
-        return [partial(FunctionMembers, value)]
+        if callable(value):
+            self._kinds.add(False)
+            return [partial(FunctionMembers, value)]
+        return self._named(name, value, *factor)
 
     @cached_property
     def _measured_scale(self) -> Any:
@@ -170,11 +168,7 @@ class FunctionMembers(Members):
         changed = self.function(each_part(np.copy, observations), self._rng)  # the function may change them in place
         if not isinstance(observations, dict):
             changed = np.asarray(changed)
-            if changed.shape != observations.shape or changed.dtype != observations.dtype:
-                raise ValueError(
-                    f"the perturbation returned observations of shape {changed.shape} and type {changed.dtype}, "
-                    f"expected those it was given: {observations.shape}, {observations.dtype}"
-                )
-            if not np.isfinite(changed).all():
-                raise ValueError("the perturbation returned observations that are NaN or infinite")
+            expected, given = ((x.shape, x.dtype.name) for x in (observations, changed))
+            if given != expected or not np.isfinite(changed).all():
+                raise ValueError(f"the perturbation returned {given}, expected finite observations {expected}")
         return changed

@@ -35,9 +35,7 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
     try:
         return NuisanceVecEnv(env, family, None)
     except ValueError as e:
-        if isinstance(declared, str) and declared == "auto":
-            raise ValueError(f"nuisance='auto', the default for images: {e}; or give nuisance=None") from e
-        raise ValueError(f"nuisance={declared!r}: {e}") from e
+        raise ValueError(f"nuisance={declared!r}: {e} (or turn it off: nuisance=None)") from e
 
 
 def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:

@@ -159,8 +159,8 @@ def test_a_wrong_declaration_is_explained(declared, space, fragment):
 
 
 @pytest.mark.parametrize(("function", "fragment"), [
-    (lambda y, rng: y[:, :1], r"shape \(4, 1\).*expected those it was given: \(4, 16\)"),
-    (lambda y, rng: y + np.float32(np.nan), "NaN or infinite"),
+    (lambda y, rng: y[:, :1], r"returned \(\(4, 1\), 'float32'\), expected .*\(4, 16\)"),
+    (lambda y, rng: y + np.float32(np.nan), "expected finite observations"),
 ])  # fmt: skip
 def test_what_a_function_returns_is_checked(function, fragment):
     with pytest.raises(ValueError, match=fragment):
