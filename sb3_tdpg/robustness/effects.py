@@ -115,15 +115,13 @@ def draw_phase(rng: np.random.Generator, n: int, share: float, sensor: Sensor) -
     return dict(phase=rng.random(n))
 
 
-@perturbation(
-    "image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), draw=draw_phase, later_only=True, timing=True
-)
+@perturbation("image", "share of the frames", (0.2, 0.35, 0.5, 0.65, 0.8), draw=draw_phase, timing=True)
 def dropped_frames(t: np.ndarray, share: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Replace lost frames with the last frame that arrived."""
     return np.where((t > 0) & evenly(t - 1, share, episode["phase"]), KEEP, 0)
 
 
-@perturbation("image", "steps", (1, 2, 3, 4, 5), later_only=True, timing=True)
+@perturbation("image", "steps", (1, 2, 3, 4, 5), timing=True)
 def delay(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Delay the observations by a number of steps; during these steps, show the first one."""
     return np.full_like(t, int(steps))
@@ -194,17 +192,17 @@ def vector_dropout(vectors: np.ndarray, share: float, episode: Episode, rng: np.
     return np.where(evenly(reading, share, episode["phase"][:, None]), 0.0, vectors)
 
 
-perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", later_only=True, timing=True)(delay)
+perturbation("vector", "steps", (1, 2, 3, 4, 5), name="vector_delay", timing=True)(delay)
 
 
-@perturbation("any", "probability", (0.1, 0.25, 0.4, 0.6, 0.8), later_only=True, timing=True)
+@perturbation("any", "probability", (0.1, 0.25, 0.4, 0.6, 0.8), timing=True)
 def hold(t: np.ndarray, probability: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """At each step, repeat the last observation with the given probability."""
     return np.where((t > 0) & (rng.random(len(t)) < probability), KEEP, 0)
 
 
 @perturbation(
-    "any", "longest delay, steps", (1, 2, 4, 6, 8), later_only=True, timing=True,
+    "any", "longest delay, steps", (1, 2, 4, 6, 8), timing=True,
     draw=lambda rng, n, longest, sensor: dict(delay=rng.integers(1, int(longest) + 1, n), age=np.zeros(n, np.int64)),
 )  # fmt: skip
 def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
@@ -216,7 +214,7 @@ def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generato
 
 
 @perturbation(
-    "any", "steps", (1, 2, 4, 8, 16), later_only=True, timing=True,
+    "any", "steps", (1, 2, 4, 8, 16), timing=True,
     # The burst ends before the horizon if it is short enough.
     draw=lambda rng, n, steps, sensor: dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n)),
 )  # fmt: skip
@@ -235,7 +233,7 @@ def draw_start(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) 
     return dict(start=1 + (rng.random(n) * max(1, int(latest * (sensor.horizon - 1)))).astype(np.int64))
 
 
-@perturbation("any", *LATEST, draw=draw_start, later_only=True, timing=True)
+@perturbation("any", *LATEST, draw=draw_start, timing=True)
 def freeze(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """Show the last observation for the rest of the episode, from a random step on."""
     return np.where(t >= episode["start"], KEEP, 0)
@@ -249,7 +247,7 @@ def draw_group(rng: np.random.Generator, n: int, latest: float, sensor: Sensor) 
     return dict(start=np.where(which[:, None] == np.arange(len(sensor.groups)), start[:, None], never))
 
 
-@perturbation("any", *LATEST, draw=draw_group, later_only=True, timing=True)
+@perturbation("any", *LATEST, draw=draw_group, timing=True)
 def group_failure(t: np.ndarray, latest: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:
     """From a random step on, show one group of components as 0 or black."""
     return np.where(t[:, None] >= episode["start"], NOTHING, 0)

@@ -45,8 +45,7 @@ class Perturbation:
     :param summary: The effect in a few words.
     :param channels: Permitted numbers of image channels. ``None`` permits any number.
     :param on_depth: Whether the perturbation makes sense on depth images, which have one channel of floats.
-    :param later_only: Whether the perturbation leaves the first observation of an episode unchanged.
-    :param timing: Whether ``apply`` decides which observation is shown.
+    :param timing: Whether ``apply`` decides which observation is shown. The first one of an episode is always shown.
     :raises ValueError: if the kind is unknown, or there are not five severities.
     """
 
@@ -59,7 +58,6 @@ class Perturbation:
     summary: str = ""
     channels: Sequence[int] | None = None
     on_depth: bool = True
-    later_only: bool = False
     timing: bool = False
 
     def __post_init__(self) -> None:
@@ -86,7 +84,7 @@ class Perturbation:
         :param horizon: Largest number of steps of an episode, if there is a limit.
         :param action_space: The action space, which only perturbations of the actions need.
         """
-        if self.later_only and horizon == 1:
+        if self.timing and self.kind != "action" and horizon == 1:
             return "it leaves the first observation of an episode unchanged, and with a horizon of 1 there is no other"
         if self.kind == "action":
             is_box = isinstance(action_space, spaces.Box)

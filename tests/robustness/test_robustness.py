@@ -28,7 +28,7 @@ def test_it_reaches_the_policy_in_every_episode_and_never_touches_the_state(prob
 
         changed = differs(seen.observations, expected.observations)
         assert expected.starts[1:].any(axis=0).all()  # every environment has been reset by itself
-        if PERTURBATIONS[name].later_only:
+        if PERTURBATIONS[name].timing:
             assert not changed[expected.starts].any()
             met = [changed[steps, i].any() for i, steps in episodes(expected.starts)]
             assert any(met) if name == "hold" else all(met)  # which may hold nothing in a short episode
@@ -167,7 +167,6 @@ def test_reset_infos_can_be_read_from_the_wrapper():
     ("colour", dict(perturbation="blur", severity=0), "severity=0 of 'blur' must be an integer from 1 to 5"),
     ("colour", dict(perturbation="blur", severity=2.0), "severity=2.0"),
     ("colour", dict(perturbation="blur", severity=True), "severity=True"),
-    ("colour", dict(perturbation="blur", seed=-1), "seed=-1 must be None or an integer of at least 0"),
     ("colour", dict(perturbation="vector_noise"), "it is for vectors"),
     ("colour", dict(perturbation="noise", scale=1.0), "scale=1.0 is for vectors"),
     ("bounded vector", dict(perturbation="noise"), "it is for images"),
