@@ -17,6 +17,7 @@ from tqdm import tqdm
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
+from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation import InformationReport, information_report, save_figure
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
@@ -96,14 +97,11 @@ def robustness_report(
     if not isinstance(env_id, str):
         raise ValueError(f"env_id={env_id!r} must be the id of an environment: gymnasium.register('Mine-v0', MyEnv)")
     kwargs = dict(env_kwargs or {})
-    for name, value, least in (
-        ("n_episodes", n_episodes, 1),
-        ("n_steps", n_steps, 1),
-        ("seed", seed, 0),
-        ("jobs", jobs, 1),
-    ):
-        if value is not None and (not isinstance(value, (int, np.integer)) or value < least):
-            raise ValueError(f"{name}={value!r} must be an integer of at least {least}")
+    for name, value in dict(n_episodes=n_episodes, n_steps=n_steps, jobs=jobs).items():
+        if value is not None:
+            check_count(name, value)
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed={seed!r} must be an integer of at least 0")
     if jobs > 1 and not all(isinstance(source, Path) for of_method in sources.values() for source in of_method):
         raise ValueError(f"jobs={jobs} needs models that are files; models in memory run in this process: use jobs=1")
     space, action_space, horizon, scale = _look_at(env_id, kwargs)
@@ -115,7 +113,8 @@ def robustness_report(
     plan = Plan(env_id, kwargs, sources, n_episodes, seed, deterministic, scale)
     names = {label: [_name(source) for source in of_method] for label, of_method in sources.items()}
     fingerprints = {label: [fingerprint(model) for model in of_method] for label, of_method in loaded.items()}
-    _check_different(fingerprints, names, {k: {type(m).__name__ for m in v} for k, v in loaded.items()})
+    for label, of_method in loaded.items():
+        _check_different(label, of_method, fingerprints[label], names[label])
     config = {name: value for name, value in vars(plan).items() if name != "sources"} | {"models": fingerprints}
     check_same_config(out / "config.json", config, "report")
     if not (out / "config.json").exists():
@@ -251,11 +250,8 @@ def _sources(models: Mapping[str, Any]) -> dict[str, list[Source]]:
     sources = {}
     for label, of_method in models.items():
         several = of_method if isinstance(of_method, (list, tuple)) else [of_method]
-        if not several:
-            raise ValueError(f"models[{label!r}] is empty: give at least one model")
-        for each in several:
-            if not isinstance(each, (str, Path)) and not hasattr(each, "get_vec_normalize_env"):
-                raise ValueError(f"models[{label!r}] has {each!r}: expected a file, or a Stable-Baselines3 model")
+        if not several or not all(isinstance(x, (str, Path)) or hasattr(x, "get_vec_normalize_env") for x in several):
+            raise ValueError(f"models[{label!r}]={of_method!r}: expected files, or models of Stable-Baselines3")
         sources[str(label)] = [Path(each) if isinstance(each, str) else each for each in several]
     return sources
 
@@ -283,20 +279,17 @@ def _check_fit(models: Models, rows: Sequence[Row]) -> None:
     check_models_fit({label: first}, [row.scenario for row in rows[1:] if row.kind == "own"])
 
 
-def _check_different(
-    fingerprints: Mapping[str, Sequence[str]], names: Mapping[str, Sequence[str]], kinds_of: Mapping[str, set[str]]
-) -> None:
+def _check_different(label: str, models: Sequence[Any], prints: Sequence[str], names: Sequence[str]) -> None:
     """Raise an error if a policy occurs twice: if it counted as two training seeds, intervals would be too narrow."""
-    for label, kinds in kinds_of.items():
-        if len(kinds) > 1:
-            raise ValueError(f"{label!r} has models of {' and '.join(sorted(kinds))}: give each a label, LABEL=FILE")
-    for label, prints in fingerprints.items():
-        for number, each in enumerate(prints):
-            if (before := prints.index(each)) != number:
-                raise ValueError(
-                    f"models {before} and {number} of {label!r} are the same policy ({names[label][before]}, "
-                    f"{names[label][number]}): a training seed counts once"
-                )
+    kinds = sorted({type(model).__name__ for model in models})
+    if len(kinds) > 1:
+        raise ValueError(f"{label!r} has models of {' and '.join(kinds)}: give each a label, LABEL=FILE")
+    for number, each in enumerate(prints):
+        if (before := prints.index(each)) != number:
+            raise ValueError(
+                f"models {before} and {number} of {label!r} are the same policy ({names[before]}, {names[number]}): "
+                "a training seed counts once"
+            )
 
 
 def _save(figure: Any, out: Path, name: str) -> str:

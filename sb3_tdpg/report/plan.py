@@ -30,8 +30,7 @@ COLUMNS = ("episode", "cost", "length", "failure")
 SIDE_BY_SIDE = 50  # number of parallel environments that are not from this package
 UNKNOWN_LENGTH = 1_000  # assumed steps of an episode without a time limit
 N_TIMED = 20  # number of steps that are timed
-MAX_EPISODES = {"image": 100}  # by kind of observation
-MAX_EPISODES_OF_OTHERS = 500
+MAX_EPISODES, MAX_EPISODES_OF_IMAGES = 500, 100
 
 Models = Mapping[str, Sequence[Any]]
 """The models of each method."""
@@ -81,7 +80,7 @@ def default_episodes(kind: str | None, horizon: int | None, n_steps: int) -> int
     :param horizon: Maximum length of an episode, if there is a limit.
     :param n_steps: The budget of steps.
     """
-    most = MAX_EPISODES.get(kind or "", MAX_EPISODES_OF_OTHERS)
+    most = MAX_EPISODES_OF_IMAGES if kind == "image" else MAX_EPISODES
     n = max(1, min(most, n_steps // (horizon or UNKNOWN_LENGTH)))
     # Each environment runs the same number of episodes, so that 53 episodes would run in a single environment.
     return n if n <= SIDE_BY_SIDE else n - n % SIDE_BY_SIDE

@@ -37,9 +37,7 @@ class Row:
     def file_name(self) -> str:
         """The name of the file with the row's records; it depends on the environment and on the severity's value."""
         slug = "".join(c if c.isalnum() else "-" for c in self.title.lower())
-        env: list[Any] = [self.scenario.env_id, self.scenario.env_kwargs]
-        if self.scenario.sensor is not None:
-            env.append(self.scenario.sensor)
+        env = [self.scenario.env_id, self.scenario.env_kwargs, self.scenario.sensor]
         content = json.dumps(jsonable([self.title, self.kind, *env, self.value]), sort_keys=True)
         return f"{slug}-{hashlib.sha256(content.encode()).hexdigest()[:8]}.csv.xz"
 

@@ -280,7 +280,7 @@ BAD = {
 @pytest.mark.parametrize(("models", "env_id", "message"), [
     ([], "Lava-v0", r"models=\[\] must be a dictionary"),
     ({}, "Lava-v0", "models={} must be a dictionary"),
-    ({"A": []}, "Lava-v0", r"models\['A'\] is empty"),
+    ({"A": []}, "Lava-v0", r"models\['A'\]=\[\]: expected files"),
     ({"A": "nothing.zip"}, LavaEnv(), "must be the id of an environment: gymnasium.register"),
 ])  # fmt: skip
 def test_what_is_no_model_or_no_id_is_refused(models, env_id, message, tmp_path):
