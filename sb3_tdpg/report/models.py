@@ -102,13 +102,9 @@ def load_all(
 
 
 def fingerprint(model: Any) -> str:
-    """Return a hash of a model's weights and of the statistics with which it normalises observations."""
+    """Return a hash of a model's weights."""
     digest = hashlib.sha256(type(model).__name__.encode())
     for name, values in sorted(model.policy.state_dict().items()):
         digest.update(name.encode())
         digest.update(values.detach().cpu().numpy().tobytes())
-    if (normalize := model.get_vec_normalize_env()) is not None and normalize.norm_obs:
-        of_parts = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
-        for key, rms in sorted(of_parts.items()):
-            digest.update(key.encode() + rms.mean.tobytes() + rms.var.tobytes())
     return digest.hexdigest()[:12]
