@@ -171,7 +171,7 @@ class Perturber(Members):
         for start in range(0, len(observations), at_once):
             part = slice(start, start + at_once)
             units = self.sensor.to_units(observations[part])
-            shares = {name: values[part].repeat(self.sensor.n_frames, axis=0) for name, values in episode.items()}
+            shares = {name: values[part] for name, values in episode.items()}
             units = self.perturbation.apply(units, self.value, shares, self._rng)
             result[part] = self.sensor.from_units(units, observations[part])
         return result

@@ -1,7 +1,7 @@
 """
 Convert observations to the units of perturbations, so that a severity means the same for every space.
 
-Dimension key: N environments, F stacked frames, C channels, H and W rows and columns, D components of a vector.
+Dimension key: N environments, C channels, H and W rows and columns, D components of a vector.
 """
 
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ def kind_of(space: spaces.Space) -> str | None:
     Return ``"image"`` or ``"vector"`` for a ``Box``, and ``None`` for any other space.
 
     An image has finite bounds. It has three dimensions, one of which is the channels, or it has two dimensions of
-    bytes. A space of four dimensions is a stack of images, the oldest first.
+    bytes.
     """
     if not isinstance(space, spaces.Box):
         return None
-    has_pixels = len(space.shape) in (3, 4) or (len(space.shape) == 2 and space.dtype == np.uint8)
+    has_pixels = len(space.shape) == 3 or (len(space.shape) == 2 and space.dtype == np.uint8)
     return "image" if has_pixels and np.isfinite(finite_range(space)).all() else "vector"
 
 
@@ -46,8 +46,8 @@ class Sensor:
     An observation space with the units that perturbations work in.
 
     An image becomes ``(N, C, H, W)`` float32, from 0 at the lowest bound of the space to 1 at the highest. A vector
-    becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed. A stack of
-    images becomes ``(N F, C, H, W)``. Perturbations of the timing need no units.
+    becomes ``(N, D)`` float64 in multiples of its scale; components with a scale of 0 are not perturbed. Perturbations
+    of the timing need no units.
     """
 
     space: Any
@@ -94,13 +94,8 @@ class Sensor:
     @property
     def frame(self) -> tuple[int, ...]:
         """Shape of one image in the order of the space, with one channel if there are only rows and columns."""
-        shape = self.space.shape[-3:]
+        shape = self.space.shape
         return (1, *shape) if len(shape) == 2 else shape
-
-    @property
-    def n_frames(self) -> int:
-        """Number of stacked images F; 1 for a vector."""
-        return self.space.shape[0] if self.is_image and len(self.space.shape) == 4 else 1
 
     @property
     def channels_last(self) -> bool:

@@ -1,10 +1,9 @@
 """What late, lost, frozen and failing observations and actions are, for vectors, images and Dict."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from perturbed_problems import DICT, ClockEnv, PictureEnv, dummy, perturbed
+from perturbed_problems import DICT, ClockEnv
 from small_problems import ToyEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -166,22 +165,3 @@ def test_the_vectors_in_a_dict_have_a_scale_and_each_part_its_own_noise():
     assert (np.sign(offsets["a"]) != np.sign(offsets["b"])).any()
     with pytest.raises(ValueError, match=r"has \['c'\]: use keys of the vectors"):
         PerturbedVecEnv(env, "vector_bias", scale={"c": 1.0})
-
-
-def test_the_images_of_a_stack_are_perturbed_one_by_one():
-    """As what the wrapper of one image shows, with the same square in all images of an episode."""
-
-    def stack(_):
-        return gym.wrappers.FrameStackObservation(PictureEnv(layout="CHW"), 3, padding_type="zero")
-
-    env = perturbed(dummy(stack, 2), "occlusion", 3)
-    assert env.observation_space.shape == (3, 3, 24, 24)
-    single = perturbed(dummy(lambda _: PictureEnv(layout="CHW"), 2), "occlusion", 3)
-    for each in (env, single):
-        each.seed(0)
-    seen = [single.reset()]
-    env.reset()
-    for _ in range(4):
-        seen.append(single.step(np.zeros((2, 1), np.float32))[0])
-        stacked = env.step(np.zeros((2, 1), np.float32))[0]
-    np.testing.assert_array_equal(stacked, np.stack(seen[-3:], axis=1))
