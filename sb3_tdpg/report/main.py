@@ -23,7 +23,7 @@ from sb3_tdpg.evaluation import InformationReport, information_report, save_figu
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
 from sb3_tdpg.evaluation.information import ESTIMATES
 from sb3_tdpg.problem import horizon_of
-from sb3_tdpg.report.charts import comparison_figure, degradation_curves, own_rows_figure, vector_examples
+from sb3_tdpg.report.charts import degradation_curves, own_rows_figure
 from sb3_tdpg.report.models import Source, fingerprint, load_all
 from sb3_tdpg.report.numbers import Numbers, make_numbers
 from sb3_tdpg.report.page import Knowledge, Page, to_html, write_page
@@ -178,7 +178,7 @@ class _Writer:
         records = pd.concat([records[records["model"] == label] for label in self.names], ignore_index=True)
         out, numbers = self.out, make_numbers(records, seed=self.plan.seed)
         is_finished = len(rows) == len(self.rows)
-        figures = self._draw(numbers, rows if is_finished else ())
+        figures = self._draw(numbers, is_finished)
         made = how_made(self.how["command"], self.how)
         page = Page(self.plan, rows, self.names, figures, knowledge, made, n_rows=len(self.rows))
         write_frame_atomically(numbers.levels, out / "levels.csv")
@@ -190,24 +190,18 @@ class _Writer:
         write_atomically(out / "report.html", html)
         return text
 
-    def _draw(self, numbers: Numbers, rows: Sequence[Row]) -> dict[str, str]:
-        """Draw the figures of this report, with examples of the given rows; return the file of each figure."""
+    def _draw(self, numbers: Numbers, is_finished: bool) -> dict[str, str]:
+        """Draw the figures of this report, the examples only for a finished page; return the file of each figure."""
         figures = {}
         if numbers.perturbations:
             figures["degradation"] = degradation_curves(numbers)
         if (numbers.groups["kind"] == "own").any():
             figures["own_rows"] = own_rows_figure(numbers)
-        if any(map(numbers.can_be_clear, numbers.models[1:])):
-            figures["comparison"] = comparison_figure(numbers)
         # The examples leave out perturbations of the timing, which one picture cannot show.
-        of_sensor = [row for row in rows if row.kind == "sensor"]
-        shown = [row for row in of_sensor if PERTURBATIONS[row.perturbation].kind == "image"]
-        plan = self.plan
-        if kind_of(self.space) == "image" and shown:
-            names = list(dict.fromkeys(row.perturbation for row in shown))
-            figures["examples"] = perturbation_gallery(plan.env_id, names, env_kwargs=plan.env_kwargs, seed=plan.seed)
-        elif of_sensor and plan.scale is not None:
-            figures["examples"] = vector_examples(plan, of_sensor, next(iter(self.models.values()))[0])
+        shown = [name for name in numbers.perturbations if PERTURBATIONS[name].kind == "image"]
+        if is_finished and shown and kind_of(self.space) == "image":
+            plan = self.plan
+            figures["examples"] = perturbation_gallery(plan.env_id, shown, env_kwargs=plan.env_kwargs, seed=plan.seed)
         return {name: _save(figure, self.out, name) for name, figure in figures.items()}
 
     def measure_information(self, progress_bar: bool) -> list[Knowledge]:

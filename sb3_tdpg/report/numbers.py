@@ -39,9 +39,6 @@ class Numbers:
     ``"less"`` or ``"more"`` up to a p-value of 0.05, otherwise ``"undecided"``."""
     model_levels: pd.DataFrame
     """The mean cost of each model in each row: ``model``, ``train_seed``, ``perturbation``, ``severity``, ``cost``."""
-    model_groups: pd.DataFrame
-    """The mean of each model over the severities of each perturbation: ``model``, ``train_seed``, ``perturbation``,
-    ``cost``, ``added``."""
 
     @property
     def models(self) -> list[str]:
@@ -89,7 +86,7 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
     keys = pd.DataFrame(list(groups), columns=["perturbation", "kind"])
     plain = rows.index[rows["kind"] == "unperturbed"]
 
-    levels, summaries, by_seed, by_row = [], [], {}, {}
+    levels, summaries, by_seed = [], [], {}
     for label, of_model in records.groupby("model", sort=False):
         cube = _cube(of_model, rows)
         # An episode begins in the same state in every row, so that its costs can be averaged over rows.
@@ -100,7 +97,6 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
         summaries.append(pd.DataFrame(dict(model=label, **keys, n_seeds=len(cube), **intervals)))
         intervals = _interval_columns(cube, seed, is_share)
         levels.append(pd.DataFrame(dict(model=label, **rows, n_seeds=len(cube), **intervals)))
-        by_row[str(label)] = dict(cost=cube.mean(axis=2))
         by_seed[str(label)] = dict(cost=cost.mean(axis=2), added=added.mean(axis=2))
 
     comparisons = [_compare(label, by_seed, keys) for label in list(by_seed)[1:]]
@@ -109,19 +105,8 @@ def make_numbers(records: pd.DataFrame, *, seed: int = 0) -> Numbers:
         pd.concat(levels, ignore_index=True),
         summary.assign(lowest=_lowest(summary, by_seed)),
         pd.concat(comparisons, ignore_index=True) if comparisons else pd.DataFrame(),
-        _long(by_row, rows[["perturbation", "severity"]]),
-        _long(by_seed, keys[["perturbation"]]),
+        records.groupby(["model", "train_seed", "perturbation", "severity"])["cost"].mean().reset_index(),
     )
-
-
-def _long(by_seed: Mapping[str, Mapping[str, np.ndarray]], keys: pd.DataFrame) -> pd.DataFrame:
-    """Convert each method's arrays, ``(S, rows)``, to a frame with one line for each model and row of the report."""
-    frames = [
-        pd.DataFrame(dict(model=label, train_seed=number, **keys, **{name: x[number] for name, x in arrays.items()}))
-        for label, arrays in by_seed.items()
-        for number in range(len(arrays["cost"]))
-    ]
-    return pd.concat(frames, ignore_index=True)
 
 
 def _lowest(summary: pd.DataFrame, by_seed: Mapping[str, Mapping[str, np.ndarray]]) -> np.ndarray:

@@ -35,7 +35,7 @@ class Page:
     plan: Plan
     rows: Sequence[Row]
     sources: Mapping[str, Sequence[str]]  # names of each method's models
-    figures: Mapping[str, str]  # the files of degradation, own_rows, comparison and examples
+    figures: Mapping[str, str]  # the files of degradation, own_rows and examples
     knowledge: Sequence[Knowledge]
     made: str  # the last sentence
     n_rows: int  # including the missing rows

@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from sb3_tdpg.report.charts import comparison_figure
 from sb3_tdpg.report.numbers import make_numbers, p_value
 from sb3_tdpg.report.page import Page, write_page
 from sb3_tdpg.report.plan import Plan
@@ -35,7 +34,7 @@ def numbers_of(*args, **kwargs):
 def page_of(numbers):
     names = {label: [f"{label}{i}.zip" for i in range(numbers.n_models(label))] for label in numbers.models}
     plan = Plan("Mine-v0", {}, {}, 2, 0, False, None)
-    return write_page(numbers, Page(plan, (), names, {}, (), "Made.", n_rows=0))
+    return write_page(numbers, Page(plan, (), names, {}, (), "Made."))
 
 
 def test_cheaper_and_more_robust_are_two_things():
@@ -98,14 +97,6 @@ def test_there_is_one_verdict_over_all_perturbations_and_then_one_for_each():
     assert "**B compared with A**, mean over all perturbations: it clearly costs less" in page
     assert "One by one, it costs less under 2 of 2 perturbations (x, y)." in page
     assert numbers_of(4, rows=rows).comparisons["perturbation"].tolist() == [UNPERTURBED, "x", "y", ALL]
-
-
-def test_the_dots_of_a_comparison_are_shares_of_the_first_methods_models():
-    records = made_up(4, control=8.0, rows=ROWS[:1])
-    records.loc[(records["model"] == "B") & (records["train_seed"] == 0), "cost"] = 8.15  # below two of four
-    (axes,) = comparison_figure(make_numbers(records)).axes
-    (dots,) = [line for line in axes.lines if line.get_marker() == "." and len(line.get_xdata()) == 4]
-    assert sorted(dots.get_xdata()) == [0.125, 0.375, 0.5, 0.625]
 
 
 def test_of_one_policy_that_fails_or_not_the_share_has_wilsons_interval():
