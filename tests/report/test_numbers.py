@@ -34,7 +34,7 @@ def numbers_of(*args, **kwargs):
 def page_of(numbers):
     names = {label: [f"{label}{i}.zip" for i in range(numbers.n_models(label))] for label in numbers.models}
     plan = Plan("Mine-v0", {}, {}, 2, 0, False, None)
-    return write_page(numbers, Page(plan, (), names, {}, (), "Made."))
+    return write_page(numbers, Page(plan, (), names, {}, (), "Made.", n_rows=0))
 
 
 def test_cheaper_and_more_robust_are_two_things():
