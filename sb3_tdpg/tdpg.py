@@ -283,8 +283,8 @@ class TDPG(EpisodicAlgorithm):
 
         Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
         would favour short episodes. With ``epoch_steps`` an environment begins another episode while fewer than that
-        many steps are stored. The last epoch of ``learn`` takes only the remaining steps, but at least a tenth of an
-        epoch. All environments begin an epoch at t = 0.
+        many steps are stored, and the last epoch of ``learn`` takes only the remaining steps, but at least a tenth of
+        an epoch. All environments begin an epoch at t = 0.
 
         :param env: The training environments.
         :param callback: Called at each step, and at the beginning and the end of the rollout.

@@ -42,10 +42,10 @@ class RunningNorm(nn.Module):
 
 class Changes(nn.Module):
     """
-    Compute the standardised change of each component since the last step, scaled by the information that it adds.
+    Compute the standardised change of each component since the last step, scaled by how well it predicts the next one.
 
     If the velocities of a system are hidden, the last change helps to predict the next change. If they are observed,
-    the last change adds only noise. Two predictions of the next change measure the information: the first uses the
+    the last change adds only noise. Two predictions of the next change are compared: the first uses the
     components and their products, the second also uses the last change. Each change is multiplied by a share: the part
     of the next change's variance that only the second prediction explains.
 

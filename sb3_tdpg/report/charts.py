@@ -43,7 +43,7 @@ def degradation_curves(numbers: Numbers) -> Figure:
 
 
 def own_rows_figure(numbers: Numbers) -> Figure:
-    """Draw, for each test row of the environment, each method's cost with its interval, and the costs of its models."""
+    """Draw the cost of each method, with its interval and a dot for each model, in each test row of the environment."""
     shown = numbers.levels[numbers.levels["kind"].isin(("unperturbed", "own"))]
     names, styles = list(shown["perturbation"].unique()), _styles(numbers)
     figure, ((axes,),) = new_panels(WIDTH, 1.1 + 0.24 * len(names))

@@ -1,5 +1,5 @@
 """
-Define all perturbations. Each is a function of a batch of observations or actions.
+Define all perturbations. Each is a function of a batch of observations, actions or times.
 
 The decorator ``@perturbation`` adds them to the registry. Two perturbations reuse the function of another one, and are
 added by a direct call.

@@ -56,8 +56,8 @@ class NuisancePhase(TDPGCallback):
     .. math:: E_t\, D(\pi(\cdot | \tilde x_t^\omega) \| \bar\pi(\cdot | \tilde x_t^0))
         + D(\pi(\cdot | \tilde x_t^0) \| \bar\pi(\cdot | \tilde x_t^0)).
 
-    Pass this callback to ``learn`` before a :class:`~sb3_tdpg.TrainingCheckpointCallback`. In a resumed training, the
-    optimiser of the phase starts anew.
+    In the list of callbacks of ``learn``, put this callback before a :class:`~sb3_tdpg.TrainingCheckpointCallback`. If
+    a training is resumed, the optimiser of the phase starts anew.
 
     :param nuisance: ``"auto"`` for random changes of images of bytes, which each episode keeps, or a declaration of a
         :class:`~sb3_tdpg.robustness.families.Family`.

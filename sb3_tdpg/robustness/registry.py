@@ -146,5 +146,5 @@ def find_applicable(
 
 
 def applicable(space: spaces.Space, horizon: int | None = None, action_space: spaces.Space | None = None) -> list[str]:
-    """Return the names of the perturbations that apply; see :meth:`Perturbation.objection`."""
+    """Return the names of the perturbations that apply to an environment; see :meth:`Perturbation.objection`."""
     return [name for name, row in PERTURBATIONS.items() if row.objection(space, horizon, action_space) is None]

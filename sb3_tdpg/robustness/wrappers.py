@@ -32,8 +32,8 @@ class PerturbedVecEnv(VecEnvWrapper):
 
     :param venv: The environments.
     :param perturbation: A name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or another declaration, such as a
-        function or a dict; see :class:`~sb3_tdpg.robustness.families.Family`. With a dict, each episode has one of the
-        entries.
+        function or a dict; see :class:`~sb3_tdpg.robustness.families.Family`. With a dict or a list, each
+        episode draws one of the entries.
     :param severity: Severity for a name, from 1 (mild) to 5 (strong). With ``None``, each episode has a random
         severity.
     :param seed: Seed of the perturbation.
