@@ -54,15 +54,6 @@ class CostDistribution(NamedTuple):
         return self._replace(values=self.values[: last + 1], probabilities=kept), max(0.0, 1 - float(below[last]))
 
 
-class Certificate(NamedTuple):
-    """An upper bound on an expected cost, and its parts: ``bound = risk + kl / beta``."""
-
-    bound: float  #: upper bound on the expected cost
-    beta: float  #: the best or the given beta; if inf, the bound is the largest cost, and if 0, the mean
-    risk: float  #: entropic risk at beta, with the allowance for the sampling error
-    kl: float  #: divergence of the shift in nats
-
-
 def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | None = None) -> float:
     r"""
     Compute the entropic risk (Equation 4), :math:`\frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
@@ -71,20 +62,15 @@ def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | No
     :param beta: At least 0; 0 gives the mean, which is the limit.
     :param probabilities: Probabilities of the costs, ``(N,)``; default: 1 / N each.
     """
-    costs = _checked_costs(costs)
     if not (np.isfinite(beta) and beta >= 0):
         raise ValueError(f"beta={beta} must be finite and at least 0")
-    weights = np.full(len(costs), 1 / len(costs)) if probabilities is None else np.asarray(probabilities)
-    return _risk(costs, weights, beta)
-
-
-def _risk(values: np.ndarray, weights: np.ndarray, beta: float) -> float:
-    mean = float(weights @ values)
+    weights = np.full(len(costs), 1 / len(costs)) if probabilities is None else probabilities
+    mean = float(weights @ costs)
     if beta == 0:
         return mean
     # Computed relative to the mean, since the difference from it is of the order of beta. scipy's logsumexp takes ten
     # times as long.
-    exponents = beta * (values - mean)
+    exponents = beta * (costs - mean)
     largest = float(exponents.max())
     if largest < 1:  # expm1 does not round small differences from 1 away
         return mean + math.log1p(float(weights @ np.expm1(exponents))) / beta
@@ -108,7 +94,10 @@ def cost_distribution(
     :param cost_bound: Upper bound on the episode cost.
     :param confidence: Probability with which the band holds; ``None``: no allowance for the sampling error.
     """
-    costs = np.sort(_checked_costs(costs))
+    costs = np.asarray(costs, dtype=np.float64)
+    if costs.ndim != 1 or len(costs) == 0 or not np.isfinite(costs).all():
+        raise ValueError(f"costs must be a vector of finite numbers, one for each episode, not {costs!r}")
+    costs = np.sort(costs)
     n = len(costs)
     ranks = _ranks(n)
     if confidence is None:
@@ -135,58 +124,45 @@ def check_allowance(confidence: float | None, cost_bound: float | None) -> None:
         )
 
 
-def worst_mean(distribution: CostDistribution, kl: float, beta: float | None = None) -> Certificate:
+def worst_mean(distribution: CostDistribution, kl: float) -> float:
     r"""
-    Bound the mean under any distribution within ``kl`` nats: the minimum of ``risk + kl / beta`` over beta.
+    Bound the mean under any distribution within ``kl`` nats: the minimum of ``entropic_risk + kl / beta`` over beta.
 
     In :math:`s = 1 / \beta` the function is convex (the perspective of a convex function plus a linear one), so a local
     search finds the minimum. Every beta gives a valid bound; some distribution within ``kl`` nats attains the minimum.
 
     :param kl: D[shifted || training] in nats, or an upper bound on it; inf gives the largest cost.
-    :param beta: Use this value instead of searching.
     """
     if not kl >= 0:
         raise ValueError(f"kl={kl} must be at least 0")
     values, weights, _ = distribution
-    if beta is not None:
-        if not (np.isfinite(beta) and beta > 0):
-            raise ValueError(f"beta={beta} must be finite and positive, or None to search for the best one")
-        risk = _risk(values, weights, beta)
-        return Certificate(risk + kl / beta, beta, risk, kl)
     largest, width = float(values[-1]), float(values[-1]) - float(values[0])
     if kl == 0 or width == 0:
-        mean = float(weights @ values)
-        return Certificate(mean, 0.0, mean, kl)
+        return float(weights @ values)
     # Compare with the divergence of the distribution that has all its weight on the largest value.
     if kl >= -math.log(max(float(weights[values == largest].sum()), 1e-300)):
-        return Certificate(largest, math.inf, largest, kl)
+        return largest
 
     def objective(log_s: float) -> float:
         s = width * math.exp(log_s)
-        return _risk(values, weights, 1 / s) + kl * s
+        return entropic_risk(values, 1 / s, weights) + kl * s
 
     best = minimize_scalar(objective, bounds=(-15.0, 15.0), method="bounded", options=dict(xatol=1e-3))
-    found = 1 / (width * math.exp(float(best.x)))
-    bound = min(float(best.fun), largest)
-    return Certificate(bound, found, bound - kl / found, kl)
+    return min(float(best.fun), largest)
 
 
 def certificate(
-    costs: np.ndarray,
-    kl: float,
-    *,
-    cost_bound: float | None = None,
-    confidence: float | None = 0.95,
-    beta: float | None = None,
-) -> Certificate:
+    costs: np.ndarray, kl: float, *, cost_bound: float | None = None, confidence: float | None = 0.95
+) -> float:
     """
     Bound the expected cost under a shift, from costs in training (Equation 6, corrected).
 
     The costs are those of independent episodes; see :func:`cost_distribution` and :func:`worst_mean`.
 
     :param kl: D[shifted || training] of the two distributions over episodes in nats, or an upper bound on it.
+    :return: the upper bound on the expected cost
     """
-    return worst_mean(cost_distribution(costs, cost_bound, confidence), kl, beta)
+    return worst_mean(cost_distribution(costs, cost_bound, confidence), kl)
 
 
 def _ranks(n: int) -> np.ndarray:
@@ -196,10 +172,3 @@ def _ranks(n: int) -> np.ndarray:
         n_steps = math.ceil(math.log(n / (2 * _HIGHEST) + 1) / math.log(_RANK_FACTOR))
         from_top += [_HIGHEST * _RANK_FACTOR ** np.arange(n_steps), np.linspace(n / 2, n - 1, 100)]
     return n - np.unique(np.concatenate(from_top).astype(np.int64).clip(0, n - 1))[::-1]
-
-
-def _checked_costs(costs: np.ndarray) -> np.ndarray:
-    costs = np.asarray(costs, dtype=np.float64)
-    if costs.ndim != 1 or len(costs) == 0 or not np.isfinite(costs).all():
-        raise ValueError(f"costs must be a vector of finite numbers, one for each episode, not {costs!r}")
-    return costs

@@ -67,12 +67,10 @@ class Budget(NamedTuple):
 class ShiftCertificate(NamedTuple):
     """Upper bounds on the expected cost under one shift."""
 
-    bound: float  #: the lowest of the following three
+    bound: float  #: the lower of the following two
     through_trvs: float  #: from the divergence of the TRVs
     through_sensor: float  #: from the divergence of the sensor, which holds for every policy
-    trivial: float  #: upper bound on the episode cost
     budget: Budget  #: divergence of the TRVs for ``through_trvs``
-    sensor_kl: float  #: divergence of sensor and start over the whole episode in nats
 
 
 class RecordedEpisodes(NamedTuple):
@@ -124,7 +122,7 @@ class TrainingEpisodes:
             most = f"at most n_episodes={n_episodes} and {EPISODES_AT_A_TIME}"
             raise ValueError(f"n_budget_episodes={n_budget_episodes} must be at least 1 and {most}")
         check_allowance(confidence, cost_bound)
-        self.model, self.scenario, self.confidence, self.cost_bound = model, scenario, confidence, cost_bound
+        self.model, self.scenario, self.confidence = model, scenario, confidence
         self._env = _pomdp(model, scenario)
         costs: list[np.ndarray] = []
         for i in range(math.ceil(n_episodes / EPISODES_AT_A_TIME)):
@@ -165,16 +163,16 @@ class TrainingEpisodes:
         """
         Bound the expected cost under a shift, clipped at ``cost_bound``.
 
-        The certificates through the TRVs and through the sensor hold simultaneously, so the lowest is valid.
+        The certificates through the TRVs and through the sensor hold simultaneously, so the lower is valid.
         """
 
         def bound_through_trvs(budget: Budget) -> float:
-            return worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl).bound
+            return worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl)
 
         budget = min(self.budgets(shift), key=bound_through_trvs)
         sensor_kl = shift.start_kl + len(self.recorded.states) * shift.sensor_kl
-        bounds = (bound_through_trvs(budget), worst_mean(self.distribution, sensor_kl).bound, self.cost_bound)
-        return ShiftCertificate(min(bounds), *bounds, budget, sensor_kl)
+        through_trvs, through_sensor = bound_through_trvs(budget), worst_mean(self.distribution, sensor_kl)
+        return ShiftCertificate(min(through_trvs, through_sensor), through_trvs, through_sensor, budget)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
         """Run the shifted environment; return the costs, ``(N,)``, and the mean divergence, which the budget bounds."""
@@ -249,7 +247,7 @@ def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) ->
 
     def add(budget: Budget, step: CostDistribution) -> Budget:
         capped, exceedance = step.capped(level)
-        return Budget(budget.kl + worst_mean(capped, budget.kl).bound, budget.exceedance + exceedance)
+        return Budget(budget.kl + worst_mean(capped, budget.kl), budget.exceedance + exceedance)
 
     budget = Budget(start_kl, 0.0)
     for step in steps[:-2]:
