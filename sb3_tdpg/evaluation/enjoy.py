@@ -89,7 +89,7 @@ class _Recorder(gym.Wrapper):
         result = self.env.reset(**kwargs)
         self.costs: list[float] = []
         self.between: list[list[np.ndarray]] = []
-        self.pictures = [self._picture()] if self.with_pictures else []
+        self.pictures: list[Any] = [self.env.render()] if self.with_pictures else []
         return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -98,15 +98,6 @@ class _Recorder(gym.Wrapper):
         if self.film is not None:
             self.between.append(list(self.film()))
         if self.with_pictures:
-            self.pictures.append(self._picture())
+            self.pictures.append(self.env.render())
         recorded = (self.pictures, self.costs, self.between)
         return observation, reward, terminated, truncated, {**info, "recorded": recorded}
-
-    def _picture(self) -> np.ndarray:
-        try:
-            picture: Any = self.env.render()
-        except gym.error.DependencyNotInstalled as e:
-            raise ValueError(f"{self.env} cannot be drawn: {e}") from e
-        if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
-            raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
-        return picture

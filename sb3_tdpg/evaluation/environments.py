@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_pkl
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
@@ -43,12 +43,7 @@ def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
         normalize.set_venv(env)
         normalize.training = normalize.norm_reward = False
         env = normalize
-    env = stacked_for(model, env)
-    space = env.observation_space
-    parts = space.values() if isinstance(space, spaces.Dict) else [space]
-    if any(is_image_space(p) and not is_image_space_channels_first(p) for p in parts if isinstance(p, spaces.Box)):
-        env = VecTransposeImage(env)  # as SB3 wraps the environment that it trains on
-    return env
+    return BaseAlgorithm._wrap_env(stacked_for(model, env), verbose=0)  # transposes images as for the training
 
 
 def check_statistics(model: Any, normalize: VecNormalize | None) -> None:
