@@ -54,8 +54,8 @@ def certify_nuisance(
     :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
         the cost of standing at the wall.
     :param env_kwargs: Keywords of the training environment.
-    :param n_episodes: Number of recorded training episodes. Each member perturbs the first ``n_budget_episodes`` of
-        them.
+    :param n_episodes: Number of training episodes for the distribution of the cost.
+    :param n_budget_episodes: Number of further training episodes, in which each member perturbs the observations.
     :param n_test_episodes: Number of episodes under each member, to measure the cost.
     :param confidence: Confidence of each certificate.
     :return: the summary, as Markdown
@@ -78,7 +78,6 @@ def certify_nuisance(
         # The stage costs at the wall, and the terminal cost there, which has a weight of 100.
         cost_bound = (next(iter(loaded.values())).horizon + 100.0) * float(GOAL[0] - WALL)
     out.mkdir(parents=True, exist_ok=True)
-    n_budget_episodes = min(n_budget_episodes, n_episodes)
     settings: dict[str, Any] = dict(n_episodes=n_episodes, cost_bound=cost_bound, confidence=confidence, seed=seed)
     rows: list[dict[str, Any]] = []
     with threads(1):

@@ -34,7 +34,7 @@ from sb3_tdpg.vec_env import BatchedVecEnv
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
 EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of episodes with a capped divergence that are tried
 
-_START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
+_START, _SENSOR, _DYNAMICS, _POLICY, _TEST, _BUDGET = range(6)  # streams of random numbers
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,6 @@ class RecordedEpisodes(NamedTuple):
     densities: list[Normal]  # of the TRVs at each step, (N, Z), and of the last actions, (N, U)
     seed: tuple[int, ...]  # of the sensor
 
-    def first(self, n: int) -> RecordedEpisodes:
-        """Return the first n episodes."""
-        densities = [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities]
-        arrays = (self.costs[:n], self.states[:, :n], self.prev_trvs[:, :n], self.last_trv_noise[:n])
-        return RecordedEpisodes(*arrays, densities, self.seed)
-
 
 class TrainingEpisodes:
     """
@@ -99,7 +93,7 @@ class TrainingEpisodes:
     :param cost_bound: Upper bound on the episode cost. The cost is clipped there. If an episode can cost more, the
         certificate is for the clipped cost.
     :param n_episodes: Number of episodes for the distribution of the cost.
-    :param n_budget_episodes: Number of the first episodes, which are used for the divergence of the TRVs.
+    :param n_budget_episodes: Number of further episodes for the divergence of the TRVs.
     :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
         error probability is spent on the distribution of the cost, and half on the divergence.
     :param seed: Seed of the episodes.
@@ -118,22 +112,17 @@ class TrainingEpisodes:
         confidence: float | None = 0.95,
         seed: int = 0,
     ) -> None:
-        if not 1 <= n_budget_episodes <= min(n_episodes, EPISODES_AT_A_TIME):
-            most = f"at most n_episodes={n_episodes} and {EPISODES_AT_A_TIME}"
-            raise ValueError(f"n_budget_episodes={n_budget_episodes} must be at least 1 and {most}")
         check_allowance(confidence, cost_bound)
         self.model, self.scenario, self.confidence = model, scenario, confidence
         self._env = _pomdp(model, scenario)
         costs: list[np.ndarray] = []
         for i in range(math.ceil(n_episodes / EPISODES_AT_A_TIME)):
             n = min(EPISODES_AT_A_TIME, n_episodes - i * EPISODES_AT_A_TIME)
-            episodes = record_episodes(model, self._env, n, (seed, i))
-            costs.append(episodes.costs)
-            if i == 0:
-                self.recorded = episodes.first(n_budget_episodes)
+            costs.append(record_episodes(model, self._env, n, (seed, i)).costs)
         self.costs = np.concatenate(costs)
         share = None if confidence is None else (1 + confidence) / 2
         self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, share)
+        self.recorded = record_episodes(model, self._env, n_budget_episodes, (seed, _BUDGET))
 
     def divergences(self, shift: Shift) -> np.ndarray:
         """

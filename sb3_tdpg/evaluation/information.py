@@ -23,7 +23,7 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.density_critic import Regression
 from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
-from sb3_tdpg.evaluation.interval import InformationInterval, component_estimates, information_interval
+from sb3_tdpg.evaluation.interval import CONFIDENCE, InformationInterval, component_estimates, information_interval
 from sb3_tdpg.evaluation.interval_bounds import MAX_TRAINING
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
@@ -74,7 +74,7 @@ class InformationReport:
         left_out = f", {n_left_out} steps with too few of them left out" if n_left_out else ""
         return (
             f"I[x_t; x~_t], summed over time: {lower:.2f} to {upper:.2f} nat "
-            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes{left_out})"
+            f"({CONFIDENCE:.0%} at each step, {len(self.costs)} episodes{left_out})"
         )
 
 

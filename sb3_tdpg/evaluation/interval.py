@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-import torch as th
 from scipy.special import owens_t
 
 from sb3_tdpg.common.threads import threads
@@ -27,7 +26,7 @@ from sb3_tdpg.information.base import InformationBatch
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
-COMPONENT_CONFIDENCE = 0.95  # of the one-sided lower limit for a component of the state
+CONFIDENCE = 0.95  # of the interval of a time step, and of the one-sided lower limit for a component of the state
 # Shares of the error probability. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
@@ -37,7 +36,7 @@ UPPER_BOUNDS = ("logdet", "loo", "marginal")
 
 @dataclass(frozen=True)
 class InformationInterval:
-    """Confidence limits of I[x_t; x~_t] at every time step, in nats; NaN with fewer than ``min_episodes`` alive."""
+    """95 % confidence limits of I[x_t; x~_t] at each time step, in nats; NaN with fewer than ``min_episodes`` alive."""
 
     lower: np.ndarray
     """``(T,)``: lower confidence limits, never below 0."""
@@ -54,8 +53,6 @@ class InformationInterval:
     """Standard error of each estimate, ``(T,)``, by name."""
     n_episodes: np.ndarray
     """``(T,)``: number of living episodes."""
-    confidence: float
-    """Minimum probability that the interval of a step contains the true value."""
 
     @property
     def total(self) -> tuple[float, float]:
@@ -148,33 +145,25 @@ def min_episodes(trv_dim: int) -> int:
 
 def _steps(batch: InformationBatch, seed: int) -> Iterator[tuple[int, Encoded, np.random.Generator]]:
     """Yield the time steps with enough living episodes, each with draws of the TRVs and a random generator."""
-    check_batch(batch)
     for t in np.flatnonzero(batch.living.sum(1).cpu() >= min_episodes(batch.trvs.shape[2])).tolist():
         rng = np.random.default_rng((seed, t))
         yield t, draw_trvs(batch.at(t), rng), rng
 
 
 @threads(1)
-def information_interval(batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0) -> InformationInterval:
+def information_interval(batch: InformationBatch, *, seed: int = 0) -> InformationInterval:
     r"""
-    Compute confidence limits for I[x_t; x~_t] at every time step from fresh rollouts of a policy.
+    Compute confidence limits (95 %) for I[x_t; x~_t] at every time step from fresh rollouts of a policy.
 
     **Lower limits** come from the Donsker-Varadhan bound of a critic on x and x~,
 
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
     which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
-    on the others. There are two kinds of critics, and the larger bound counts:
+    on the others. The larger bound of two kinds of critics counts:
 
-    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to one half of the episodes and
-      evaluated on the other half, and vice versa. Up to 300 episodes are divided in three ways, since each division
-      misses some pairs.
-    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, which is fast to fit and therefore
-      fitted to more episodes: to all but two of eight groups (of five groups for more than 300 episodes), and evaluated
-      on these two. It is tighter if states and TRVs are about jointly Gaussian.
-
-    The means over episodes and pairs are taken over all critics of a kind before the logarithm. The encoder's density
-    alone gives no lower bound, because it bounds the information about the encoder's *input*, which can be larger.
+    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to halves of the episodes;
+    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, fitted to most of the episodes.
 
     **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
     e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
@@ -184,25 +173,12 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the marginal density a of the critic, also on
       fresh episodes.
 
-    Each episode uses the mean over several draws of x~ given e, since the encoder's density is known. Control variates
-    remove the deviation of the noise from its expected mean square. Both methods reduce the error and leave the
-    expectation unchanged.
-
-    Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of the
-    error probability, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
-    contributions of episodes, where means that are too low come with standard errors that are too small. The
-    probabilities of the two limits also depend on the gap between the estimates (``miss_of_each_limit``). Each limit is
-    valid for all bounds of its side together, because the tightest bound is chosen (``joint_quantile``). The confidence
-    holds for each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot exceed about
-    ``ln(N^2 / 10)``.
+    The confidence of 95 % holds for each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot
+    exceed about ``ln(N^2 / 10)``. ``docs/guide/information.md`` explains how the limits allow for the sampling error.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
-    :param confidence: Minimum probability that the interval of a step contains the true value.
     :param seed: Seed of the divisions of the episodes and of the noise.
-    :raises ValueError: if ``confidence`` is not in (0, 1), or the batch fails ``check_batch``.
     """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
     horizon, n_episodes = len(batch.trvs), batch.living.sum(1).cpu().numpy()
     estimates, errors = ({name: np.full(horizon, np.nan) for name in LOWER_BOUNDS + UPPER_BOUNDS} for _ in range(2))
     limits = np.full((2, horizon), np.nan)
@@ -215,16 +191,14 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
             estimates[name][t], errors[name][t] = bound.value, bound.error
         below, above = ({name: b for name, b in side.items() if np.isfinite(b.value)} for side in (below, above))
         gap = _gap(below.values(), above.values())
-        miss = [miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)]
+        miss = [miss_of_each_limit(spent * (1 - CONFIDENCE), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)]
         lower_by[t], lower = limit(below, miss[0], sign=-1)
         upper_by[t], upper = limit(above, miss[1], sign=1)
         if lower <= 0:
             lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
         limits[:, t] = min(lower, upper), upper
-    return InformationInterval(
-        limits[0], limits[1], tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes, confidence
-    )
+    return InformationInterval(limits[0], limits[1], tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes)
 
 
 def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -239,7 +213,6 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
     :param seed: Seed of the division of the episodes and of the noise.
     :return: the estimates and their lower limits, each with a confidence of 95 %, ``(T, X)`` each, nats; NaN where a
         component is constant and where too few episodes are alive
-    :raises ValueError: if the batch fails ``check_batch``.
     """
     values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
     for t, step, rng in _steps(batch, seed):
@@ -247,20 +220,5 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
             of_one = step._replace(states=step.states[:, [k]])
             bounds = dict(critic=critic_bounds(of_one, rng)[0], gaussian=gaussian_bound(of_one, rng))
             values[0, t, k] = max(bound.value for bound in bounds.values())
-            _, values[1, t, k] = limit(bounds, 1 - COMPONENT_CONFIDENCE, sign=-1)
+            _, values[1, t, k] = limit(bounds, 1 - CONFIDENCE, sign=-1)
     return values[0], values[1]
-
-
-def check_batch(batch: InformationBatch) -> None:
-    """Raise a ValueError if the shapes do not fit, a value is not finite, or a standard deviation is not positive."""
-    shapes = {name: tuple(getattr(batch, name).shape) for name in ("states", "trvs", "means", "stds")}
-    states, *others = shapes.values()
-    if len(states) != 3 or len(set(others)) != 1 or len(others[0]) != 3 or states[:2] != others[0][:2]:
-        raise ValueError(
-            f"the batch has shapes {shapes}: expected (T, N, X) for the states and (T, N, Z) for trvs, means and stds"
-        )
-    for name in shapes:
-        if not th.isfinite(getattr(batch, name)[batch.living]).all():
-            raise ValueError(f"the batch's {name} are not all finite")
-    if not (batch.stds[batch.living] > 0).all():
-        raise ValueError("the batch's stds must be positive: they are the encoder's standard deviations")

@@ -58,8 +58,6 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
         model = getattr(import_module(package), name).load(path, device="cpu")
     except Exception as e:
         reason = " ".join(str(e).split())
-        if str(path) in reason:
-            raise ValueError(reason) from e
         raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
     if found := statistics_beside(path):
         try:

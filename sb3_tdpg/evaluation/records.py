@@ -60,10 +60,10 @@ def evaluate_scenarios(
     :param progress_bar: Show a progress bar.
     :raises ValueError: if an argument is invalid; no episode has been run then.
     """
-    models = _named_models(model)
+    models = dict(model) if isinstance(model, Mapping) else {type(model).__name__: model}
     rows = [scenario.with_kwargs(**(env_kwargs or {})) for scenario in scenarios]
     labels = labels or {}
-    _check_arguments(rows, n_episodes, labels)
+    _check_arguments(models, rows, n_episodes)
     check_models_fit(models, rows)
 
     frames = []
@@ -160,24 +160,14 @@ def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:
     return columns
 
 
-def _named_models(model: Any) -> dict[str, Any]:
-    models = dict(model) if isinstance(model, Mapping) else {type(model).__name__: model}
-    if not models:
-        raise ValueError("model is an empty mapping: give at least one model, for instance {'TDPG': model}")
-    for label, each in models.items():
-        if isinstance(each, type) or getattr(each, "policy", None) is None:
-            raise ValueError(f"model {label!r} is {each!r}, expected a Stable-Baselines3 model with a policy")
-    return models
-
-
-def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, labels: Mapping[str, Any]) -> None:
-    if not scenarios:
-        raise ValueError("scenarios is empty: give at least one, for instance sb3_tdpg.envs.scenarios.LAVA")
+def _check_arguments(models: Mapping[str, Any], scenarios: Sequence[Scenario], n_episodes: int) -> None:
+    if not (models and scenarios):
+        raise ValueError("give at least one model and one scenario, for instance sb3_tdpg.envs.scenarios.LAVA")
+    for label, model in models.items():
+        if getattr(model, "policy", None) is None:
+            raise ValueError(f"model {label!r} is {model!r}, expected a Stable-Baselines3 model with a policy")
     counts = Counter(scenario.name for scenario in scenarios)
     if twice := sorted(name for name, count in counts.items() if count > 1):
         raise ValueError(f"scenario names must differ, but {twice} occur more than once")
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes per scenario")
-    taken = [name for name in labels if name in {*COLUMNS, "failure"} or name.startswith("final_")]
-    if taken:
-        raise ValueError(f"labels={dict(labels)}: {taken} are names of columns already, choose others")
