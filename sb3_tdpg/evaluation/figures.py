@@ -56,7 +56,7 @@ def information_timeline(frame: pd.DataFrame) -> Figure:
     """
     Draw the interval for I[x_t; x~_t] over the time steps, and mark the bounds that give its limits.
 
-    :param frame: Result of :func:`~sb3_tdpg.evaluation.interval_frame`.
+    :param frame: The frame of an :class:`~sb3_tdpg.evaluation.InformationReport`.
     """
     figure, ((axes,),) = new_panels(WIDTH * 0.75, 3.4)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]

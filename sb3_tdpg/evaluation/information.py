@@ -61,8 +61,17 @@ class InformationReport:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The interval as a frame; see :func:`interval_frame`."""
-        return interval_frame(self.interval)
+        """
+        The interval as a frame with a row for each time step.
+
+        The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the names of the bounds that give them,
+        ``lower_name`` and ``upper_name``, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``,
+        ``marginal``) and ``n_episodes``.
+        """
+        interval = self.interval
+        columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
+        t = np.arange(len(interval.lower))
+        return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
     def figures(self) -> dict[str, Figure]:
         """Draw the interval over time (``"timeline"``) and the map of the components (``"knowledge"``)."""
@@ -147,19 +156,6 @@ def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None,
     return pd.DataFrame(
         dict(t=np.repeat(np.arange(horizon), len(shown)), component=[names[k] for k in shown] * horizon, **values)
     )
-
-
-def interval_frame(interval: InformationInterval) -> pd.DataFrame:
-    """
-    Convert an interval to a frame with a row for each time step.
-
-    The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the names of the bounds that give them,
-    ``lower_name`` and ``upper_name``, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``,
-    ``marginal``) and ``n_episodes``.
-    """
-    columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
-    t = np.arange(len(interval.lower))
-    return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
 
 def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> tuple[InformationBatch, np.ndarray]:

@@ -26,7 +26,7 @@ class InformationCallback(TDPGCallback):
     a warning.
 
     :param eval_freq: Number of epochs from one interval to the next, beginning with the first epoch.
-    :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.
+    :raises ValueError: if ``eval_freq`` is below 1.
     """
 
     def __init__(self, eval_freq: int = 10) -> None:
@@ -35,16 +35,6 @@ class InformationCallback(TDPGCallback):
             raise ValueError(f"eval_freq={eval_freq} must be at least 1 (epochs)")
         self.eval_freq = eval_freq
         self.interval: InformationInterval | None = None  # the latest
-
-    def _on_training_start(self) -> None:
-        model, needed = self.tdpg, min_episodes(self.tdpg.policy.trv_dim)
-        n_episodes = model.epoch_size // model.horizon
-        # With epoch_steps an epoch may have more episodes, if some end early.
-        if model.epoch_steps is None and n_episodes < needed:
-            raise ValueError(
-                f"n_episodes={n_episodes} is too small for an interval of the information in {model.policy.trv_dim} "
-                f"TRVs: use at least {needed}"
-            )
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg

@@ -60,10 +60,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
         reason = " ".join(str(e).split())
         raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
     if found := statistics_beside(path):
-        try:
-            env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
-        except Exception as e:
-            raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
+        env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
         model.set_env(stacked_for(model, load_statistics(found, env, model)))
     return model
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.tables import one_or_all, require_columns, summary_table
+from sb3_tdpg.evaluation.tables import one_or_all, summary_table
 
 LEVEL = 0.95  # of the intervals
 N_BOOTSTRAP = 2000
@@ -29,7 +29,8 @@ def aggregate_seeds(records_by_seed: pd.DataFrame) -> pd.DataFrame:
         ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
         seed), ``level``, ``seed`` and ``deterministic``
     """
-    require_columns(records_by_seed, ["train_seed"])
+    if "train_seed" not in records_by_seed:
+        raise ValueError(f"the records have no column train_seed; they have {list(records_by_seed)}")
     rows = []
     for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
         means, stds = group[["mean", "std"]].to_numpy().T
