@@ -8,7 +8,7 @@ Donsker-Varadhan formula gives
     \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
     \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c}.
 
-The right side needs only costs under p. The bound corrects the paper's Theorem II.1. The derivation is in
+The right-hand side needs only costs under p. The bound corrects the paper's Theorem II.1. The derivation is in
 ``docs/guide/certificate.md``.
 
 Dimension key: N episodes, M points of a distribution.
@@ -36,7 +36,7 @@ class CostDistribution(NamedTuple):
     confidence: float | None  #: None: without allowance for the sampling error
 
     def with_largest(self, probability: float) -> CostDistribution:
-        """Raise the cost to its largest value in the worst event of this probability, where the cost is lowest."""
+        """Raise the lowest costs, up to a total probability of ``probability``, to the largest cost."""
         below = np.clip(np.cumsum(self.probabilities) - probability, 0.0, 1.0)
         below[-1] = 1.0
         return self._replace(probabilities=np.diff(below, prepend=0.0))
@@ -59,7 +59,7 @@ def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | No
     Compute the entropic risk (Equation 4), :math:`\frac1\beta \log \mathbb E\, e^{\beta c}`, without overflow.
 
     :param costs: ``(N,)``
-    :param beta: At least 0; 0 gives the mean, which is the limit.
+    :param beta: Number of at least 0; 0 gives the mean, which is the limit for a small beta.
     :param probabilities: Probabilities of the costs, ``(N,)``; default: 1 / N each.
     """
     if not (np.isfinite(beta) and beta >= 0):
@@ -83,14 +83,14 @@ def cost_distribution(
     r"""
     Bound the distribution of the cost from above by a confidence band around a sample of costs.
 
-    For the i-th lowest of N costs, :math:`F(c_{(i)})` is stochastically above a Beta(i, N + 1 - i) variable. The lower
-    quantiles at ``1 - confidence`` divided by the number of used ranks hold simultaneously (Bonferroni). The step
-    function through these quantiles is a lower bound on F. The remaining probability above the highest cost, about
-    ``log(400 / (1 - confidence)) / N``, is put at ``cost_bound``; 400 is about the number of ranks for a million costs.
-    The band bounds the mean of every increasing function simultaneously, so the entropic risk may be optimised over
-    beta.
+    Let F be the distribution function of the cost. At the i-th lowest of N costs, :math:`F(c_{(i)})` is stochastically
+    above a Beta(i, N + 1 - i) variable. Its lower quantiles at the level ``1 - confidence`` divided by the number of
+    used ranks hold simultaneously (Bonferroni). The step function through these quantiles is a lower bound on F. The
+    band leaves a probability of about ``log(400 / (1 - confidence)) / N`` above the highest cost, and assigns it to
+    ``cost_bound``. The number of used ranks is about 400 for a million costs. The band bounds the mean of every
+    increasing function simultaneously, so the entropic risk may be optimised over beta.
 
-    :param costs: Independent and identically distributed, ``(N,)``.
+    :param costs: Costs of independent episodes with the same distribution, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.
     :param confidence: Probability with which the band holds; ``None``: no allowance for the sampling error.
     """
@@ -128,8 +128,9 @@ def worst_mean(distribution: CostDistribution, kl: float) -> float:
     r"""
     Bound the mean under any distribution within ``kl`` nats: the minimum of ``entropic_risk + kl / beta`` over beta.
 
-    In :math:`s = 1 / \beta` the function is convex (the perspective of a convex function plus a linear one), so a local
-    search finds the minimum. Every beta gives a valid bound; some distribution within ``kl`` nats attains the minimum.
+    As a function of :math:`s = 1 / \beta`, the bound is convex (the perspective of a convex function plus a linear
+    function), so a local search finds the minimum. Every beta gives a valid bound. Some distribution within ``kl`` nats
+    attains the minimum.
 
     :param kl: D[shifted || training] in nats, or an upper bound on it; inf gives the largest cost.
     """
@@ -139,7 +140,7 @@ def worst_mean(distribution: CostDistribution, kl: float) -> float:
     largest, width = float(values[-1]), float(values[-1]) - float(values[0])
     if kl == 0 or width == 0:
         return float(weights @ values)
-    # Compare with the divergence of the distribution that has all its weight on the largest value.
+    # The distribution that has all its weight on the largest value has this divergence from the given one.
     if kl >= -math.log(max(float(weights[values == largest].sum()), 1e-300)):
         return largest
 
@@ -166,7 +167,7 @@ def certificate(
 
 
 def _ranks(n: int) -> np.ndarray:
-    """Choose ranks from 1 to n: all of the highest, then fewer and fewer, and evenly spaced ranks below the middle."""
+    """Choose ranks from 1 to n: the 50 highest, fewer and fewer below them, and 100 evenly spaced in the lower half."""
     from_top: list[np.ndarray] = [np.arange(min(_HIGHEST, n))]
     if n > _HIGHEST:
         n_steps = math.ceil(math.log(n / (2 * _HIGHEST) + 1) / math.log(_RANK_FACTOR))

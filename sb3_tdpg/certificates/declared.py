@@ -45,18 +45,19 @@ def certify_nuisance(
     """
     Certify policies under a declared nuisance, and compare the bounds with the measured costs.
 
-    The first row of a model is the whole family, with a member for each episode. Each other row is one random member.
+    In the first row of a model in ``nuisance.csv``, each episode has its own random member of the nuisance. In every
+    other row, all episodes have the same random member.
 
     :param models: Files that ``model.save()`` wrote.
-    :param env_id: The training environment, one of this package.
-    :param declared: See :class:`~sb3_tdpg.robustness.families.Family`.
+    :param env_id: Id of the training environment, which must be one of this package.
+    :param declared: The nuisance, declared as for :class:`~sb3_tdpg.robustness.families.Family`.
     :param out: Folder for ``summary.md``, ``nuisance.csv`` and ``config.json``.
-    :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
-        the cost of standing at the wall.
+    :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava: the
+        cost of standing at the wall.
     :param env_kwargs: Keywords of the training environment.
     :param n_episodes: Number of training episodes for the distribution of the cost.
     :param n_budget_episodes: Number of further training episodes, in which each member perturbs the observations.
-    :param n_test_episodes: Number of episodes under each member, to measure the cost.
+    :param n_test_episodes: Number of episodes in which the cost under each member is measured.
     :param confidence: Confidence of each certificate.
     :return: the summary, as Markdown
     :raises ValueError: if an argument is invalid; no episode has been run then.

@@ -1,9 +1,9 @@
 r"""
-Declare shifts of sensor and start, and compute how far they move the distribution over episodes, in nats.
+Declare shifts of the sensor and of the start, and bound the divergence between shifted and training episodes.
 
-The actions depend on the observations only through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. A shift of
-the sensor therefore moves states and actions by no more than it moves the TRVs. The divergence of the TRVs can be
-computed, because the encoder's density is known. The derivation is in ``docs/guide/certificate.md``.
+The actions depend on the observations only through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. It is
+therefore sufficient to bound the divergence of the TRVs, which can be computed because the encoder's density is known.
+The derivation is in ``docs/guide/certificate.md``.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
@@ -89,16 +89,16 @@ class TrainingEpisodes:
     Record training episodes of a policy; a shifted sensor then observes the recorded states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
-    :param scenario: The training environment, one of this package.
-    :param cost_bound: Upper bound on the episode cost. The cost is clipped there. If an episode can cost more, the
-        certificate is for the clipped cost.
+    :param scenario: The training environment, which must be one of this package.
+    :param cost_bound: Upper bound on the cost of an episode; the cost is clipped there. If an episode can cost more,
+        the certificate is for the clipped cost.
     :param n_episodes: Number of episodes for the distribution of the cost.
     :param n_budget_episodes: Number of further episodes for the divergence of the TRVs.
     :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
         error probability is spent on the distribution of the cost, and half on the divergence.
     :param seed: Seed of the episodes.
-    :raises ValueError: if the environment or that of the model is unsuitable, or a number is invalid; no episode has
-        been run then.
+    :raises ValueError: if the scenario or the model's own environment is unsuitable, or a number is invalid. No episode
+        has been run then.
     """
 
     def __init__(
@@ -137,9 +137,10 @@ class TrainingEpisodes:
         """
         Bound the divergence between episodes with and without the shift, from recorded episodes.
 
-        An episode consists of its TRVs, states and actions. Under the shifted distribution, the mean divergence of a
-        step is at most the largest mean over all distributions within the divergence of the earlier steps. Where the
-        divergence exceeds a cap, the bound assumes an unshifted step and the largest episode cost.
+        An episode consists of its TRVs, states and actions. The divergence of the earlier steps is bounded first. The
+        mean divergence of a step under the shift is then at most the largest mean under all distributions within that
+        bound. In an episode with a divergence above a cap, the bound assumes that the step is not shifted and that the
+        episode has the largest cost.
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
@@ -152,7 +153,7 @@ class TrainingEpisodes:
         """
         Bound the expected cost under a shift, clipped at ``cost_bound``.
 
-        The certificates through the TRVs and through the sensor hold simultaneously, so the lower is valid.
+        The bounds through the TRVs and through the sensor hold simultaneously, so the lower one is valid.
         """
 
         def bound_through_trvs(budget: Budget) -> float:
@@ -164,7 +165,7 @@ class TrainingEpisodes:
         return ShiftCertificate(min(through_trvs, through_sensor), through_trvs, through_sensor, budget)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
-        """Run the shifted environment; return the costs, ``(N,)``, and the mean divergence, which the budget bounds."""
+        """Run shifted episodes; return their costs, ``(N,)``, and their mean divergence, which a budget bounds."""
         shifted = record_episodes(self.model, self._shifted(shift), n_episodes, (seed, _TEST))
         by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
         return shifted.costs, shift.start_kl + float(by_step[:-2].sum() + by_step[-2:].min())
@@ -225,14 +226,13 @@ def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
-    # Double precision is needed: a small divergence is a difference of numbers near 1, and must not be rounded down to
-    # 0.
+    # In single precision, a small divergence, which is a difference of numbers near 1, would be rounded to 0.
     double = [[Normal(d.mean.double(), d.stddev.double()) for d in densities] for densities in (shifted, training)]
     return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in zip(*double, strict=True)])
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
-    """Sum the divergences of the steps; of the last TRVs and the last action, only the lower divergence counts."""
+    """Add up the bounds of the steps, but of those of the last TRVs and the last action only the lower one."""
 
     def add(budget: Budget, step: CostDistribution) -> Budget:
         capped, exceedance = step.capped(level)

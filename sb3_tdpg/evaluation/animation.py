@@ -35,7 +35,7 @@ class Episode(NamedTuple):
     between: Sequence[Sequence[np.ndarray]] = ()  # pictures between x_t and x_{t+1} for each step, or nothing
 
     def film(self) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield all pictures with their times in steps."""
+        """Yield the time in steps and the picture of each frame."""
         for t, picture in enumerate(self.pictures):
             yield float(t), picture
             between = self.between[t] if t < len(self.between) else ()
@@ -44,7 +44,7 @@ class Episode(NamedTuple):
 
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
-    """Raise an error if the file extension is unknown (``ValueError``), or matplotlib or ffmpeg is missing."""
+    """Raise an error if the extension is not ``.gif`` or ``.mp4``, or if matplotlib or ffmpeg is missing."""
     ending = Path(path).suffix
     if ending not in (".gif", ".mp4"):
         raise ValueError(f"{path}: the extension {ending!r} is not a video format: use .gif or .mp4")
@@ -54,7 +54,7 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
 
 
 def _ffmpeg() -> str | None:
-    """Return the path of ffmpeg from Matplotlib's settings (by default, on the PATH) or from imageio-ffmpeg, if any."""
+    """Return the path of the ffmpeg of Matplotlib's settings (by default, on the PATH) or of imageio-ffmpeg, if any."""
     import matplotlib as mpl
 
     if (found := shutil.which(mpl.rcParams["animation.ffmpeg_path"])) is not None:
@@ -76,7 +76,7 @@ def save_animation(
     :param episodes: Episodes with pictures of the same size.
     :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
     :param horizon: Number of controls T in an episode.
-    :param fps: Frames per second; a GIF is timed in hundredths of a second.
+    :param fps: Frames per second. A GIF rounds the duration of a frame to hundredths of a second.
     :param signal: ``"TRV"`` or ``"action"``: what is drawn below the pictures.
     :raises ValueError: if the video cannot be written there.
     """
@@ -101,7 +101,7 @@ class _Video:
         scale = width / MIN_WIDTH
         panel = round(scale * PANEL_HEIGHT)
         dpi, total = scale * DPI, height + panel
-        # A tenth of a pixel is added, because a quotient that is rounded down would cut a row off the picture.
+        # A tenth of a pixel is added, because rounding down the size would cut a row off the picture.
         self.figure: Figure = Figure(figsize=((width + 0.1) / dpi, (total + 0.1) / dpi), dpi=dpi)
         self.canvas = FigureCanvasAgg(self.figure)
         # The picture is drawn pixel by pixel, because axes would resample it.
@@ -133,7 +133,7 @@ class _Video:
         self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
 
     def frames(self) -> Iterator[bool]:
-        """Set the figure to each frame in turn; yield whether the frame is the last of its episode."""
+        """Draw each frame in turn, and yield whether it is the last frame of its episode."""
         for number, episode in enumerate(self.episodes, start=1):
             cost_so_far = np.concatenate([[0.0], episode.costs.cumsum()])
             for time, picture in episode.film():
@@ -176,7 +176,7 @@ def save_gif(
     :param path: The file; its folder exists.
     :param images: RGB images.
     :param durations: Duration of each image, in ms.
-    :param palette: An image whose palette to use; default: 256 colours of eight of the images.
+    :param palette: An image with the palette to use; default: 256 colours from eight of the images.
     """
     if palette is None:
         # MAXCOVERAGE keeps the colours of small objects, and k-means improves those of large ones.

@@ -1,5 +1,5 @@
 """
-Confidence intervals for I[x_t; x~_t] from named lower and upper bounds.
+Compute confidence intervals for I[x_t; x~_t] from several lower and upper bounds.
 
 Dimension key: T time steps, N episodes, X state, Z TRVs.
 """
@@ -74,14 +74,14 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
     Divide the error probability between two limits, given the gap between their bounds.
 
-    The true value lies in the gap, and a limit that is far from it cannot miss it. In the worst case the true value is
-    at either end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c
-    standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets half
-    of the probability. With a wide gap each limit gets the whole probability, because the true value can be
-    close to one of them only.
+    The true value lies in the gap, and a limit that is far from the true value cannot miss it. In the worst case the
+    true value is at one end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that
+    are c standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets
+    half of the probability. With a wide gap each limit gets the whole probability, because the true value can be close
+    to only one limit.
 
     :param miss: Probability that either limit misses the true value.
-    :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.
+    :param gap: Upper minus lower estimate, in standard errors; negative values and NaN count as 0.
     """
     from scipy.optimize import brentq  # its import takes half a second
 
@@ -99,11 +99,11 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     r"""
     Return how many standard errors any of several correlated Gaussians exceeds with a probability of at most ``miss``.
 
-    Hunter's inequality (1976, Journal of Applied Probability 13(3)) bounds this probability by the sum of the single
-    probabilities minus the joint probabilities of the first Gaussian with each other one. With Owen's function T, the
-    bound for c standard errors is :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully
-    correlated Gaussians give the quantile of a single Gaussian, and independent ones about Bonferroni's quantile.
-    ``miss`` must be below 0.5.
+    Hunter's inequality (1976, Journal of Applied Probability 13(3)) gives the following upper bound: the sum of the
+    probabilities that each Gaussian exceeds this limit, minus the probabilities that the first Gaussian and each other
+    Gaussian exceed it together. With Owen's function T, the bound for c standard errors is
+    :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
+    of a single Gaussian, and independent Gaussians give about Bonferroni's quantile. ``miss`` must be below 0.5.
     """
     from scipy.optimize import brentq
 
@@ -119,7 +119,7 @@ def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, flo
     """
     Return the name and the value of the tightest upper limit (``sign=1``) or lower limit (``sign=-1``).
 
-    :param miss: Probability that any limit is on the wrong side of its bound's expectation.
+    :param miss: Probability that at least one limit is on the wrong side of the expectation of its bound.
     """
     if not bounds:
         return "", sign * math.inf
@@ -160,7 +160,7 @@ def information_interval(batch: InformationBatch, *, seed: int = 0) -> Informati
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
     which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
-    on the others. The larger bound of two kinds of critics counts:
+    on the others. Of two kinds of critics, the larger bound counts:
 
     - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to halves of the episodes;
     - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, fitted to most of the episodes.
@@ -205,14 +205,14 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
     r"""
     Bound the information of the TRVs about each component of the state from below, I[x^k_t; x~_t].
 
-    The result is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
+    The bound is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
     state. If the TRVs depend on several components, their density given one component has a complicated shape, and the
     Gaussian critic gives the better bound.
 
     :param batch: As in :func:`information_interval`.
     :param seed: Seed of the division of the episodes and of the noise.
-    :return: the estimates and their lower limits, each with a confidence of 95 %, ``(T, X)`` each, nats; NaN where a
-        component is constant and where too few episodes are alive
+    :return: the estimates of the bounds and their lower 95 % confidence limits, ``(T, X)`` each, in nats; NaN where a
+        component is constant or too few episodes are alive
     """
     values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
     for t, step, rng in _steps(batch, seed):

@@ -37,7 +37,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     Hub), the observations are normalised as in training. Loading unpickles the file, which can run any code: load only
     files that you trust.
 
-    :param path: The file that ``model.save`` wrote.
+    :param path: The ``.zip`` file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
     :param env_kwargs: Keywords of the environment.
     :raises ValueError: if the file cannot be read, or its algorithm is unknown.
@@ -69,8 +69,8 @@ def statistics_beside(path: Path) -> Path | None:
     """
     Return the file with the statistics of observations of a model, or ``None`` if there is none.
 
-    The file lies beside the model or in a folder with the model's name. For ``<id>_1/best_model.zip`` it lies in
-    ``<id>_1/<id>/``.
+    The file is searched beside the model and in a folder with the model's name. For ``<id>_1/best_model.zip`` it is
+    also searched in ``<id>_1/<id>/``.
     """
     folder = path.parent
     folders = [folder, path.with_suffix(""), folder / folder.resolve().name.rpartition("_")[0]]

@@ -40,23 +40,23 @@ def evaluate_scenarios(
     """
     Run models in scenarios and record every episode.
 
-    The frame has one row for each model, scenario and episode, in this order, with the columns ``model``, ``scenario``,
-    ``env_id``, ``episode``, ``cost`` (the negative return), ``length`` (steps), ``final_*`` (every number in the last
-    ``info``; the components of an array are ``final_state_0``, ...), ``seed`` and ``deterministic``. If the
-    environment reports ``info["is_success"]``, there is also a column ``failure``.
+    The frame has one row for each model, scenario and episode, in this order. The columns are ``model``, ``scenario``,
+    ``env_id``, ``episode``, ``cost`` (the negative return), ``length`` (steps), ``final_*``, ``seed`` and
+    ``deterministic``. Every number in the last ``info`` has a column ``final_*``; the components of an array are
+    ``final_state_0``, ... If the environment reports ``info["is_success"]``, there is also a column ``failure``.
 
-    The same seed gives the same frame. In a scenario all models start from the same initial states, and they meet the
-    same noise if the number of random numbers that the environment draws does not depend on the actions. Under the same
-    condition, all scenarios of one environment share their initial states and noise. The global random generators are
-    restored at the end.
+    The same seed gives the same frame. In a scenario all models start from the same initial states. If the number of
+    random numbers that the environment draws does not depend on the actions, the models also meet the same noise, and
+    all scenarios of one environment share their initial states and noise. The global random generators are restored at
+    the end.
 
     :param model: One SB3 model, or a mapping from labels to models.
     :param scenarios: The scenarios to run, in the order of the rows.
-    :param n_episodes: Number of episodes of each model in each scenario that has no number of its own.
+    :param n_episodes: Number of episodes of each model in each scenario without an ``n_episodes`` of its own.
     :param seed: Seed of the environments and of the policies' sampling.
     :param deterministic: Act without noise. The default is the stochastic policy, which the paper's tables use.
     :param env_kwargs: Keywords for the environments of all scenarios; a scenario's own keywords take precedence.
-    :param labels: Constant columns to put in front, for instance ``dict(train_seed=3)``.
+    :param labels: Names and values of constant columns to add in front, for instance ``dict(train_seed=3)``.
     :param progress_bar: Show a progress bar.
     :raises ValueError: if an argument is invalid; no episode has been run then.
     """

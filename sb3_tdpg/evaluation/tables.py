@@ -15,8 +15,9 @@ def summary_table(records: pd.DataFrame) -> pd.DataFrame:
     Summarise the cost over the episodes of each model in each scenario, and of each ``train_seed`` if there are any.
 
     :param records: Result of :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :return: the columns ``model``, ``scenario``, ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem`` (standard
-        error of the mean), ``median``; ``failure_share`` if there is a column ``failure``; ``seed``, ``deterministic``
+    :return: a frame with the columns ``model``, ``scenario``, ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem``
+        (standard error of the mean), ``median``, ``failure_share`` (if there is a column ``failure``), ``seed`` and
+        ``deterministic``
     """
     keys = [*(["train_seed"] if "train_seed" in records.columns else []), "model", "scenario"]
     if n_missing := int(records["cost"].isna().sum()):
@@ -49,15 +50,15 @@ def comparison_markdown(
     summary: pd.DataFrame, scenarios: Sequence[Scenario], *, quantity: str = "episode cost", digits: int = 2
 ) -> str:
     """
-    Write a Markdown table with a row for each scenario, and for each model its numbers beside the paper's.
+    Write a Markdown table with a row for each scenario and, for each model, columns of its numbers and the paper's.
 
     :param summary: Result of :func:`summary_table`, or of :func:`aggregate_seeds`; with the latter, a cell shows the
         interquartile mean over seeds and its interval.
     :param scenarios: The rows, in this order. The paper's numbers are shown for models whose label is a key of
         ``scenario.paper``.
     :param quantity: Name of the compared quantity, for the line below the table.
-    :return: the table, with our lowest number and the paper's lowest number of each row in bold, and a line on how the
-        table was made
+    :return: the table, and a line on how it was made; our lowest number and the paper's lowest number of each row are
+        bold
     """
     over_seeds = "iqm" in summary.columns
     if summary.duplicated(["model", "scenario"]).any():
