@@ -33,7 +33,6 @@ class CostDistribution(NamedTuple):
 
     values: np.ndarray  #: (M,), ascending
     probabilities: np.ndarray  #: (M,)
-    confidence: float | None  #: None: without allowance for the sampling error
 
     def with_largest(self, probability: float) -> CostDistribution:
         """Raise the lowest costs, up to a total probability of ``probability``, to the largest cost."""
@@ -47,7 +46,7 @@ class CostDistribution(NamedTuple):
 
         :return: the distribution of the capped cost, and the probability of a cost above the cap
         """
-        n = len(self.values) - (self.confidence is not None)  # then the last value is not from the sample
+        n = len(self.values) - 1  # the last value is not from the sample
         below = np.cumsum(self.probabilities)[:n]
         last = min(int(np.searchsorted(below, 1 - level)), n - 1)
         kept = np.append(self.probabilities[:last], 1 - (below[last - 1] if last else 0.0))
@@ -77,9 +76,7 @@ def entropic_risk(costs: np.ndarray, beta: float, probabilities: np.ndarray | No
     return mean + (largest + math.log(float(weights @ np.exp(exponents - largest)))) / beta
 
 
-def cost_distribution(
-    costs: np.ndarray, cost_bound: float | None = None, confidence: float | None = 0.95
-) -> CostDistribution:
+def cost_distribution(costs: np.ndarray, cost_bound: float, confidence: float = 0.95) -> CostDistribution:
     r"""
     Bound the distribution of the cost from above by a confidence band around a sample of costs.
 
@@ -92,7 +89,7 @@ def cost_distribution(
 
     :param costs: Costs of independent episodes with the same distribution, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.
-    :param confidence: Probability with which the band holds; ``None``: no allowance for the sampling error.
+    :param confidence: Probability with which the band holds.
     """
     costs = np.asarray(costs, dtype=np.float64)
     if costs.ndim != 1 or len(costs) == 0 or not np.isfinite(costs).all():
@@ -100,28 +97,20 @@ def cost_distribution(
     costs = np.sort(costs)
     n = len(costs)
     ranks = _ranks(n)
-    if confidence is None:
-        below, values = ranks / n, costs[ranks - 1]
-    else:
-        check_allowance(confidence, cost_bound)
-        assert cost_bound is not None
-        if costs[-1] > cost_bound:
-            given = f"a cost of {costs[-1]:g} exceeds cost_bound={cost_bound:g}"
-            raise ValueError(f"{given}: give a larger bound, or certify the clipped cost np.minimum(costs, cost_bound)")
-        below = beta_distribution.ppf((1 - confidence) / len(ranks), ranks, n + 1 - ranks)
-        below, values = np.append(below, 1.0), np.append(costs[ranks - 1], cost_bound)
-    return CostDistribution(values, np.diff(below, prepend=0.0), confidence)
+    check_allowance(confidence, cost_bound)
+    if costs[-1] > cost_bound:
+        given = f"a cost of {costs[-1]:g} exceeds cost_bound={cost_bound:g}"
+        raise ValueError(f"{given}: give a larger bound, or certify the clipped cost np.minimum(costs, cost_bound)")
+    below = beta_distribution.ppf((1 - confidence) / len(ranks), ranks, n + 1 - ranks)
+    return CostDistribution(np.append(costs[ranks - 1], cost_bound), np.diff(below, prepend=0.0, append=1.0))
 
 
-def check_allowance(confidence: float | None, cost_bound: float | None) -> None:
-    """Raise a ``ValueError`` if the confidence is not a probability, or there is no finite cost bound for it."""
-    if confidence is not None and not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1, or be None for no allowance")
-    if confidence is not None and (cost_bound is None or not np.isfinite(cost_bound)):
-        raise ValueError(
-            f"cost_bound={cost_bound} must be finite for a confidence of {confidence}, because a rare episode could "
-            "cost anything: give an upper bound on the episode cost, or confidence=None for an estimate"
-        )
+def check_allowance(confidence: float, cost_bound: float) -> None:
+    """Raise a ``ValueError`` if the confidence is not a probability, or the cost bound is not finite."""
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence={confidence} must lie between 0 and 1")
+    if not np.isfinite(cost_bound):
+        raise ValueError(f"cost_bound={cost_bound} must be finite: give an upper bound on the cost of an episode")
 
 
 def worst_mean(distribution: CostDistribution, kl: float) -> float:
@@ -136,7 +125,7 @@ def worst_mean(distribution: CostDistribution, kl: float) -> float:
     """
     if not kl >= 0:
         raise ValueError(f"kl={kl} must be at least 0")
-    values, weights, _ = distribution
+    values, weights = distribution
     largest, width = float(values[-1]), float(values[-1]) - float(values[0])
     if kl == 0 or width == 0:
         return float(weights @ values)
@@ -152,9 +141,7 @@ def worst_mean(distribution: CostDistribution, kl: float) -> float:
     return min(float(best.fun), largest)
 
 
-def certificate(
-    costs: np.ndarray, kl: float, *, cost_bound: float | None = None, confidence: float | None = 0.95
-) -> float:
+def certificate(costs: np.ndarray, kl: float, *, cost_bound: float, confidence: float = 0.95) -> float:
     """
     Bound the expected cost under a shift, from costs in training (Equation 6, corrected).
 

@@ -94,8 +94,8 @@ class TrainingEpisodes:
         the certificate is for the clipped cost.
     :param n_episodes: Number of episodes for the distribution of the cost.
     :param n_budget_episodes: Number of further episodes for the divergence of the TRVs.
-    :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
-        error probability is spent on the distribution of the cost, and half on the divergence.
+    :param confidence: Confidence of each certificate. Half of the error probability is spent on the distribution of the
+        cost, and half on the divergence.
     :param seed: Seed of the episodes.
     :raises ValueError: if the scenario or the model's own environment is unsuitable, or a number is invalid. No episode
         has been run then.
@@ -109,7 +109,7 @@ class TrainingEpisodes:
         cost_bound: float,
         n_episodes: int = 1_000_000,
         n_budget_episodes: int = 50_000,
-        confidence: float | None = 0.95,
+        confidence: float = 0.95,
         seed: int = 0,
     ) -> None:
         check_allowance(confidence, cost_bound)
@@ -120,8 +120,7 @@ class TrainingEpisodes:
             n = min(EPISODES_AT_A_TIME, n_episodes - i * EPISODES_AT_A_TIME)
             costs.append(record_episodes(model, self._env, n, (seed, i)).costs)
         self.costs = np.concatenate(costs)
-        share = None if confidence is None else (1 + confidence) / 2
-        self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, share)
+        self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, (1 + confidence) / 2)
         self.recorded = record_episodes(model, self._env, n_budget_episodes, (seed, _BUDGET))
 
     def divergences(self, shift: Shift) -> np.ndarray:
@@ -145,7 +144,7 @@ class TrainingEpisodes:
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
         divergences = self.divergences(shift)
-        share = None if self.confidence is None else 1 - (1 - self.confidence) / (2 * len(divergences))
+        share = 1 - (1 - self.confidence) / (2 * len(divergences))
         steps = [cost_distribution(divergence, float(divergence.max()), share) for divergence in divergences]
         return [_budget(steps, shift.start_kl, level) for level in EXCEEDANCE_LEVELS]
 

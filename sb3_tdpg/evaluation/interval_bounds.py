@@ -67,9 +67,9 @@ def noise_controls(step: Encoded) -> np.ndarray:
 
     Log-densities are approximately quadratic in the noise. The units are the standard deviations for the encoder's
     density, and the TRVs' covariance S for the marginal density. The control variates are
-    :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with :math:`\nu = \tilde x - \mu`,
-    averaged over the draws. Their expectations are 0 for every distribution of the means and any S that is independent
-    of the noise.
+    :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with
+    :math:`\nu = \tilde x - \mu`, averaged over the draws. Their expectations are 0 for every distribution of the means
+    and any S that is independent of the noise.
     """
     scale = np.sqrt(np.square(step.stds).mean(axis=0))
     stds, centred = step.stds / scale, (step.means - step.means.mean(axis=0)) / scale
