@@ -44,7 +44,7 @@ class InformationBounds(NamedTuple):
     """Bounds on the information, summed over the time steps of an episode, in nats."""
 
     upper: float  # upper bound on I[x_t; x~_t]: the log-det bound
-    lower: float  # lower bound on I[encoder input; x~_t]; this is I[x_t; x~_t] without memory and sensor noise
+    lower: float  # lower bound on I[encoder input; x~_t], which equals I[x_t; x~_t] without memory and sensor noise
 
 
 @dataclass(frozen=True)

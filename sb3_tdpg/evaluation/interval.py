@@ -27,7 +27,8 @@ from sb3_tdpg.information.base import InformationBatch
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
 CONFIDENCE = 0.95  # of the interval of a time step, and of the one-sided lower limit for a component of the state
-# Shares of the error probability. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
+# Shares of the error probability of the lower and the upper limit. The rest allows for skewness, which turns 2 % into
+# about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
 LOWER_BOUNDS = ("critic", "gaussian")

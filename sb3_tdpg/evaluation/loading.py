@@ -10,7 +10,7 @@ from typing import Any
 from sb3_tdpg.evaluation.environments import load_statistics, stacked_for
 from sb3_tdpg.vec_env import make_episodes_env
 
-# A model is recognised by the module of its policy, or by a setting that the algorithms before it do not have.
+# The first entry counts that is the beginning of the module of the policy, or the name of a setting of the algorithm.
 ALGORITHMS = {
     "sb3_tdpg.": "sb3_tdpg:TDPG",
     "sb3_contrib.common.recurrent.": "sb3_contrib:RecurrentPPO",

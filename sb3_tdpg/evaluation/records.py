@@ -5,7 +5,6 @@ Dimension key: T horizon, N episodes, X state.
 """
 
 import contextlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
@@ -161,8 +160,8 @@ def _check_arguments(models: Mapping[str, Any], scenarios: Sequence[Scenario], n
     for label, model in models.items():
         if getattr(model, "policy", None) is None:
             raise ValueError(f"model {label!r} is {model!r}, expected a Stable-Baselines3 model with a policy")
-    counts = Counter(scenario.name for scenario in scenarios)
-    if twice := sorted(name for name, count in counts.items() if count > 1):
-        raise ValueError(f"scenario names must differ, but {twice} occur more than once")
+    names = [scenario.name for scenario in scenarios]
+    if len(set(names)) < len(names):
+        raise ValueError(f"scenario names must differ, not {names}")
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes per scenario")

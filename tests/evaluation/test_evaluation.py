@@ -230,7 +230,7 @@ def test_the_last_infos_success_becomes_a_failure_column(tdpg, monkeypatch):
 
 @pytest.mark.parametrize(("change", "message"), [
     (dict(scenarios=[]), "at least one model and one scenario"),
-    (dict(scenarios=[LAVA[0], LAVA[0]]), "'Training'.*more than once"),
+    (dict(scenarios=[LAVA[0], LAVA[0]]), "names must differ.*'Training', 'Training'"),
     (dict(n_episodes=0), "n_episodes=0"),
     (dict(n_episodes=2.5), "n_episodes=2.5"),
     (dict(seed=-1), "seed=-1"),
