@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command(**options)
     except KeyboardInterrupt:
-        out = options.get("out") if command in (_demo, _reproduce, _sweep, _frontier, _report) else None
+        out = options.get("out") if command in (_demo, _reproduce, _frontier, _report) else None
         advice = "" if out is None else f"; the results so far are in {out}, and the same command continues from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
@@ -47,9 +47,9 @@ def _demo(out: Path, **options: Any) -> None:
     _print_results(out, lambda: demo(out, **options))
 
 
-def _print_results(out: Path, make: Callable[[], str], *, is_shared: bool = False) -> None:
-    """Print the summary that a function writes to a folder; unless it is shared, the folder is locked meanwhile."""
-    with contextlib.nullcontext() if is_shared else kept_by_this_process(out):
+def _print_results(out: Path, make: Callable[[], str]) -> None:
+    """Print the summary that a function writes to a folder, which is locked meanwhile."""
+    with kept_by_this_process(out):
         text = make()
     print(f"\n{text}\n\nresults are in {out}")
 
@@ -114,16 +114,6 @@ def _zoo(program: str, arguments: Sequence[str]) -> None:
         raise ImportError(f"{program} needs rl-zoo3 ({e}): pip install 'sb3_tdpg[zoo]'") from e
 
     run(program, arguments)
-
-
-def _sweep(env: str, seeds: int, settings: Sequence[str], **options: Any) -> None:
-    from sb3_tdpg.experiments.sweep import sweep
-
-    out = options.pop("out") or Path("results", f"sweep-{options['block'] or env.rpartition(':')[2]}")
-    options["settings"] = parse_keywords(settings)
-    # If a storage is given, several workers share the folder.
-    is_shared = options["storage"] is not None
-    _print_results(out, lambda: sweep(env, n_seeds=seeds, out=out, **options), is_shared=is_shared)
 
 
 def _frontier(env: str, seeds: int, env_kwargs: Sequence[str], settings: Sequence[str], **options: Any) -> None:
@@ -268,12 +258,7 @@ FLAGS: dict[str, dict[str, Any]] = {
     "--seed": dict(type=int, default=0),
     "--deterministic": dict(action="store_true", help="use means instead of samples: not the policy that was trained"),
     "--jobs": dict(type=_positive, help="processes (default: the number of cores)"),
-    "--block": dict(help="block of hyperparameters (default: that of the environment)"),
-    "--set": dict(
-        dest="settings", help="replace settings of the block: mi_estimator=logdet (values in YAML)", **KEYWORDS
-    ),
     "--n-timesteps": dict(type=_positive, help="environment steps of each training"),
-    "--n-eval-episodes": dict(type=_positive, default=1000, help="episodes of each row of the table"),
 }
 
 
@@ -288,8 +273,8 @@ def _make_parser() -> argparse.ArgumentParser:
             subparser.add_argument(flag, **FLAGS[flag])
         return subparser.add_argument
 
-    sizes = ("--n-timesteps", "--n-eval-episodes")
-    add = command(_demo, "train PG and TDPG on the lava problem and compare them", "--seed", *sizes)
+    add = command(_demo, "train PG and TDPG on the lava problem and compare them", "--seed", "--n-timesteps")
+    add("--n-eval-episodes", type=_positive, default=1000, help="episodes of each row of the table")
     add("--out", type=Path, default=Path("results/lava"), help="folder for the results")
     add("--reading", choices=("table", "text"), default="table", help="cost definition: of the paper's table or text")
 
@@ -317,18 +302,11 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--out", type=Path, help="the file (default: beside the model)")
     add("--format", choices=("onnx", "torchscript"), help="default: that of the file's name, or onnx")
 
-    text = "train with several betas and seeds, select by the paper's rule, plot cost against information"
-    add = command(_sweep, text, "--env", "--jobs", "--block", "--set", *sizes)
-    add("--betas", nargs="+", required=True, metavar="BETA", help="1/25 1/50 0.01 inf ...")
-    add("--seeds", type=_positive, default=5, help="training seeds of each beta")
-    add("--cost-limit", type=float, help="of the selection (default: minus the environment's reward_threshold)")
-    add("--out", type=Path, help="folder for the results (default: results/sweep-<block>)")
-    add("--storage", metavar="URL", help="share the sweep with other workers: postgresql://... or FILE.log")
-    add("--study-name", help="name of the study in the storage (default: sweep-<block>)")
-    add("--grace-period", type=float, default=60.0, help="seconds without a heartbeat until a worker counts as dead")
-
     text = "will the bottleneck pay? trainings that keep shares of the improvement, an open loop, a figure, a verdict"
-    add = command(_frontier, text, "--env", "--env-kwargs", "--jobs", "--n-timesteps", "--block", "--set")
+    add = command(_frontier, text, "--env", "--env-kwargs", "--jobs", "--n-timesteps")
+    add("--block", help="block of hyperparameters (default: that of the environment)")
+    text = "replace settings of the block: mi_estimator=logdet (values in YAML)"
+    add("--set", dest="settings", help=text, **KEYWORDS)
     add("--shares", nargs="+", type=float, default=(99, 95, 90, 80), metavar="PERCENT", help="default: 99 95 90 80")
     add("--seeds", type=_positive, default=3, help="training seeds of each row (default: 3)")
     add("--n-eval-episodes", type=_positive, default=500, help="episodes of each evaluation (default: 500)")

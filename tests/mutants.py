@@ -81,15 +81,8 @@ def stage() -> None:
 def mutmut(*arguments: str, check: bool = True) -> str:
     """Run mutmut in the copied tree and return its output; without ``check``, ignore its errors."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ""}
-    command = [sys.executable, "-m", "mutmut", *arguments]
-    done = subprocess.run(
-        command,
-        cwd=TREE,
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-        stderr=None if check else subprocess.DEVNULL,
-    )
+    command, stderr = [sys.executable, "-m", "mutmut", *arguments], None if check else subprocess.DEVNULL
+    done = subprocess.run(command, cwd=TREE, env=environment, stdout=subprocess.PIPE, text=True, stderr=stderr)
     if check and done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)[:200]} failed:\n{done.stdout[-3000:]}")
     return done.stdout

@@ -16,7 +16,6 @@ from sb3_tdpg.envs.ball_catch import BallCatchEnv
 from sb3_tdpg.envs.textures import random_texture
 from sb3_tdpg.robustness import PerturbedVecEnv, applicable
 
-SEVERITIES = (1, 2, 3, 4, 5)
 HORIZON = 8
 
 

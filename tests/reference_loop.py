@@ -23,6 +23,7 @@ from sb3_tdpg import TDPG
 from sb3_tdpg.common.networks import BatchedMLP
 
 GOAL, WALL, LAVA = 3.0, 0.0, 5.0  # m
+Tensors = list[th.Tensor]
 
 
 class Minibatch(NamedTuple):
@@ -47,10 +48,10 @@ class Randomness(NamedTuple):
 class Episode:
     """The record of an episode, with one entry for each time step."""
 
-    states: list[th.Tensor] = field(default_factory=list)  # (X,)
-    observations: list[th.Tensor] = field(default_factory=list)  # (X,)
-    trvs: list[th.Tensor] = field(default_factory=list)  # (Z,)
-    actions: list[th.Tensor] = field(default_factory=list)  # (U,)
+    states: Tensors = field(default_factory=list)  # (X,)
+    observations: Tensors = field(default_factory=list)  # (X,)
+    trvs: Tensors = field(default_factory=list)  # (Z,)
+    actions: Tensors = field(default_factory=list)  # (U,)
     costs: list[float] = field(default_factory=list)
 
 
@@ -79,9 +80,7 @@ class LoopTDPG:
         self.trv_dim = self.encoders[0][-1].out_features // 2
         parameters = [p for network in self.encoders + self.action_heads for p in network.parameters()]
         self.optimizer = th.optim.Adam(parameters, lr=self.policy_learning_rate)
-        self.critic_optimizers = [
-            th.optim.Adam(critic.parameters(), lr=self.critic_learning_rate) for critic in self.critics
-        ]
+        self.critic_optimizers = [th.optim.Adam(c.parameters(), lr=self.critic_learning_rate) for c in self.critics]
 
     @classmethod
     def copy_of(cls, model: TDPG) -> LoopTDPG:
@@ -107,45 +106,27 @@ class LoopTDPG:
             self.fit_critics(episodes, randomness.minibatches)
         self.update(episodes, randomness.trv_noise, randomness.pairings, mean_baseline(episodes))
 
-    # -- rollouts -------------------------------------------------------------------------------------------------
-
     @th.no_grad()
     def rollouts(self, randomness: Randomness) -> list[Episode]:
         """Roll out each episode separately."""
-        return [
-            self.rollout(
-                float(randomness.initial_distance[n]),
-                randomness.sensor_noise[n],
-                randomness.trv_noise[n],
-                randomness.action_noise[n],
-            )
-            for n in range(len(randomness.initial_distance))
-        ]
+        return [self.rollout(float(distance), *noise) for distance, *noise in zip(*randomness[:4], strict=True)]
 
     def rollout(
         self, distance: float, sensor_noise: np.ndarray, trv_noise: th.Tensor, action_noise: th.Tensor
     ) -> Episode:
         """Roll out one robot."""
-        episode = Episode()
-        velocity = 0.0
-        trv = th.zeros(self.trv_dim)
+        episode, velocity, trv = Episode(), 0.0, th.zeros(self.trv_dim)
         for t in range(self.horizon):
-            observation = th.tensor(
-                [
-                    to_float32(distance + self.sensor_noise_std * float(sensor_noise[t, 0])),
-                    to_float32(velocity + self.sensor_noise_std * float(sensor_noise[t, 1])),
-                ]
-            )
+            noise = self.sensor_noise_std * sensor_noise[t]
+            observation = th.tensor([to_float32(distance + noise[0]), to_float32(velocity + noise[1])])
             mean, variance = self.encode(t, trv, observation)
             trv = mean + th.sqrt(variance) * trv_noise[t]
             action_mean, action_variance = self.act(t, trv)
             action = action_mean + th.sqrt(action_variance) * action_noise[t]
-
             episode.states.append(th.tensor([distance, velocity]))
             episode.observations.append(observation)
             episode.trvs.append(trv)
             episode.actions.append(action)
-
             cost = math.hypot(distance - GOAL, velocity)
             control = min(max(action.item(), -self.max_action), self.max_action)
             distance, velocity = move(distance, velocity, control)
@@ -164,8 +145,6 @@ class LoopTDPG:
         mean, log_variance = self.action_heads[t](trv).chunk(2)
         return mean, bounded_exp(log_variance, 8) + self.action_var_floor
 
-    # -- mutual information ---------------------------------------------------------------------------------------
-
     def fit_critics(self, episodes: list[Episode], minibatches: list[list[Minibatch]]) -> None:
         """Fit the critics one after the other."""
         for t in range(self.horizon):
@@ -177,45 +156,23 @@ class LoopTDPG:
                 loss.backward()
                 self.critic_optimizers[t].step()
 
-    def donsker_varadhan(
-        self, t: int, states: list[th.Tensor], trvs: list[th.Tensor], minibatch: Minibatch
-    ) -> th.Tensor:
+    def donsker_varadhan(self, t: int, states: Tensors, trvs: Tensors, minibatch: Minibatch) -> th.Tensor:
         """Estimate I[x_t; x~_t] in nats; the critic is called for one sample at a time."""
-        joint = 0.0
-        for i in minibatch.joint:
-            joint = joint + self.critics[t](th.cat([states[i], trvs[i]]))[0]
-        marginal = 0.0
-        for i, j in minibatch.marginal:
-            marginal = marginal + th.exp(self.critics[t](th.cat([states[i], trvs[j]]))[0])
-        return joint / len(minibatch.joint) - th.log(marginal / len(minibatch.marginal))
+        joint = [self.critics[t](th.cat([states[i], trvs[i]]))[0] for i in minibatch.joint]
+        marginal = [th.exp(self.critics[t](th.cat([states[i], trvs[j]]))[0]) for i, j in minibatch.marginal]
+        return sum(joint) / len(joint) - th.log(sum(marginal) / len(marginal))
 
-    def information(
-        self, episodes: list[Episode], trvs: list[list[th.Tensor]], pairings: list[Minibatch]
-    ) -> list[th.Tensor]:
-        """
-        Estimate I[x_t; x~_t] for every t.
-
-        :param trvs: TRVs of each episode at each time step.
-        """
+    def information(self, episodes: list[Episode], trvs: list[Tensors], pairings: list[Minibatch]) -> Tensors:
+        """Estimate I[x_t; x~_t] for every t; ``trvs`` are those of each episode at each time step."""
         return [
             self.donsker_varadhan(t, [e.states[t] for e in episodes], [e[t] for e in trvs], pairings[t])
             for t in range(self.horizon)
         ]
 
-    # -- update ---------------------------------------------------------------------------------------------------
-
     def update(
-        self,
-        episodes: list[Episode],
-        trv_noise: th.Tensor,
-        pairings: list[Minibatch],
-        advantages: list[list[float]],
+        self, episodes: list[Episode], trv_noise: th.Tensor, pairings: list[Minibatch], advantages: list[list[float]]
     ) -> None:
-        """
-        Make one optimiser step on the policy.
-
-        :param advantages: Weight of each log-probability, for each episode and time step.
-        """
+        """Make one optimiser step on the policy; the advantages weight the log-probabilities."""
         loss = 0.0
         for n, episode in enumerate(episodes):
             prev_trv = th.zeros(self.trv_dim)
@@ -234,35 +191,28 @@ class LoopTDPG:
         loss.backward()
         self.optimizer.step()
 
-    def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> list[th.Tensor]:
+    def rebuild_trvs(self, episode: Episode, noise: th.Tensor) -> Tensors:
         """Compute the TRVs of an episode again, as functions of the encoder's parameters."""
-        trvs = []
-        trv = th.zeros(self.trv_dim)
+        trvs = [th.zeros(self.trv_dim)]
         for t in range(self.horizon):
-            mean, variance = self.encode(t, trv, episode.observations[t])
-            trv = mean + th.sqrt(variance) * noise[t]
-            trvs.append(trv)
-        return trvs
+            mean, variance = self.encode(t, trvs[-1], episode.observations[t])
+            trvs.append(mean + th.sqrt(variance) * noise[t])
+        return trvs[1:]
 
 
 def move(distance: float, velocity: float, control: float) -> tuple[float, float]:
     """Move one robot of the lava problem for one time step."""
-    if distance >= LAVA:
+    if distance >= LAVA or distance + velocity >= LAVA:
         return LAVA, 0.0
-    new_distance = distance + velocity
-    if new_distance >= LAVA:
-        return LAVA, 0.0
-    if new_distance < WALL:
+    if distance + velocity < WALL:
         return WALL, 0.0
-    return new_distance, velocity + control
+    return distance + velocity, velocity + control
 
 
 def log_density(x: th.Tensor, mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
     """Return the log-density of a diagonal Gaussian; the components are summed in a loop."""
-    result = 0.0
-    for i in range(len(x)):
-        result = result - 0.5 * ((x[i] - mean[i]) ** 2 / variance[i] + th.log(2 * math.pi * variance[i]))
-    return result
+    terms = zip(x, mean, variance, strict=True)
+    return -0.5 * sum((value - m) ** 2 / v + th.log(2 * math.pi * v) for value, m, v in terms)
 
 
 def mean_baseline(episodes: list[Episode]) -> list[list[float]]:

@@ -10,10 +10,9 @@ from unittest.mock import patch
 
 import optuna
 
-from sb3_tdpg.experiments.studies import enqueue_once, open_storage, open_study, work
+from sb3_tdpg.zoo.studies import open_storage, open_study, work
 
 GRACE_PERIOD = 3
-JOBS = [{"x": x} for x in (-2, -1, 0, 1, 2, 3)]
 
 
 def open_quick(url, **kwargs):
@@ -26,8 +25,7 @@ def run_worker(url, n_trials, log, seconds):
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def objective(trial):
-        x = trial.suggest_float("x", -1.0, 1.0) if n_trials else trial.suggest_int("x", -2, 3)
-        y = trial.suggest_float("y", -1.0, 1.0)
+        x, y = (trial.suggest_float(name, -1.0, 1.0) for name in ("x", "y"))
         write(f"begin {os.getpid()} {x} {y}")
         time.sleep(seconds)
         write(f"end {os.getpid()} {x} {y}")
@@ -39,8 +37,6 @@ def run_worker(url, n_trials, log, seconds):
 
     # All workers have the same seed, but they must not try the same points.
     study = open_quick(url, sampler=optuna.samplers.TPESampler(seed=0))
-    if n_trials is None:
-        enqueue_once(study, JOBS)
     work(study, objective, n_trials, report=lambda text: write(f"say {os.getpid()} {text}"))
 
 

@@ -25,6 +25,10 @@ def lava(n=20, **kwargs):
     return BatchedVecEnv(LavaEnv(**kwargs), n)
 
 
+def actions(space):
+    return dict(env=toy_vec_env(action_space=space))
+
+
 class WithoutHorizon(ToyEnv):
     def __init__(self):
         super().__init__(declares_horizon=False)
@@ -38,10 +42,7 @@ class NamedTwice(LavaEnv):
 ARGUMENTS = {
     **{f"policy {name}": (dict(policy=name), f"policy='{name}'", r"\['TRVPolicy'\]", "takes vectors, images and dicts")
        for name in ("MlpPolicy", "CnnPolicy", "MultiInputPolicy", "MlpLstmPolicy")},
-    "policy of PPO": (dict(policy=PPO.policy_aliases["MlpPolicy"]), "ActorCriticPolicy", "TRVPolicy"),
-    "policy a number": (dict(policy=3), "policy=3", "TRVPolicy"),
     "beta zero": (dict(beta=0.0), "beta=0.0", "positive number", "inf"),
-    "beta negative": (dict(beta=-1.0), "beta=-1.0", "positive number"),
     "beta NaN": (dict(beta=math.nan), "beta=nan", "positive number"),
     "beta a string": (dict(beta="0.1"), "beta='0.1'", "a number", "'lin_1e-3'", "auto"),
     "beta a text that ends at zero": (dict(beta="lin_0.5"), "beta=0.0", "positive number"),
@@ -50,21 +51,15 @@ ARGUMENTS = {
     "nuisance a number": (dict(nuisance=3), "nuisance=3: 3 is no perturbation", "a function of the observations"),
     "cost_limit zero": (dict(cost_limit=0.0), "cost_limit=0.0", "other than 0"),
     "cost_limit NaN": (dict(cost_limit=math.nan), "cost_limit=nan", "finite"),
-    "cost_limit of all": (dict(cost_limit="100%"), "cost_limit='100%'", "between 0 and 100 %", "'95%'"),
     "cost_limit a text": (dict(cost_limit="0.95"), "cost_limit='0.95'", "'95%'"),
-    "cost_limit beside a number for beta": (
-        dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"
-    ),
+    "cost_limit no number": (dict(cost_limit="x%"), "cost_limit='x%'", "'95%'"),
+    "cost_limit and a number": (dict(beta=0.5, cost_limit=3.0), "cost_limit=3.0", "beta=0.5", "SelectionCallback"),
     "n_epochs zero": (dict(n_epochs=0), "n_epochs=0", "integer of at least 1"),
     "batch_size above an epoch": (dict(batch_size=101), "batch_size=101", "between 10 and 100, the steps of an epoch"),
     "batch_size of one episode": (dict(batch_size=5), "batch_size=5", "between 10 and 100", "two episodes at least"),
     "bptt_steps none": (dict(bptt_steps=0), "bptt_steps=0", "integer of at least 1"),
-    "actions without bounds but in name": (
-        dict(env=toy_vec_env(action_space=spaces.Box(-1e30, 1e30, (1,)))), "infinite bounds, or above 1e.18"
-    ),
-    "actions that begin with 1": (
-        dict(env=toy_vec_env(action_space=spaces.MultiDiscrete([2, 3], start=[1, 1]))), "must begin with 0"
-    ),
+    "actions without bounds but in name": (actions(spaces.Box(-1e30, 1e30, (1,))), "infinite bounds, or above 1e.18"),
+    "actions that begin with 1": (actions(spaces.MultiDiscrete([2, 3], start=[1, 1])), "must begin with 0"),
     "no threads": (dict(n_threads=0), "n_threads=0", "integer of at least 1"),
     "bptt_steps of a time-varying policy": (dict(bptt_steps=2), "bptt_steps=2", "horizon of 5", "time_varying=False"),
     "clip_range zero": (dict(clip_range=0.0), "clip_range=0.0", "positive", "inf"),
@@ -74,114 +69,71 @@ ARGUMENTS = {
     "minibatches without clipping": (dict(batch_size=50), "batch_size=50", "2 updates", "clip_range=0.2"),
     "beta a schedule that ends at zero": (dict(beta=lambda progress: progress), "beta=0.0", "positive number"),
     "beta a schedule that returns a string": (dict(beta=lambda progress: "1"), "beta='1'", "positive number"),
-    "unknown estimator": (
-        dict(mi_estimator="mime"), "mi_estimator='mime'", r"\['directed', .* 'smile', 'vib'\]"
-    ),
+    "unknown estimator": (dict(mi_estimator="mime"), "mi_estimator='mime'", r"\['directed', .* 'smile', 'vib'\]"),
     "estimator of a wrong class": (dict(mi_estimator=th.nn.Linear), "mi_estimator", "InformationEstimator"),
-    "unknown key of mi_kwargs": (
-        dict(mi_estimator="mine", mi_kwargs=dict(hiden_sizes=3)), "mi_kwargs", "'hiden_sizes': did you mean 'hidden_si"
-    ),
-    "mi_kwargs for another estimator": (
-        dict(mi_estimator="logdet", mi_kwargs=dict(batch_size=5)), "mi_kwargs", "batch_size", "LogDet"
-    ),
-    "mi_kwargs out of range": (
-        dict(mi_estimator="mine", mi_kwargs=dict(batch_size=0)), "mi_kwargs: batch_size=0", "positive"
-    ),
+    "mi_kwargs misspelt": (dict(mi_estimator="mine", mi_kwargs=dict(hiden_sizes=3)), "mi_kwargs", "mean 'hidden_size"),
+    "mi_kwargs of another": (dict(mi_estimator="logdet", mi_kwargs=dict(batch_size=5)), "batch_size", "LogDet"),
+    "mi_kwargs out of range": (dict(mi_estimator="mine", mi_kwargs=dict(batch_size=0)), "batch_size=0", "positive"),
     "mi_kwargs of a wrong type": (dict(mi_kwargs="batch_size=5"), "mi_kwargs", "dict"),
-    "n_episodes no multiple of n_envs": (
-        dict(env=lava(6), n_episodes=20), "n_episodes=20", r"multiple", r"\(6\)", "use 18 or 24"
-    ),
+    "n_episodes no multiple of n_envs": (dict(env=lava(6), n_episodes=20), "n_episodes=20", r"\(6\)", "use 18 or 24"),
     "n_episodes below n_envs": (dict(env=lava(6), n_episodes=4), "n_episodes=4", r"use 6"),
     "n_episodes no multiple of n_envs of an id": (dict(n_envs=6, n_episodes=20), "use 18 or 24"),
     "n_episodes one": (dict(n_episodes=1), "n_episodes=1", "at least 2"),
-    "n_episodes zero": (dict(n_episodes=0), "n_episodes=0", "integer of at least"),
     "n_episodes a float": (dict(n_episodes=20.0), "n_episodes=20.0", "integer"),
     "n_envs zero": (dict(n_envs=0), "n_envs=0", "integer of at least 1"),
     "n_envs for an environment": (dict(env=lava(20), n_envs=10), "n_envs=10", "leave n_envs out"),
-    "unknown baseline": (
-        dict(baseline="median"), r"baseline='median' is unknown: use one of \['mean', 'regression', 'value'\]"
-    ),
-    "unknown encoder gradient": (
-        dict(encoder_gradient="sore"), "encoder_gradient='sore'", r"\['score', 'pathwise'\]"
-    ),
+    "unknown baseline": (dict(baseline="median"), r"baseline='median' is unknown.*\['mean', 'regression', 'value'\]"),
+    "unknown encoder gradient": (dict(encoder_gradient="sore"), "encoder_gradient='sore'", r"\['score', 'pathwise'\]"),
     "gamma a text": (dict(gamma="1"), "gamma='1' must be a number"),
     "gae_lambda a text": (dict(gae_lambda="1"), "gae_lambda='1' must be a number"),
     "seed a fraction": (dict(seed=1.5), "seed=1.5", "integer"),
     "seed negative": (dict(seed=-1), "seed=-1", "integer from 0"),
-    "epoch_steps less than two episodes": (
-        dict(n_episodes=None, epoch_steps=9), "epoch_steps=9", "two episodes", "n_episodes=2"
-    ),
+    "epoch of one episode": (dict(n_episodes=None, epoch_steps=9), "epoch_steps=9", "two episodes", "n_episodes=2"),
     "nuisance without scenes": (dict(nuisance={"env_kwargs": []}), r"'env_kwargs': \[\]", "hold keywords"),
-    "nuisance with a number for scenes": (dict(nuisance={"env_kwargs": 3}), "'env_kwargs': 3", "a list of such"),
-    "nuisance with an unknown keyword": (
-        dict(nuisance={"env_kwargs": [{"bar": 3}]}), r"'env_kwargs': \[\{'bar': 3\}\]", "unexpected keyword .*'bar'"
-    ),
+    "nuisance misspelt": (dict(nuisance={"env_kwargs": [{"bar": 3}]}), "'env_kwargs': .*unexpected keyword .*'bar'"),
     "nuisance that redraws a number": (
         dict(nuisance={"env_kwargs": [{"sensor_noise_std": 1.0}], "redraw": 3}), "redraw=3", r"list .*'d \(m\)'"
     ),
     "nuisance that only redraws": (dict(nuisance={"redraw": ["d"]}), "'redraw' needs 'env_kwargs'"),
-    "nuisance with three severities": (
-        dict(nuisance={"vector_noise": [1, 2, 3]}), r"\[1, 2, 3\]", "the lowest and the highest"
-    ),
+    "three severities": (dict(nuisance={"vector_noise": [1, 2, 3]}), r"\[1, 2, 3\]", "the lowest and the highest"),
     "gamma zero": (dict(gamma=0.0), "gamma=0.0", r"\(0, 1\]"),
-    "gamma above one": (dict(gamma=1.01), "gamma=1.01", r"\(0, 1\]"),
     "gamma NaN": (dict(gamma=math.nan), "gamma=nan", r"\(0, 1\]"),
     "max_grad_norm negative": (dict(max_grad_norm=-1.0), "max_grad_norm=-1.0", "positive", "inf"),
     "max_grad_norm NaN": (dict(max_grad_norm=math.nan), "max_grad_norm=nan", "positive", "inf"),
     "target_kl zero": (dict(target_kl=0.0), "target_kl=0.0", "positive", "inf"),
     "learning_rate negative": (dict(learning_rate=-1e-3), "learning_rate=-0.001", "non-negative"),
-    "learning_rate NaN": (dict(learning_rate=math.nan), "learning_rate=nan", "not negative|positive|finite"),
     "learning_rate a string": (dict(learning_rate="1e-3"), "learning_rate='1e-3'", "number"),
     "learning_rate a schedule that goes below zero": (
         dict(learning_rate=lambda progress: progress - 0.5), "learning_rate=-0.5", "non-negative"
     ),
     "unknown environment": (dict(env="Larva-v0"), "Larva"),
-    "environment without a horizon": (
-        dict(env=DummyVecEnv([WithoutHorizon])), "finite horizon", "`horizon`", "max_episode_steps"
-    ),
+    "no horizon": (dict(env=DummyVecEnv([WithoutHorizon])), "finite horizon", "`horizon`", "max_episode_steps"),
     "horizon zero": (dict(env=toy_vec_env(horizon=0)), "finite horizon", "horizon=0"),
     "image without a state": (
         dict(env=toy_vec_env(observation_space=IMAGE, gives_state=False)),
         r"an image \(Box\(0, 255, \(3, 20, 16\), uint8\)\) cannot stand in for it",
         r'info\["state"\]', "state_space", "reset",
     ),
-    "too many names of the state": (
-        dict(env=toy_vec_env(state_names=("d (m)", "v (m/s)"))), r"state_names=\('d \(m\)', 'v", "1 different", "x0"
-    ),
+    "more names": (dict(env=toy_vec_env(state_names=("d (m)", "v (m/s)"))), r"\('d \(m\)', 'v", "1 different", "x0"),
     "names of the state as one text": (dict(env=toy_vec_env(state_names="d")), "state_names='d'", "1 different"),
     "a name of the state twice": (dict(env=BatchedVecEnv(NamedTwice(), 20)), "state_names=.'d', 'd'.", "2 different"),
-    "action bounds that are not finite": (
-        dict(env=toy_vec_env(action_space=spaces.Box(-np.inf, np.inf, (1,), np.float32))), "action", "bound", "finite"
-    ),
-    "actions that do not begin with 0": (
-        dict(env=toy_vec_env(action_space=spaces.Discrete(3, start=5))), "action space", "begin with 0"
-    ),
-    "action space that is not supported": (
-        dict(env=toy_vec_env(action_space=spaces.Dict(a=spaces.Discrete(2)))), "action space", "Box", "Discrete"
-    ),
+    "infinite bounds": (actions(spaces.Box(-np.inf, np.inf, (1,), np.float32)), "action", "bound", "finite"),
+    "actions that do not begin with 0": (actions(spaces.Discrete(3, start=5)), "action space", "begin with 0"),
+    "actions in a dict": (actions(spaces.Dict(a=spaces.Discrete(2))), "action space", "Box", "Discrete"),
     "observations in a tuple": (
         dict(env=toy_vec_env(observation_space=spaces.Tuple([spaces.Box(-1, 1, (2,))]))), "FlattenObservation"
     ),
     "both lengths": (dict(n_episodes=10, epoch_steps=100), "n_episodes=10 and epoch_steps=100", "give one of them"),
     "rewards normalised": (dict(env=VecNormalize(lava())), "norm_reward=False", "beta"),
-    "unknown key of policy_kwargs": (
-        dict(policy_kwargs=dict(trv_dims=2)), "policy_kwargs", "'trv_dims': did you mean 'trv_dim'"
-    ),
-    "policy_kwargs of a wrong type": (
-        dict(policy_kwargs="trv_dim=2"), "policy_kwargs='trv_dim=2' must be a dict of keywords of TRVPolicy$"
-    ),
-    "unknown key of net_arch": (
-        dict(policy_kwargs=dict(net_arch=dict(pi=[64]))), "net_arch", r"\['action_head', 'encoder'\]"
-    ),
+    "trv_dim misspelt": (dict(policy_kwargs=dict(trv_dims=2)), "policy_kwargs", "'trv_dims': did you mean 'trv_di"),
+    "policy_kwargs a text": (dict(policy_kwargs="trv_dim=2"), "policy_kwargs='trv_dim=2' must be a dict of keywords"),
+    "net_arch of PPO": (dict(policy_kwargs=dict(net_arch=dict(pi=[64]))), "net_arch", r"\['action_head', 'encoder'\]"),
     "action_mean_init too long": (
         dict(policy_kwargs=dict(action_mean_init=[0.1, 0.2])), r"action_mean_init=\[0.1, 0.2\]", "1 numbers", "Box"
     ),
-    "net_arch a list": (dict(policy_kwargs=dict(net_arch=[64, 64])), "net_arch", r"\['action_head', 'encoder'\]"),
     "trv_dim zero": (dict(policy_kwargs=dict(trv_dim=0)), "trv_dim=0", "at least 1"),
     "trv_dim a float": (dict(policy_kwargs=dict(trv_dim=2.5)), "trv_dim=2.5", "integer"),
-    "variance floor negative": (
-        dict(policy_kwargs=dict(encoder_var_floor=-1.0)), "encoder_var_floor=-1.0", "not be negative"
-    ),
+    "floor negative": (dict(policy_kwargs=dict(encoder_var_floor=-1.0)), "encoder_var_floor=-1.0", "not be negative"),
     "variance floor NaN": (dict(policy_kwargs=dict(action_var_floor=math.nan)), "action_var_floor=nan"),
 }  # fmt: skip
 
@@ -206,9 +158,6 @@ def test_a_bad_argument_is_refused_with_the_mend(case):
 def test_an_unknown_argument_is_told_with_the_nearest_name_or_its_equivalent(name, mend):
     with pytest.raises(TypeError, match=f"no argument '{name}'{mend}"):
         TDPG("TRVPolicy", **{name: 3})
-
-
-# -- files -----------------------------------------------------------------------------------------------------
 
 
 def half(path):
@@ -265,31 +214,27 @@ def test_a_damaged_model_is_told_in_a_line_that_names_it(write, tmp_path, capsys
         assert not out.exists()
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no_such_model"):
-        TDPG.load(tmp_path / "no_such_model", device="cpu")
-
-
-def test_a_model_of_ppo_is_refused(tmp_path):
-    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"TRVPolicy.*class that saved it"):
-        TDPG.load(tmp_path / "model", device="cpu")
-
-
 @pytest.mark.parametrize(("kwargs", "error", "message"), [
     (dict(env=lava(horizon=7)), ValueError, r"horizon=7.*made for horizon=5.*same shape"),
     (dict(env=lava(6)), ValueError, "use 18 or 24"),
     (dict(env=lava(), beta=-1.0), ValueError, "beta=-1.0 must be a positive number"),
     (dict(mi_estimator="mine"), ValueError, "has no networks for mi_estimator='mine'"),
-], ids=["horizon", "n_envs", "beta", "estimator"])  # fmt: skip
+    (dict(baseline="value"), ValueError, "has no networks for baseline"),
+    (dict(n_episode=100), TypeError, r"n_episode.*n_episodes"),
+], ids=lambda value: " ".join(value) if isinstance(value, dict) else "")  # fmt: skip
 def test_a_model_is_not_loaded_with_what_does_not_fit_and_not_taken_for_damaged(kwargs, error, message, tmp_path):
-    tiny_tdpg().save(tmp_path / "model")
+    tiny_tdpg(beta=math.inf).save(tmp_path / "model")
     with pytest.raises(error, match=message) as refused:
         TDPG.load(tmp_path / "model", **kwargs, device="cpu")
     assert "damaged" not in str(refused.value)
 
 
-# -- a model that stands ---------------------------------------------------------------------------------------
+def test_what_is_no_model_of_tdpg_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no_such_model"):
+        TDPG.load(tmp_path / "no_such_model", device="cpu")
+    PPO("MlpPolicy", "CartPole-v1", device="cpu").save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"TRVPolicy.*class that saved it"):
+        TDPG.load(tmp_path / "model", device="cpu")
 
 
 @pytest.mark.parametrize(("env", "message"), [
@@ -305,11 +250,6 @@ def test_an_environment_that_does_not_fit_cannot_be_set_and_leaves_the_old_one(e
     model.learn(100)
 
 
-def test_a_dict_is_refused_by_predict():
-    with pytest.raises(ValueError, match=r"(?i)observation"):
-        tiny_tdpg().predict({"a": np.zeros(2, np.float32)})
-
-
 POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete(2), lr_schedule=lambda _: 1e-3)
 
 
@@ -320,9 +260,7 @@ POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete
     (SelectionCallback, dict(mi_limit=math.nan), "mi_limit is NaN"),
     (SelectionCallback, dict(mi_limit=-0.1), "mi_limit=-0.1 must not be negative"),
     (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=0), "save_freq=0 must be at least 1"),
-    (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=-1), "save_freq=-1 must be at least 1"),
     (TRVPolicy, dict(POLICY, horizon=0), "horizon.*at least 1"),
-    (TRVPolicy, dict(POLICY, horizon=-1), "horizon.*at least 1"),
     (TRVPolicy, dict(POLICY, horizon=2.5), "horizon.*at least 1"),
 ])  # fmt: skip
 def test_a_callback_or_a_policy_of_its_own_refuses_a_bad_argument(make, kwargs, message):

@@ -50,23 +50,9 @@ def test_the_batch_has_every_field_as_a_tensor_and_does_not_change_with_the_next
         assert isinstance(getattr(batch, name), th.Tensor)
     kept = batch.costs.clone()
     buffer.reset()
+    assert (buffer.full, buffer.alive.sum(), buffer.costs.sum()) == (False, 0, 0)
     buffer.add_step(np.zeros(N, int), np.arange(N), **rows(N, 9.0))
     th.testing.assert_close(batch.costs, kept)
-
-
-def test_an_incomplete_epoch_is_not_handed_out(buffer):
-    buffer.add_step(np.zeros(N, int), np.arange(N), **rows(N, 1.0))
-    with pytest.raises(AssertionError, match="not complete"):
-        buffer.episode_batch()
-
-
-def test_a_reset_forgets_the_last_epoch(buffer):
-    buffer.add_step(np.zeros(N, int), np.arange(N), **rows(N, 5.0))
-    buffer.full = True
-    buffer.reset()
-    assert not buffer.full
-    assert buffer.alive.sum() == 0
-    assert buffer.costs.sum() == 0
 
 
 def test_the_previous_trvs_are_those_of_the_step_before_and_zero_at_the_start(buffer):
@@ -98,9 +84,6 @@ def test_where_no_episode_runs_the_encoder_has_a_density(buffer):
     stds = buffer.episode_batch().stds
     assert (stds[0] == 7).all()
     assert (stds[1:] == 1).all()  # so that the logarithm is finite
-
-
-# -- which column of the buffer an environment fills -----------------------------------------------------------------
 
 
 def test_each_environment_runs_its_share_of_a_number_of_episodes():

@@ -146,9 +146,6 @@ def test_a_published_policy_loads_and_costs_what_its_page_says(policy):
     assert mean == pytest.approx(float(stated), abs=5 if is_return else 0.06)
 
 
-# -- notebooks -------------------------------------------------------------------------------------------------
-
-
 def code_cells(notebook):
     """Return the code of each cell, in order; a notebook is JSON that contains plain Python."""
     for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
@@ -203,9 +200,6 @@ def test_a_notebook_is_kept_without_outputs(notebook):
     for cell in content["cells"]:
         if cell["cell_type"] == "code":
             assert cell["outputs"] == [] and cell["execution_count"] is None
-
-
-# -- the map of the paper --------------------------------------------------------------------------------------
 
 
 def numbers_of_the_paper(text):

@@ -20,27 +20,11 @@ from sb3_tdpg.losses import (
     ([[1.0, 1.0], [0.0, 1.0]], 10 + 40 + 160),  # a dead step does not count, but its episode does
 ])  # fmt: skip
 def test_the_policy_gradient_loss_sums_over_time_and_averages_over_episodes(alive, total):
-    log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]])
-    assert policy_gradient_loss(log_prob, 10 * log_prob, th.tensor(alive)).item() == total / 2
-
-
-def test_the_loss_is_a_cost_that_falls_when_expensive_samples_become_less_likely():
-    log_prob = th.zeros(1, 2, requires_grad=True)
-    policy_gradient_loss(log_prob, th.tensor([[5.0, -5.0]]), th.ones(1, 2)).backward()
-    assert log_prob.grad[0, 0] > 0 > log_prob.grad[0, 1]
-
-
-def test_no_gradient_flows_into_the_advantages():
-    advantages = th.ones(2, 2, requires_grad=True)
-    policy_gradient_loss(th.ones(2, 2, requires_grad=True), advantages, th.ones(2, 2)).backward()
-    assert advantages.grad is None
-
-
-def test_shapes_that_would_broadcast_are_refused():
-    with pytest.raises(AssertionError):
-        policy_gradient_loss(th.ones(3, 4), th.ones(3, 1), th.ones(3, 4))
-    with pytest.raises(AssertionError):
-        information_loss(th.ones(3, 1))
+    log_prob = th.tensor([[1.0, 2.0], [3.0, 4.0]], requires_grad=True)
+    loss = policy_gradient_loss(log_prob, 10 * log_prob, th.tensor(alive))
+    assert loss.item() == total / 2
+    loss.backward()  # none of it flows into the advantages
+    th.testing.assert_close(log_prob.grad, 10 * log_prob.detach() * th.tensor(alive) / 2)
 
 
 def test_a_negative_estimate_of_the_information_is_neither_rewarded_nor_followed():

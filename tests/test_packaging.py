@@ -85,7 +85,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-def test_the_wheel_holds_every_module_environment_template_and_hyperparameter_file(wheel: Path) -> None:
+def test_the_wheel_holds_every_module_template_and_hyperparameter_file_and_nothing_else(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {"sb3_tdpg/py.typed", "sb3_tdpg/hub/card.md"}
     expected |= {f"sb3_tdpg/{path.relative_to(REPOSITORY)}" for path in REPOSITORY.glob("envs/**/*.py")}
@@ -95,25 +95,20 @@ def test_the_wheel_holds_every_module_environment_template_and_hyperparameter_fi
     assert any(name.endswith(".yml") for name in expected)
     assert "sb3_tdpg/report/templates/report.md" in expected
     assert expected <= names, f"missing from the wheel: {sorted(expected - names)}"
+    assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"sb3_tdpg"}
 
 
-def test_the_wheel_installs_nothing_but_sb3_tdpg_at_the_top(wheel: Path) -> None:
-    top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"sb3_tdpg"}
-
-
-def test_the_installed_wheel_has_its_own_files_and_the_version_that_it_reports(installed: Path, tmp_path: Path) -> None:
+def test_the_installed_wheel_makes_lava_from_its_own_files_and_tells_its_version(
+    installed: Path, tmp_path: Path
+) -> None:
     show = (
         "import importlib.metadata; print(sb3_tdpg.__file__, sb3_tdpg.envs.__file__, sb3_tdpg.hyperparams.__file__, "
         "importlib.metadata.version('sb3_tdpg'), sb3_tdpg.__version__, sep='\\n')"
     )
-    *files, packaged, reported = run(installed, "-c", IMPORT_ALL + show, cwd=tmp_path).splitlines()[-5:]
+    code = IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA + "; " + show
+    *files, packaged, reported = run(installed, "-c", code, cwd=tmp_path).splitlines()[-5:]
     assert all(Path(file).is_relative_to(installed.parents[1]) for file in files), files
     assert packaged == reported
-
-
-def test_the_installed_wheel_makes_the_lava_environment(installed: Path, tmp_path: Path) -> None:
-    run(installed, "-c", IMPORT_ALL + NOTHING_ELSE + MAKE_LAVA, cwd=tmp_path)
 
 
 def test_the_installed_wheel_does_not_get_in_the_way_of_a_checkout(installed: Path) -> None:
@@ -132,7 +127,6 @@ QUICKSTART_MAKES = (
     "results/report-CartPole-v1/report.html",
     "ball.gif",
     "logs/tdpg/Lava-v0_1/Lava-v0.zip",
-    "results/sweep-Lava-v0/selected.zip",
 )
 
 

@@ -27,9 +27,12 @@ def test_an_epoch_makes_so_many_passes_over_minibatches_of_whole_episodes(encode
     assert model._n_updates == 3
 
 
-def test_no_minibatch_is_left_with_a_single_episode():
+def test_every_episode_is_in_one_minibatch_of_a_pass_and_none_is_left_alone():
     model = train_epochs(tiny_tdpg(n_episodes=17, batch_size=40, clip_range=0.2), 1)
-    assert sorted(len(part) for part in model._minibatches(model.rollout_buffer.episode_batch())) == [5, 6, 6]
+    parts = model._minibatches(model.rollout_buffer.episode_batch())
+    assert sorted(len(part) for part in parts) == [5, 6, 6]
+    columns = th.cat(list(parts)).tolist()
+    assert sorted(columns) == list(range(17)) != columns
 
 
 @pytest.mark.parametrize(("env", "settings"), [
@@ -40,13 +43,6 @@ def test_no_minibatch_is_left_with_a_single_episode():
 def test_a_minibatch_has_two_columns_at_least(env, settings):
     model = TDPG(env=toy_vec_env(**env), device="cpu", seed=0, **settings)
     assert model.learn(model.epoch_size).epoch == 1
-
-
-def test_every_episode_is_in_one_minibatch_of_a_pass():
-    model = train_epochs(tiny_tdpg(**PASSES), 1)
-    columns = th.cat(list(model._minibatches(model.rollout_buffer.episode_batch())))
-    assert sorted(columns.tolist()) == list(range(20))
-    assert columns.tolist() != list(range(20))
 
 
 @pytest.mark.parametrize("beta", [math.inf, 1 / 75])

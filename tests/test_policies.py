@@ -26,6 +26,9 @@ ACTION_SPACES = {
     "discrete": spaces.Discrete(4),
     "multi_discrete": spaces.MultiDiscrete([2, 3]),
     "multi_binary": spaces.MultiBinary(3),
+    "scalar": spaces.Box(-1, 1, (), np.float32),
+    "binary matrix": spaces.MultiBinary((2, 3)),
+    "discrete matrix": spaces.MultiDiscrete(np.array([[2, 3], [4, 5]])),
 }
 
 
@@ -49,9 +52,6 @@ def step_through(policy, observations, deterministic):
         trvs.append(state[0])
     policy.step = original
     return np.stack(actions), np.stack(trvs), recorded
-
-
-# -- predict and the batched pass ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("gate", [True, False], ids=["gate", "no gate"])
@@ -160,36 +160,24 @@ def test_environments_at_different_time_steps_in_one_call_equal_separate_calls(t
     np.testing.assert_array_equal(next_t, t + 1)
 
 
-def test_a_single_observation_gives_a_single_action_and_equals_a_batch_of_one():
-    policy = make_policy()
-    observations = np.random.default_rng(0).normal(size=(T, 3)).astype(np.float32)
-    single, batch = None, None
-    for observation in observations:
-        action, single = policy.predict(observation, single, deterministic=True)
-        batched, batch = policy.predict(observation[None], batch, deterministic=True)
-        assert action.shape == (2,)
-        np.testing.assert_array_equal(action, batched[0])
-    assert policy.predict(observations[0], None, np.ones(1, bool))[0].shape == (2,)
-
-
-def test_an_episode_beyond_the_horizon_is_refused_with_the_mend():
-    policy = make_policy()
-    state = None
+@pytest.mark.parametrize("time_varying", [True, False])
+def test_beyond_the_horizon_a_policy_goes_on_if_its_steps_share_their_weights(time_varying):
+    policy, observation, state = make_policy(time_varying=time_varying), np.zeros((N, 3), np.float32), None
     for _ in range(T):
-        _, state = policy.predict(np.zeros((N, 3), np.float32), state)
-    with pytest.raises(
-        ValueError, match=rf"step {T + 1} of an episode.*{T} steps.*episode_start=True.*time_varying=Fa"
-    ):
-        policy.predict(np.zeros((N, 3), np.float32), state)
-    policy.predict(np.zeros((N, 3), np.float32), state, np.ones(N, bool))
+        _, state = policy.predict(observation, state)
+    if time_varying:
+        mend = rf"step {T + 1} of an episode.*{T} steps.*episode_start=True.*time_varying=Fa"
+        with pytest.raises(ValueError, match=mend):
+            policy.predict(observation, state)
+        policy.predict(observation, state, np.ones(N, bool))
+    else:
+        assert policy.predict(observation, state)[1][1].tolist() == [T + 1] * N
 
 
-def test_a_policy_whose_steps_share_their_weights_goes_on_beyond_the_horizon():
-    policy = make_policy(time_varying=False)
-    state = None
-    for _ in range(3 * T):
-        _, state = policy.predict(np.zeros((N, 3), np.float32), state)
-    assert state[1].tolist() == [3 * T] * N
+@pytest.mark.parametrize("shape", [(4,), (N, 4), (2, 3, 3), ()])
+def test_an_observation_of_a_wrong_shape_is_refused(shape):
+    with pytest.raises(ValueError, match=r"(?i)observation.*\(3,\)"):
+        make_policy().predict(np.zeros(shape, np.float32))
 
 
 def test_a_state_for_another_number_of_environments_is_refused():
@@ -199,29 +187,19 @@ def test_a_state_for_another_number_of_environments_is_refused():
         policy.predict(np.zeros((2, 3), np.float32), state)
 
 
-@pytest.mark.parametrize("shape", [(4,), (N, 4), (2, 3, 3), ()])
-def test_an_observation_of_a_wrong_shape_is_refused(shape):
-    with pytest.raises(ValueError, match=r"(?i)observation.*\(3,\)"):
-        make_policy().predict(np.zeros(shape, np.float32))
-
-
-def test_actions_are_clipped_to_their_bounds():
-    policy = make_policy(action_space=ACTION_SPACES["lopsided"])
-    actions, _ = policy.predict(10 * np.ones((200, 3), np.float32))
-    low, high = ACTION_SPACES["lopsided"].low, ACTION_SPACES["lopsided"].high
-    assert (actions >= low).all()
-    assert (actions <= high).all()
-    assert (actions[:, 0] == low[0]).any()
-    assert (actions[:, 0] == high[0]).any()
-
-
-# -- what the policy is made of --------------------------------------------------------------------------------
-
-
 def test_weights_vary_in_time_up_to_a_horizon_and_are_shared_beyond():
-    for horizon, expected in ((MAX_TIME_VARYING_HORIZON, True), (MAX_TIME_VARYING_HORIZON + 1, False)):
-        assert make_policy(horizon=horizon, net_arch=dict(encoder=[2], action_head=[2])).time_varying == expected
-    assert not make_policy(time_varying=False).time_varying
+    for horizon in (MAX_TIME_VARYING_HORIZON, MAX_TIME_VARYING_HORIZON + 1):
+        policy = make_policy(horizon=horizon, net_arch=dict(encoder=[2], action_head=[2]))
+        assert policy.time_varying == (horizon == MAX_TIME_VARYING_HORIZON)
+
+
+@pytest.mark.parametrize("squash", [True, False])
+def test_no_observation_drives_the_trv_means_out_of_the_unit_box_unless_asked_to(squash):
+    far_off, policy = np.full((5, 3), 1e30, np.float32), make_policy(squash_trv_mean=squash)
+    means = policy.step(th.as_tensor(far_off), th.zeros(5, 2), np.zeros(5, int)).means
+    assert bool((means.abs() <= 1).all()) == squash
+    actions, state = policy.predict(far_off)
+    assert np.isfinite(policy.predict(far_off, state)[0]).all() and np.isfinite(actions).all()
 
 
 def test_the_variances_have_the_floors_and_offsets_that_were_asked_for():
@@ -261,9 +239,7 @@ def test_the_paper_s_convolutions_stand_before_the_encoder_of_small_images_and_o
         assert [layer.out_channels for layer in convolutions] == channels
         assert (policy.trv_dim, policy.gate, policy.time_varying) == ((8, False, True) if preset else (32, True, False))
     policy = make_policy(CHW)
-    dark, bright = (
-        policy.predict(np.full((1, *CHW.shape), value, np.uint8), deterministic=True)[1][0] for value in (0, 255)
-    )
+    dark, bright = (policy.predict(np.full((1, *CHW.shape), x, np.uint8), deterministic=True)[1][0] for x in (0, 255))
     assert not np.allclose(dark, bright)
 
 
@@ -290,29 +266,17 @@ def test_a_saved_policy_predicts_the_same(tmp_path):
     policy = make_policy(trv_dim=3, encoder_var_floor=0.5, time_varying=False, action_log_var_init=1.0)
     policy.save(tmp_path / "policy.zip")
     loaded = TRVPolicy.load(tmp_path / "policy.zip", device="cpu")
-    observation = np.ones((N, 3), np.float32)
     results = []
     for p in (policy, loaded):
         th.manual_seed(1)
-        results.append(p.predict(observation)[0])
+        results.append(p.predict(np.ones((N, 3), np.float32))[0])
     np.testing.assert_array_equal(*results)
-
-
-# -- spaces ----------------------------------------------------------------------------------------------------
-
-
-MORE_ACTION_SPACES = {
-    **ACTION_SPACES,
-    "scalar": spaces.Box(-1, 1, (), np.float32),
-    "binary matrix": spaces.MultiBinary((2, 3)),
-    "discrete matrix": spaces.MultiDiscrete(np.array([[2, 3], [4, 5]])),
-}
 
 
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array")  # a scalar action
 @pytest.mark.parametrize("encoder_gradient", ["score", "pathwise"])
-@pytest.mark.parametrize("space", MORE_ACTION_SPACES.values(), ids=MORE_ACTION_SPACES)
-def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encoder_gradient, tmp_path):
+@pytest.mark.parametrize("space", ACTION_SPACES.values(), ids=ACTION_SPACES)
+def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encoder_gradient):
     # ToyEnv asserts that each action is in the space.
     model = tiny_tdpg(toy_vec_env(action_space=space), encoder_gradient=encoder_gradient, beta=0.1)
     before = parameters(model.policy)
@@ -325,13 +289,10 @@ def test_every_kind_of_action_space_trains_and_gives_valid_actions(space, encode
         assert space.contains(action)
         batch, _ = model.predict(np.stack([observation] * 5), deterministic=deterministic)
         assert batch.shape == (5, *space.shape)
-    model.save(tmp_path / "model")
-    loaded = TDPG.load(tmp_path / "model", device="cpu")
-    expected, _ = model.predict(observation, deterministic=True)
-    np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], expected)
+        assert not deterministic or np.allclose(batch, action, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ACTION_SPACES)
+@pytest.mark.parametrize("name", ["box", "discrete", "multi_discrete", "multi_binary"])
 def test_the_log_probability_of_an_action_is_that_of_its_distribution(name):
     space = ACTION_SPACES[name]
     model = train_epochs(tiny_tdpg(toy_vec_env(action_space=space), beta=np.inf), 1)
@@ -380,22 +341,6 @@ def test_without_a_true_state_the_observation_is_taken_for_it(space):
     assert model.predict(space.sample())[0].shape == (1,)
 
 
-def test_no_observation_drives_the_trv_means_out_of_the_unit_box_unless_asked_to():
-    far_off = th.full((5, 3), 1e6)
-    for squash, bounded in ((True, True), (False, False)):
-        policy = make_policy(squash_trv_mean=squash)
-        means = policy.step(far_off, th.zeros(5, 2), np.zeros(5, int)).means
-        assert bool((means.abs() <= 1).all()) == bounded
-
-
-def test_the_variance_of_a_trv_levels_off_and_keeps_a_gradient_to_come_back_on():
-    policy = make_policy(encoder_log_var_init=12.0)
-    stds = policy.step(th.zeros(5, 3), th.zeros(5, 2), np.zeros(5, int)).stds
-    assert stds.max() <= np.exp(2) + 1e-2
-    stds.sum().backward()
-    assert policy.encoder.mlp.layers[-1].bias.grad.abs().max() > 0
-
-
 def test_an_action_with_a_single_value_keeps_it():
     space = spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32))
     model = TDPG(env=toy_vec_env(action_space=space, horizon=50), epoch_steps=100, batch_size=50, device="cpu", seed=0)
@@ -411,12 +356,3 @@ def test_an_extractor_may_rely_on_the_layout_of_images():
     kwargs = dict(features_extractor_class=Viewing, net_arch=dict(encoder=[4], action_head=[]))
     env = toy_vec_env(observation_space=spaces.Box(0, 255, (3, 12, 12), np.uint8))
     train_epochs(TDPG(env=env, n_episodes=4, policy_kwargs=kwargs, device="cpu"), 1)
-
-
-def test_observations_without_bounds_give_finite_actions():
-    policy = make_policy()
-    observation = np.full((4, 3), 1e30, np.float32)
-    state = None
-    for _ in range(policy.horizon):
-        actions, state = policy.predict(observation, state=state)
-        assert np.isfinite(actions).all()

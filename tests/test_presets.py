@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_problems import lava_env, tiny_tdpg, toy_vec_env, train_epochs, words
+from small_problems import lava_env, tiny_tdpg, toy_vec_env, words
 
 from sb3_tdpg import TDPG, TRVPolicy
 from sb3_tdpg.envs.scenarios import BALL_CATCH
@@ -39,6 +39,7 @@ def test_vectors_are_learnt_from_with_one_update_an_epoch():
     assert (model.beta, model.n_episodes, model.n_epochs, model.batch_size) == (1 / 75, 500, 1, None)
     assert (model.clip_range(1.0), model.encoder_gradient, model.mi_estimator) == (math.inf, "score", "logdet")
     assert not model.normalize_advantage
+    assert [model.lr_schedule(progress) for progress in (1.0, 0.0)] == pytest.approx([2e-3, 2e-5])
     assert model.rollout_buffer.n_envs == model.env.num_envs == 500
 
 
@@ -52,21 +53,6 @@ def test_images_are_learnt_from_with_ppos_passes_a_nuisance_and_a_bottleneck():
     assert (policy.features_dim, policy.trv_dim, policy.gate, policy.time_varying) == (256, 32, True, False)
     assert any(isinstance(layer, th.nn.LayerNorm) for layer in policy.features_extractor.cnn)
     assert model.env.num_envs == 160
-
-
-def test_every_default_may_be_overruled():
-    env = toy_vec_env(observation_space=IMAGE)
-    model = TDPG(
-        "TRVPolicy", env, beta=0.5, n_episodes=8, n_epochs=1, clip_range=math.inf, normalize_advantage=False,
-        encoder_gradient="score", mi_estimator="loo", device="cpu",
-    )  # fmt: skip
-    assert (model.beta, model.n_epochs, model.batch_size, model.clip_range(1.0)) == (0.5, 1, 8 * 3, math.inf)
-    assert (model.encoder_gradient, model.mi_estimator, model.normalize_advantage) == ("score", "loo", False)
-    train_epochs(model, 1)
-
-
-def test_a_cost_limit_alone_asks_for_the_weight_that_keeps_it():
-    assert tiny_tdpg(cost_limit=30.0).beta == "auto"
 
 
 def test_learning_without_a_number_of_steps_takes_the_default(monkeypatch):
@@ -96,9 +82,6 @@ def test_depth_images_are_learnt_from_with_larger_epochs_and_the_papers_grasping
     model.env.close()
     model = TDPG("TRVPolicy", "PandaGrasp-v0", device="cpu")
     assert (model.n_episodes, model.batch_size, model.env.num_envs) == (400, 200, 400)
-
-
-# -- arguments that say something of others, also when a model is loaded -----------------------------------------------
 
 
 @pytest.mark.parametrize(("given", "others"), [

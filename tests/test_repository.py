@@ -82,13 +82,6 @@ def test_read_the_docs_calls_the_makefile() -> None:
         assert targets_of(command) <= TARGETS, f"no such target: {command}"
 
 
-@pytest.mark.parametrize("name", ["bug", "proposal"])
-def test_an_issue_form_asks_at_least_one_required_question(name: str) -> None:
-    form = read_yaml(ROOT / f".github/ISSUE_TEMPLATE/{name}.yml")
-    assert form["name"] and form["description"]
-    assert any(field.get("validations", {}).get("required") for field in form["body"])
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_a_community_page_links_to_files_and_names_targets_that_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
@@ -97,11 +90,6 @@ def test_a_community_page_links_to_files_and_names_targets_that_exist(page: Path
     assert not missing
     for command in re.findall(r"`make ([a-z -]+)`", text):
         assert set(command.split()) <= TARGETS, f"no such target: make {command}"
-
-
-def test_contributing_takes_ten_steps_from_a_clone_to_a_merged_change() -> None:
-    text = (ROOT / ".github/CONTRIBUTING.md").read_text(encoding="utf-8")
-    assert re.findall(r"^(\d+)\. ", text, re.MULTILINE) == [str(i) for i in range(1, 11)]
 
 
 def test_the_citation_and_setup_cfg_have_the_version_of_the_package(metadata) -> None:

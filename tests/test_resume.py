@@ -116,31 +116,18 @@ def test_a_training_that_stopped_anywhere_goes_on_bit_for_bit(env, settings, tmp
     assert_same_training(uninterrupted, resume(env, tmp_path / "b.zip"))
 
 
-def test_a_training_may_be_resumed_more_than_once(tmp_path):
-    uninterrupted = train(make_model("lava", "mine"), 700, tmp_path / "a.zip")
-    path = tmp_path / "b.zip"
-    with pytest.raises(Stop):
-        train(make_model("lava", "mine"), 700, path, [stop_in_epoch(2)])
-    for epoch in (3, 5):
-        with pytest.raises(Stop):
-            resume("lava", path, [stop_in_epoch(epoch)])
-    assert_same_training(uninterrupted, resume("lava", path))
-
-
-def test_a_selection_goes_on_as_if_nothing_had_happened(tmp_path):
+def test_a_selection_goes_on_as_if_nothing_had_happened_twice(tmp_path):
     def selection(name):
         return SelectionCallback(mi_limit=1e3, save_path=tmp_path / name)
 
-    def train_with(name, **stop):
-        chosen = selection(name)
-        model = train(make_model("lava", "mine"), 700, tmp_path / f"{name}_checkpoint.zip", [chosen, *stop.values()])
-        return model, chosen
-
-    uninterrupted, expected = train_with("a")
+    paths = [tmp_path / f"{name}_checkpoint.zip" for name in "ab"]
+    expected, chosen = selection("a"), selection("b")
+    uninterrupted = train(make_model("lava", "mine"), 700, paths[0], [expected])
     with pytest.raises(Stop):
-        train_with("b", stop=stop_in_epoch(5))
-    chosen = selection("b")
-    resumed = resume("lava", tmp_path / "b_checkpoint.zip", [chosen])
+        train(make_model("lava", "mine"), 700, paths[1], [selection("b"), stop_in_epoch(3)])
+    with pytest.raises(Stop):
+        resume("lava", paths[1], [selection("b"), stop_in_epoch(5)])
+    resumed = resume("lava", paths[1], [chosen])
     assert_same_training(uninterrupted, resumed)
     assert chosen.best == expected.best
     expected.restore(uninterrupted)
@@ -149,20 +136,13 @@ def test_a_selection_goes_on_as_if_nothing_had_happened(tmp_path):
 
 
 def test_a_checkpoint_of_other_environments_is_refused_with_the_mend(tmp_path):
-    path = tmp_path / "c.zip"
-    train(make_model("lava_in_dummy_vec_env", "mine"), 100, path)
-    model = TDPG.load(path, env=make_vec_env("Lava-v0", n_envs=2), device="cpu")
+    model = train(make_model("lava_in_dummy_vec_env", "mine"), 100, tmp_path / "c.zip")
+    other = TDPG.load(tmp_path / "c.zip", env=make_vec_env("Lava-v0", n_envs=2), device="cpu")
     with pytest.raises(ValueError, match=r"made with 4 environments, .* has 2: resume with the same number"):
-        model.learn(100, reset_num_timesteps=False)
+        other.learn(100, reset_num_timesteps=False)
+    model.save(tmp_path / "model.zip")  # an ordinary file has no random state in it
+    TDPG.load(tmp_path / "model.zip", env=other.env, device="cpu").learn(100, reset_num_timesteps=False)
 
-
-def test_an_ordinary_file_has_no_random_state_in_it(tmp_path):
-    model = train(make_model("lava", "mine"), 100, tmp_path / "c.zip")
-    model.save(tmp_path / "model.zip")
-    assert TDPG.load(tmp_path / "model.zip", device="cpu")._random_state is None
-
-
-# -- with a real kill ------------------------------------------------------------------------------------------
 
 SCRIPT = """
     import os, signal, sys, zipfile

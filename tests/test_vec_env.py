@@ -121,13 +121,6 @@ def test_the_same_seed_gives_the_same_episodes_and_the_seed_is_used_once():
     assert not np.array_equal(first, second)
 
 
-def test_reset_options_are_refused_with_the_mend():
-    vec_env = lava_vec_env()
-    vec_env.set_options({"sensor_noise_std": 1.0})
-    with pytest.raises(ValueError, match="pass variations to its constructor"):
-        vec_env.reset()
-
-
 @pytest.mark.parametrize(("is_normalized", "wrap"), [
     (True, lambda env: VecNormalize(env, norm_reward=False)),
     (False, VecMonitor),
@@ -147,8 +140,11 @@ def test_the_model_sees_the_true_states_through_sb3s_wrappers(is_normalized, wra
     assert (abs(observations[..., 0].mean()) < 1) == is_normalized  # the mean of d is 2.5
 
 
-def test_attributes_and_methods_of_the_environment_can_be_reached():
+def test_attributes_and_methods_of_the_environment_can_be_reached_and_reset_options_are_refused():
     vec_env = lava_vec_env()
+    vec_env.set_options({"sensor_noise_std": 1.0})
+    with pytest.raises(ValueError, match="pass variations to its constructor"):
+        vec_env.reset()
     assert vec_env.get_attr("horizon") == [5] * N
     vec_env.set_attr("sensor_noise_std", 0.25)
     assert vec_env.get_attr("sensor_noise_std", indices=[0, 2]) == [0.25, 0.25]
@@ -158,25 +154,17 @@ def test_attributes_and_methods_of_the_environment_can_be_reached():
     assert vec_env.env_is_wrapped(gym.Wrapper) == [False] * N
 
 
-# -- make_episodes_env ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("env_id", ["Lava-v0", "sb3_tdpg:Lava-v0"])
-def test_an_environment_of_this_plugin_becomes_one_batch(env_id):
-    env = make_episodes_env(env_id, n_episodes=30, env_kwargs=dict(sensor_noise_std=0.2), seed=1)
-    assert isinstance(env, BatchedVecEnv)
-    assert env.num_envs == 30
-    assert env.get_attr("sensor_noise_std")[0] == 0.2
-    again = make_episodes_env(env_id, n_episodes=30, env_kwargs=dict(sensor_noise_std=0.2), seed=1)
+@pytest.mark.parametrize(("env_id", "cls", "kwargs", "n"), [
+    ("Lava-v0", BatchedVecEnv, dict(sensor_noise_std=0.2), 120),
+    ("sb3_tdpg:Lava-v0", BatchedVecEnv, dict(sensor_noise_std=0.2), 120),
+    ("Pendulum-v1", DummyVecEnv, dict(g=5.0), 40),  # the largest divisor of 120 up to 50
+])  # fmt: skip
+def test_an_environment_of_this_plugin_becomes_one_batch_and_any_other_a_dummy_vec_env(env_id, cls, kwargs, n):
+    env, again = (make_episodes_env(env_id, n_episodes=120, env_kwargs=kwargs, seed=1) for _ in range(2))
+    assert (type(env), env.num_envs) == (cls, n)
+    ((name, value),) = kwargs.items()
+    assert getattr(env.unwrapped.env if cls is BatchedVecEnv else env.envs[0].unwrapped, name) == value
     np.testing.assert_array_equal(env.reset(), again.reset())
-
-
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_any_other_environment_becomes_a_dummy_vec_env(env_id):
-    env = make_episodes_env(env_id, n_episodes=120, seed=1)
-    assert isinstance(env, DummyVecEnv)
-    assert env.num_envs == 40  # the largest divisor of 120 up to 50
-    np.testing.assert_array_equal(env.reset(), make_episodes_env(env_id, n_episodes=120, seed=1).reset())
     assert make_episodes_env(env_id, 3, n_episodes=120).num_envs == 3
 
 
@@ -226,8 +214,3 @@ def test_pictures_of_a_batch_have_no_gripper():
     env.step(np.array([[0.0], [1.5]]))
     grey = [(image == (140, 140, 150)).all(-1).any() for image in env.get_images()]
     assert grey == [False, False]
-
-
-def test_an_unknown_id_is_refused():
-    with pytest.raises(gym.error.Error, match="NoSuchEnv"):
-        make_episodes_env("NoSuchEnv-v0")

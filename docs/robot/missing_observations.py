@@ -1,4 +1,4 @@
-"""Cost on Lava when observations are missing: ``missing_observations.py PG/runs TDPG/runs FIGURE``."""
+"""Cost on Lava when observations are missing: ``missing_observations.py PG TDPG FIGURE``."""
 
 import sys
 from pathlib import Path
@@ -30,7 +30,7 @@ def main(pg: Path, tdpg: Path, figure: Path) -> None:
     """Draw the costs of every model, and print their means over the models."""
     _, axes = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
     for name, folder, colour in (("PG", pg, "C1"), ("TDPG", tdpg, "C0")):
-        models = [TDPG.load(path, device="cpu") for path in sorted(folder.glob("*/model.zip"))]
+        models = [TDPG.load(path, device="cpu") for path in sorted(folder.rglob("Lava-v0.zip"))]
         costs = np.array([[mean_cost(model, share) for share in SHARES] for model in models])
         axes.plot(SHARES, costs.T, ".", color=colour, alpha=0.6)
         axes.plot(SHARES, costs.mean(0), color=colour, label=f"{name} ({len(models)} models)")

@@ -1,4 +1,4 @@
-"""Predict whether the information penalty will improve robustness on a task, from a short sweep over cost limits."""
+"""Predict whether the information penalty will improve robustness on a task, from trainings with cost limits."""
 
 import contextlib
 import glob
@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 from tqdm import tqdm
@@ -19,17 +20,22 @@ from sb3_tdpg.common.markdown import fill_template, markdown_table
 from sb3_tdpg.common.provenance import how_made, provenance, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.evaluation import save_figure
+from sb3_tdpg.evaluation import save_figure, summary_table
+from sb3_tdpg.evaluation.figures import INK, WIDTH, import_matplotlib, legend_above, new_panels
+from sb3_tdpg.evaluation.information import information_bounds, rollout_information
 from sb3_tdpg.evaluation.statistics import interquartile_means
 from sb3_tdpg.experiments.blind import BlindVecEnv
 from sb3_tdpg.experiments.runs import Run, Task, check_folder, complete_runs, read_progress
-from sb3_tdpg.experiments.sweep import TIE, build_once, finished_row
-from sb3_tdpg.experiments.tradeoff import frontier_figure
+from sb3_tdpg.experiments.training import Training, make_training
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.presets import DEFAULTS, preset_of
+from sb3_tdpg.tdpg import TDPG
 
 SHARES = (99, 95, 90, 80)  # per cent
 NO_PENALTY, OPEN_LOOP = "no penalty", "open loop"
+N_INFORMATION = 1000  # episodes at most
+LIMIT_COLOR = "#D55E00"
+TIE = 0.01  # nats: smaller differences are chance, so that less information counts as none
 # Thresholds of the verdict, as fractions.
 IMPROVEMENT = 0.9  # of the improvement must be kept
 INFORMATION = 0.1  # of the information may be kept: with more information, no limit has made a policy more robust
@@ -93,7 +99,7 @@ def frontier(
         shared.pop("policy")
     if n_timesteps is not None or block is None:
         shared["n_timesteps"] = n_timesteps or 1
-    model, _, length = build_once(lambda: _task(env_id, block, shared, NO_PENALTY, 0, out)[0])
+    model, _, length = _build(_task(env_id, block, shared, NO_PENALTY, 0, out)[0])
     if n_timesteps is None and block is None:
         preset = preset_of(model.observation_space, model.horizon)
         length = shared["n_timesteps"] = DEFAULTS[preset].total_epochs * model.epoch_size
@@ -104,13 +110,13 @@ def frontier(
         )
     keys = [(label, seed) for label in labels for seed in range(n_seeds)]
     tasks = [_task(env_id, block, shared, label, seed, out) for label, seed in keys]
-    build_once(lambda: tasks[-1][0])
+    _build(tasks[-1][0])
     for task in tasks:
         check_folder(*task, n_eval_episodes)
     with threads(1):
         complete_runs(tasks, n_eval_episodes=n_eval_episodes, jobs=jobs)
         measured = tqdm(zip(tasks, keys, strict=True), "measuring the information", len(tasks), unit="run")
-        rows = [finished_row(task, n_eval_episodes, {"label": key[0]}) for task, key in measured]
+        rows = [_measure(task, label, n_eval_episodes) for task, (label, _) in measured]
     runs = pd.DataFrame(rows)
     first = np.mean([read_progress(folder)["rollout/ep_cost_mean"].iloc[0] for _, folder, _ in tasks[:n_seeds]])
     used = tasks[0][0].settings.get("env_kwargs") or {}  # includes the keywords of the block
@@ -129,6 +135,47 @@ def _task(env_id: str, block: str | None, shared: Mapping[str, Any], label: str,
     run = Run(label.replace("%", "per cent"), env_id, block, seed, {**shared, **own})
     scenario = Scenario("Training", env_id, sensor=BlindVecEnv if label == OPEN_LOOP else None)
     return run, out / "runs" / run.folder_name, [scenario]
+
+
+def _build(run: Run) -> Training:
+    """Build the model of a run, to find errors in the settings before any training."""
+    try:
+        training = make_training(run.env_id, run.settings, seed=0, device="cpu")
+    except gym.error.Error as e:
+        raise ValueError(f"env={run.env_id!r} cannot be made: {e}") from e
+    except KeyError as e:
+        raise ValueError(f"{e.args[0]}: choose one with --block") from e
+    except TypeError as e:
+        raise ValueError(f"the settings of block {run.block!r} do not fit: {e}") from e
+    assert training.model.env is not None
+    training.model.env.close()
+    return training
+
+
+def _measure(task: Task, label: str, n_eval_episodes: int) -> dict[str, Any]:
+    """Measure the cost and the information of a finished run; save and return its row of ``runs.csv``."""
+    run, folder, (scenario,) = task
+    path = folder / "row.json"
+    if path.exists():
+        return json.loads(path.read_text())
+    records = pd.read_csv(folder / "episodes.csv")
+    costs = summary_table(records).iloc[0]
+    model = TDPG.load(folder / "model.zip", device="cpu")
+    scenario = scenario.with_kwargs(**(run.settings.get("env_kwargs") or {}))
+    n_episodes = min(N_INFORMATION, max(n_eval_episodes, model.policy.trv_dim + 2))
+    upper, lower = information_bounds(rollout_information(model, scenario, n_episodes))
+    row = dict(
+        label=label,
+        seed=run.seed,
+        cost=float(costs["mean"]),
+        std=float(costs["std"]),
+        information=upper,
+        information_lower=lower,
+        met_block_limits=bool(records["selected"].iloc[0]),
+        folder=folder.name,
+    )
+    write_atomically(path, json.dumps(row))
+    return row
 
 
 def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
@@ -240,7 +287,7 @@ def _write(
     write_frame_atomically(table, out / "frontier.csv")
     write_run_config(out / "config.json", {**config, "runs": [*runs["folder"]]})
     best = knee(table)
-    save_figure(frontier_figure(runs, table, best), out / "frontier.png")
+    save_figure(_figure(runs, table, best), out / "frontier.png")
 
     def column(name: str, form: Callable[[float], str]) -> list[str]:
         ends = zip(*(table[f"{name}{end}"].map(form) for end in ("", "_low", "_high")), table["seeds"], strict=True)
@@ -269,3 +316,33 @@ def _write(
     )
     write_atomically(out / "frontier.md", summary)
     return summary
+
+
+def _figure(runs: pd.DataFrame, table: pd.DataFrame, knee: str | None) -> Any:
+    """Draw a dot for each run, the means with their intervals, the open loop and the knee, if there is one."""
+    matplotlib = import_matplotlib()
+    figure, ((axes,),) = new_panels(WIDTH * 0.75, 4.2)
+    start, end = table.iloc[0], table.iloc[-1]
+    points = table.iloc[:-1]
+    shades = matplotlib.colormaps["viridis_r"](np.linspace(0.12, 1.0, len(points) - 1))
+    axes.plot(points["nats"], points["cost"], color=INK, linewidth=0.8, zorder=2)
+    mixture: dict[str, Any] = dict(color=LIMIT_COLOR, linestyle=(0, (1, 2)), linewidth=1.2, zorder=1)
+    axes.plot([start["nats"], 0], [start["cost"], end["best"]], label="mixtures of the two", **mixture)
+    sizes = np.linspace(9, 5, len(points))  # different sizes keep overlapping points visible
+    for color, size, (_, row) in zip([INK, *shades], sizes, points.iterrows(), strict=True):
+        seeds = runs[runs["label"] == row["label"]]
+        axes.plot(seeds["information"], seeds["cost"], ".", color=color, markersize=5, alpha=0.6, zorder=3)
+        errors = [[[row[n] - row[f"{n}_low"]], [row[f"{n}_high"] - row[n]]] for n in ("nats", "cost")]
+        style: dict[str, Any] = dict(fmt="o", color=color, markersize=size, capsize=2, elinewidth=1, zorder=4)
+        axes.errorbar(row["nats"], row["cost"], yerr=errors[1], xerr=errors[0], label=row["label"], **style)
+        if row["label"] == knee:
+            ring: dict[str, Any] = dict(facecolors="none", edgecolors=LIMIT_COLOR, linewidths=2, zorder=5)
+            axes.scatter(row["nats"], row["cost"], s=170, label="knee", **ring)
+    axes.scatter(0, end["best"], marker="D", s=90, color=LIMIT_COLOR, zorder=3, label="best open loop")
+    axes.axhline(end["best"], color=LIMIT_COLOR, linestyle=(0, (4, 3)), linewidth=1, zorder=1)
+    axes.margins(x=0.04, y=0.08)
+    axes.grid(alpha=0.25)
+    axes.set_xlabel("information in the TRVs (nat)", fontsize=9)
+    axes.set_ylabel("mean episode cost", fontsize=9)
+    legend_above(figure, axes, 5)
+    return figure

@@ -25,7 +25,6 @@ from sb3_tdpg.common.processes import process_pool
 from sb3_tdpg.common.provenance import check_same_config, write_frame_atomically, write_run_config
 from sb3_tdpg.common.threads import usable_cores
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.episodic import TrainingDivergedError
 from sb3_tdpg.evaluation import evaluate_scenarios
 from sb3_tdpg.experiments.training import make_training, take_env
 from sb3_tdpg.hyperparams import load_hyperparams
@@ -266,13 +265,7 @@ def read_progress(folder: Path) -> pd.DataFrame:
     return log.assign(**{"time/iterations": range(1, len(log) + 1)})  # in a resumed log the numbers start from 1 again
 
 
-def complete_runs(
-    tasks: Sequence[Task],
-    *,
-    n_eval_episodes: int = 1000,
-    jobs: int | None = None,
-    failures: dict[str, str] | None = None,
-) -> None:
+def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: int | None = None) -> None:
     """
     Complete runs (see :func:`complete_run`) with a progress bar, ``jobs`` at a time (default: the number of cores).
 
@@ -300,10 +293,7 @@ def complete_runs(
                 raise ValueError(f"these runs wait for each other: {[task[0].folder_name for task in waiting]}")
             for future in wait(running, timeout=1.0, return_when=FIRST_COMPLETED).done:
                 folder = running.pop(future)
-                if failures is not None and isinstance(error := future.exception(), TrainingDivergedError):
-                    failures[folder.name] = str(error)
-                else:
-                    future.result()
+                future.result()
                 unfinished.remove(folder)
                 n_epochs += _count_epochs(folder)
                 progress.update()

@@ -27,10 +27,10 @@ from sb3_tdpg.callbacks import SelectionCallback
 from sb3_tdpg.common.files import write_atomically
 from sb3_tdpg.common.provenance import check_same_config, with_numbers, write_frame_atomically, write_run_config
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
-from sb3_tdpg.experiments.studies import DONE, REASON, open_storage, open_study, work
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.zoo.manager import TDPGExperimentManager
 from sb3_tdpg.zoo.search import Space, put_in, read_space, relevant, sample
+from sb3_tdpg.zoo.studies import DONE, REASON, open_storage, open_study, work
 
 N_EVALUATIONS = 10
 BEHIND = "behind the others"  # reason why a trial without an error is pruned

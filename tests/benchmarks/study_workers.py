@@ -21,9 +21,9 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS
 
 import optuna
 
-from sb3_tdpg.experiments.studies import open_storage, open_study, work
 from sb3_tdpg.experiments.training import make_training
 from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.zoo.studies import open_storage, open_study, work
 
 GOAL = 1.8  # times as fast with two workers
 N_TRIALS = 12

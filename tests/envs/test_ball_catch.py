@@ -33,9 +33,6 @@ def run_episode(env, controls, seed=0):
     return np.array(states), np.array(observations), np.array(costs)
 
 
-# -- the dynamics and the costs by hand ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("reading", "robot", "fall"), [
     ("text", (2 / 15, 1 / 15), (7.196, 6.542)),
     ("published", (0.2, 0.1), (7.85 - 9.8 / 15, 7.85 - 2 * 9.8 / 15)),
@@ -67,12 +64,6 @@ def test_the_ball_goes_from_eight_metres_to_where_the_reading_has_it_at_the_end(
     assert costs[-1] == pytest.approx(100 * (1.0 + lands))
 
 
-def test_a_robot_that_drives_straight_to_the_landing_point_pays_for_its_controls_only():
-    env = BallCatchEnv(robot_range=(-2.0, -2.0))
-    _, _, costs = run_episode(env, [1.5] * 25)
-    np.testing.assert_allclose(costs, 0.015, atol=1e-9)
-
-
 def test_an_episode_starts_with_the_robot_anywhere_in_its_range_and_the_ball_at_its_launch():
     states = BallCatchEnv().initial_state(20_000)
     np.testing.assert_allclose(np.quantile(states[:, 0], [0, 0.25, 0.5, 0.75, 1]), [-2, -1, 0, 1, 2], atol=0.05)
@@ -88,9 +79,6 @@ def test_a_launch_that_varies_fills_its_ranges_and_moves_the_landing_point():
     lands = states[:, 1] + states[:, 3] * env.horizon * env.dt
     assert lands.std() > 0.5
     assert -1.34 < lands.min() < lands.max() < 2.34
-
-
-# -- what the camera sees ------------------------------------------------------------------------------------
 
 
 def test_the_observation_is_an_image_of_sky_wall_floor_and_ball():
@@ -109,45 +97,32 @@ def test_the_observation_is_an_image_of_sky_wall_floor_and_ball():
     assert (abs(columns - 32) < 4).all()
 
 
-def test_the_ball_grows_as_it_comes_nearer():
-    env = BallCatchEnv(robot_range=(0, 0))
-    _, observations, _ = run_episode(env, [0.0] * 20)
+def test_the_ball_grows_as_it_comes_nearer_and_the_wall_moves_with_the_robot():
+    _, observations, _ = run_episode(BallCatchEnv(robot_range=(0, 0)), [0.0] * 20)
     sizes = [ball_pixels(image).sum() for image in observations]
     assert 3 <= sizes[0] <= 9
     assert sizes[19] > 3 * sizes[8] > 0
-
-
-def test_the_wall_moves_with_the_robot_and_the_floor_does_not():
-    at = {d: BallCatchEnv(robot_range=(d, d)).reset(seed=0)[0] for d in (-1.0, 1.0)}
-    assert (at[-1.0][:, 10:50] != at[1.0][:, 10:50]).mean() > 0.3
-    np.testing.assert_array_equal(at[-1.0][:, 62:], at[1.0][:, 62:])
+    left, right = (BallCatchEnv(robot_range=(d, d)).reset(seed=0)[0] for d in (-1.0, 1.0))
+    assert (left[:, 10:50] != right[:, 10:50]).mean() > 0.3
+    np.testing.assert_array_equal(left[:, 62:], right[:, 62:])  # the floor
 
 
 def test_the_renderer_changes_neither_states_nor_costs():
     controls = np.random.default_rng(0).normal(size=25)
-    for keywords in ({}, dict(pixel_noise_std=0.1)):
-        states, _, costs = run_episode(BallCatchEnv(renderer="pybullet", **keywords), controls)
-        fast_states, _, fast_costs = run_episode(BallCatchEnv(**keywords), controls)
-        np.testing.assert_array_equal(fast_states, states)
-        np.testing.assert_array_equal(fast_costs, costs)
+    (states, _, costs), (fast_states, _, fast_costs) = (
+        run_episode(BallCatchEnv(renderer=renderer, pixel_noise_std=0.1), controls) for renderer in ("pybullet", "fast")
+    )
+    np.testing.assert_array_equal(fast_states, states)
+    np.testing.assert_array_equal(fast_costs, costs)
 
 
-# -- noise ---------------------------------------------------------------------------------------------------
-
-
-def test_pixel_noise_has_the_standard_deviation_that_was_asked_for():
-    clean = BallCatchEnv(robot_range=(0, 0), texture=np.full((4, 4, 3), 128, np.uint8)).reset(seed=0)[0]
-    noise = dict(pixel_noise_std=0.05, noise_mode="clip")
-    noisy = BallCatchEnv(robot_range=(0, 0), texture=np.full((4, 4, 3), 128, np.uint8), **noise).reset(seed=0)[0]
-    difference = (noisy.astype(float) - clean) / 255
-    assert difference[:, 20:50].std() == pytest.approx(0.05, rel=0.03)
-    assert abs(difference[:, 20:50].mean()) < 0.003
-
-
-def test_pixels_with_noise_are_rounded_to_the_nearest_byte():
-    keywords = dict(renderer="fast", noise_mode="clip")
-    clean, noisy = (BallCatchEnv(pixel_noise_std=std, **keywords).reset(seed=0)[0] for std in (0.0, 1e-4))
-    np.testing.assert_array_equal(noisy, clean)  # the noise is a fortieth of a byte
+def test_pixel_noise_has_the_standard_deviation_that_was_asked_for_and_is_rounded_to_bytes():
+    keywords = dict(texture=np.full((4, 4, 3), 128, np.uint8), noise_mode="clip")
+    clean, tiny, noisy = (BallCatchEnv(pixel_noise_std=std, **keywords).reset(seed=0)[0] for std in (0.0, 1e-4, 0.05))
+    difference = (noisy.astype(float) - clean)[:, 20:50] / 255
+    assert difference.std() == pytest.approx(0.05, rel=0.03)
+    assert abs(difference.mean()) < 0.003
+    np.testing.assert_array_equal(tiny, clean)  # a fortieth of a byte is rounded away
 
 
 def test_minmax_spreads_each_image_over_the_whole_range_and_clip_leaves_its_contrast():
@@ -167,23 +142,13 @@ def test_minmax_spreads_each_image_over_the_whole_range_and_clip_leaves_its_cont
     assert contrast(images["clip"]) > 0.7 * contrast(clean)
 
 
-# -- the interface -------------------------------------------------------------------------------------------
-
-
 def test_two_environments_in_one_process_do_not_disturb_each_other():
-    controls = np.random.default_rng(0).normal(size=6)
-    _, alone, _ = run_episode(BallCatchEnv(renderer="pybullet"), controls)
-    env = BallCatchEnv(renderer="pybullet")
+    env, controls = BallCatchEnv(renderer="pybullet"), np.random.default_rng(0).normal(size=6)
+    _, alone, _ = run_episode(env, controls)
     other = BallCatchEnv(renderer="pybullet", texture="blue_tiles", ball_color=(1, 1, 0))
-    assert env._world.client.client_id != other._world.client.client_id
-    observation, _ = env.reset(seed=0)
-    beside = [observation]
-    other.reset(seed=9)
-    for u in controls:
-        other.step(np.array([-u]))
-        beside.append(env.step(np.array([u]))[0])
+    run_episode(other, -controls, seed=9)
+    np.testing.assert_array_equal(run_episode(env, controls)[1], alone)
     other.close()
-    np.testing.assert_array_equal(np.array(beside), alone)
     np.testing.assert_array_equal(env.reset(seed=0)[0], alone[0])
 
 
@@ -210,9 +175,6 @@ def test_the_camera_image_in_the_picture_is_the_observation():
     assert not np.array_equal(env.render()[:, :512], picture[:, :512])
 
 
-# -- scenarios -----------------------------------------------------------------------------------------------
-
-
 def test_table_two_has_its_twelve_rows_and_each_can_be_made():
     assert len(BALL_CATCH) == len(BALL_CATCH_VARYING_LAUNCH) == 12
     noise = [row.env_kwargs["pixel_noise_std"] for row in BALL_CATCH if "pixel_noise_std" in row.env_kwargs]
@@ -220,22 +182,14 @@ def test_table_two_has_its_twelve_rows_and_each_can_be_made():
     assert [row.env_kwargs["texture"] for row in BALL_CATCH if "texture" in row.env_kwargs] == list(TEST_TEXTURES)
     for row in BALL_CATCH + BALL_CATCH_VARYING_LAUNCH:
         gym.make(row.env_id, **row.with_kwargs(**BALL_PUBLISHED_READING).env_kwargs).close()
-    for row in BALL_CATCH:
+    for row, ours in zip(BALL_CATCH, BALL_CATCH_VARYING_LAUNCH, strict=True):
+        assert (ours.name, dict(ours.env_kwargs)) == (row.name, {**row.env_kwargs, **BALL_VARYING_LAUNCH})
+        assert not ours.paper
         for result in row.paper.values():
             assert result.std is None
             # The cost is 100 times the distance and a little for the controls; but for a misprint of the paper.
             if row.name != "Test background 6":
                 assert result.mean == pytest.approx(100 * result.distance, abs=2)
-
-
-def test_the_rows_of_the_varying_launch_differ_from_table_two_in_the_launch_alone():
-    for row, ours in zip(BALL_CATCH, BALL_CATCH_VARYING_LAUNCH, strict=True):
-        assert ours.name == row.name
-        assert dict(ours.env_kwargs) == {**row.env_kwargs, **BALL_VARYING_LAUNCH}
-        assert not ours.paper
-
-
-# -- walls ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "P"])

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
-from small_problems import words
+from small_problems import LinearProblem, words
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg import TDPG, BatchedVecEnv, make_episodes_env
 from sb3_tdpg.envs import ENTRY_POINTS
 from sb3_tdpg.envs.ball_catch import BallCatchEnv
-from sb3_tdpg.envs.base import POMDPEnv
 from sb3_tdpg.envs.bullet import BulletClient
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.panda_grasp import PandaGraspEnv
@@ -66,6 +64,8 @@ def test_every_registered_environment_is_reproducible_from_its_seed(env_id):
 def test_an_episode_stays_in_the_state_space_pays_its_cost_and_is_terminated_at_the_horizon(env_id):
     env = gym.make(env_id)
     horizon, state_space = env.unwrapped.horizon, env.unwrapped.state_space
+    assert (len(env.unwrapped.state_names),) == state_space.shape
+    assert all(re.fullmatch(r".+ \(.+\)", name) for name in env.unwrapped.state_names)  # with a unit
     for seed in range(20):
         env.action_space.seed(seed)
         _, info = env.reset(seed=seed)
@@ -77,13 +77,6 @@ def test_an_episode_stays_in_the_state_space_pays_its_cost_and_is_terminated_at_
             ends.append(end)
         assert state_space.contains(info["state"])
         assert ends == [[False, False]] * (horizon - 1) + [[True, False]]  # and never truncated
-
-
-@EVERY_ID
-def test_every_component_of_the_state_has_a_name_with_a_unit(env_id):
-    env = gym.make(env_id).unwrapped
-    assert (len(env.state_names),) == env.state_space.shape
-    assert all(re.fullmatch(r".+ \(.+\)", name) for name in env.state_names)
 
 
 @EVERY_ID
@@ -133,42 +126,8 @@ def test_drawing_does_not_change_an_episode(env_id):
     drawn.close()
 
 
-def still_ball(**kwargs):
-    """Ball catching that draws no number but for noise."""
-    return BallCatchEnv(robot_range=(0.5, 0.5), **kwargs)
-
-
-@pytest.mark.parametrize("vectorise", [
-    lambda make, **kwargs: DummyVecEnv([lambda: make(**kwargs)]),
-    lambda make, **kwargs: BatchedVecEnv(make(**kwargs), 1),
-], ids=["DummyVecEnv", "BatchedVecEnv"])  # fmt: skip
-@pytest.mark.parametrize(("make", "perturbation"), [
-    (LavaEnv, dict(sensor_noise_std=50.0)),
-    (still_ball, dict(pixel_noise_std=0.2)),
-    (still_ball, dict(pixel_noise_std=0.2, noise_mode="clip")),
-    (still_ball, dict(texture="violet_dots")),
-], ids=words)  # fmt: skip
-def test_a_perturbation_reaches_the_observation_in_every_episode_and_never_the_true_state(
-    make, perturbation, vectorise
-):
-    def run(**kwargs):
-        env = vectorise(make, horizon=4, **kwargs)
-        env.seed(0)
-        observations, states = [env.reset()[0]], [env.reset_infos[0]["state"]]
-        for _ in range(11):
-            observation, _, dones, infos = env.step(np.full((1, 1), 0.3))
-            observations.append(observation[0])
-            states.append(env.reset_infos[0]["state"] if dones[0] else infos[0]["state"])
-        return np.array(observations), np.array(states)
-
-    observations, states = run(**perturbation)
-    clean_observations, clean_states = run(**dict.fromkeys(perturbation.keys() & {"sensor_noise_std"}, 0.0))
-    np.testing.assert_array_equal(states, clean_states)
-    assert ((observations != clean_observations).reshape(12, -1).mean(axis=1) > 0.3).all()
-
-
 @pytest.mark.parametrize("make", [
-    lambda: still_ball(pixel_noise_std=0.1),
+    lambda: BallCatchEnv(robot_range=(0.5, 0.5), pixel_noise_std=0.1),
     lambda: PandaGraspEnv(depth_noise_std=0.3, xy_half_width=0.0, yaw_range=(0.0, 0.0)),
 ], ids=["ball", "panda"])  # fmt: skip
 def test_noise_follows_the_seed_differs_between_images_and_stays_in_the_space(make):
@@ -183,10 +142,12 @@ def test_noise_follows_the_seed_differs_between_images_and_stays_in_the_space(ma
 
 
 OF_SCENES = {
+    LavaEnv: [(dict(sensor_noise_std=50.0), True), (dict(action_cost=1.0), False)],
     BallCatchEnv: [
-        *((dict(keywords, renderer=renderer), True) for renderer in ("pybullet", "fast") for keywords in (
+        *((keywords, True) for keywords in (
             dict(ball_color=(1.0, 0.0, 1.0)), dict(ball_radius=1.0), dict(camera_height=1.5), dict(camera_pitch=20.0),
-            dict(fov=70.0), dict(texture="random-3"),
+            dict(fov=70.0), dict(texture="random-3"), dict(pixel_noise_std=0.2),
+            dict(pixel_noise_std=0.2, noise_mode="clip"),
         )),
         (dict(gravity=5.0), False),
     ],
@@ -200,10 +161,10 @@ OF_SCENES = {
 @pytest.mark.parametrize(
     ("make", "keywords", "changes"), [(make, *row) for make, rows in OF_SCENES.items() for row in rows], ids=words
 )
-def test_a_keyword_of_the_scene_changes_the_image_one_of_the_physics_does_not_and_neither_the_state(
+def test_a_keyword_of_the_scene_changes_the_observation_one_of_the_physics_does_not_and_neither_the_state(
     make, keywords, changes
 ):
-    plain, other = make(**{k: v for k, v in keywords.items() if k == "renderer"}), make(**keywords)
+    plain, other = make(), make(**keywords)
     (expected_image, expected), (image, info) = (env.reset(seed=0) for env in (plain, other))
     assert np.array_equal(image, expected_image) != changes
     np.testing.assert_array_equal(info["state"], expected["state"])
@@ -306,21 +267,14 @@ def test_actions_of_another_shape_are_refused_and_not_counted(env_id):
     assert dones == [False] * (env.horizon - 1) + [True]
 
 
-# -- what the constructors refuse ------------------------------------------------------------------------------------
-
-CAMERA_RANGE = r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1"
-CAMERA_SHIFT = r"camera_shift=.* must leave the camera within 0.1 m of its usual height"
 REFUSED = {
     LavaEnv: [
         (dict(sensor_noise_std=-0.1), "sensor_noise_std=-0.1 must be finite and not negative"),
         (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
         (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
-        (dict(horizon=2.5), "horizon=2.5 must be an integer of at least 1"),
         (dict(max_action=0.0), "max_action=0.0 must be finite and positive"),
-        (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
-        (dict(action_cost=np.nan), "action_cost=nan must be finite"),
-        (dict(lava_stage_cost=np.inf), "lava_stage_cost=inf must be finite"),
-        (dict(lava_terminal_cost=np.nan), "lava_terminal_cost=nan must be finite"),
+        *(({name: np.nan}, f"{name}=nan must be finite")
+          for name in ("action_cost", "lava_stage_cost", "lava_terminal_cost")),
         (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
         (dict(start_beta=(0.0, 1.0)), r"start_beta=\(0.0, 1.0\) must be two positive numbers"),
         (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
@@ -330,49 +284,39 @@ REFUSED = {
         (dict(noise_mode="max"), r"noise_mode='max' must be one of \['minmax', 'clip'\]"),
         (dict(renderer="opengl"), r"renderer='opengl' must be one of \['pybullet', 'fast'\]"),
         (dict(n_processes=0), "n_processes=0 must be"),
-        (dict(dt=0.0), "dt=0.0 must be finite and positive"),
-        (dict(control_gain=-1.0), "control_gain=-1.0 must be finite and positive"),
         (dict(gravity=np.inf), "gravity=inf must be finite"),
-        (dict(max_action=np.inf), "max_action=inf must be finite and positive"),
+        *(({name: 0.0}, f"{name}=0.0 must be finite and positive")
+          for name in ("dt", "control_gain", "max_action", "ball_radius", "camera_height")),
         (dict(robot_range=(1.0, -1.0)), r"robot_range=\(1.0, -1.0\) must be \(low, high\)"),
-        (dict(robot_range=2.0), r"robot_range=2.0 must be \(low, high\)"),
         (dict(ball_start_range=(8.0, 1.0)), r"ball_start_range=\(8.0, 1.0\) must be \(\(low_x, low_y\)"),
         (dict(ball_speed_range=((-4, 8), (-5, 8))), r"ball_speed_range=.* must be \(\(low_x, low_y\).* low <= high"),
         (dict(ball_color=(0, 255, 0)), r"ball_color=\(0, 255, 0\) must be \(red, green, blue\), each between 0 and 1"),
-        (dict(ball_radius=0.0), "ball_radius=0.0 must be finite and positive"),
-        (dict(camera_height=-1.0), "camera_height=-1.0 must be finite and positive"),
         (dict(camera_pitch=90.0), "camera_pitch=90.0 must be between -90 and 90 degrees"),
         (dict(fov=np.nan), "fov=nan must be between 0 and 180 degrees"),
         (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
         (dict(texture="bricks"), r"texture='bricks' is unknown: use one of \['brick', 'blue_tiles', .*'red_planks'\]"),
         (dict(texture=np.zeros((8, 8), np.uint8)), r"shape \(8, 8\) and dtype uint8; expected \(height, width, 3\)"),
-        (dict(texture=np.zeros((8, 8, 3))), "dtype float64; expected"),
     ],
     PandaGraspEnv: [
         (dict(xy_half_width=-0.1), "xy_half_width=-0.1 must be between 0 and 0.15 m"),
         (dict(yaw_range=(1.0, -1.0)), r"yaw_range=\(1.0, -1.0\) must be \(low, high\) of finite numbers in rad"),
-        (dict(yaw_range=(0.0, np.inf)), "yaw_range=.* must be"),
         (dict(mug_scale=0.0), "mug_scale=0.0 must be between 0.5 and 1.5"),
         (dict(frame_offset=1.0), "frame_offset=1.0 must be between -0.05 and 0.05 m"),
         (dict(friction=-1.0), "friction=-1.0 must be finite and not negative"),
         (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
         (dict(motion="slow"), r"motion='slow' must be one of \['fast', 'reference'\]"),
         (dict(depth_noise_std=-0.1), "depth_noise_std=-0.1 must be finite and not negative"),
-        (dict(render_mode="ansi"), r"render_mode='ansi' must be None or one of \['rgb_array', 'human'\]"),
-        *((dict(camera_range=value), CAMERA_RANGE)
-          for value in [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05, (0.0,)]),
-        (dict(camera_shift=0.11), CAMERA_SHIFT),
-        (dict(camera_shift=np.nan), CAMERA_SHIFT),
-        (dict(camera_shift=0.08, camera_range=(-0.03, 0.03)), CAMERA_SHIFT),
+        *((dict(camera_range=value), r"camera_range=.* must be None or \(low, high\) in m, -0.1 <= low <= high <= 0.1")
+          for value in [(-0.2, 0.0), (0.01, -0.01), (0.0, np.nan), ("a", "b"), 0.05]),
+        *((keywords, "camera_shift=.* must leave the camera within 0.1 m of its usual height")
+          for keywords in [dict(camera_shift=np.nan), dict(camera_shift=0.08, camera_range=(-0.03, 0.03))]),
     ],
     PandaSqueezeEnv: [
         (dict(friction=-0.1), "friction=-0.1 must be between 0 and 1"),
         (dict(centring_error=0.01), "centring_error=0.01 must be between 0 and 0.0035 m: else a jaw may come down"),
         (dict(tolerance=0.3), "tolerance=0.3 must be between 0 and 0.2 rad"),
         (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite and not negative"),
-        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
         (dict(n_processes=0), "n_processes=0 must be an integer of at least 1"),
-        (dict(render_mode="human"), "render_mode='human' must be None or one of"),
     ],
     SqueezeInsertEnv: [
         (dict(turn=(0.9, 1.1)), r"turn\[1\]=1.1 must be between 0 and 1: a squeeze does not turn the part too far"),
@@ -380,14 +324,10 @@ REFUSED = {
         (dict(basin=2.0), "basin=2.0 must be between 0 and 1.5708 rad"),
         (dict(tolerance=-0.1), "tolerance=-0.1 must be finite and not negative"),
         (dict(sensor_noise_std=np.nan), "sensor_noise_std=nan must be finite"),
-        (dict(horizon=0), "horizon=0 must be an integer of at least 1"),
     ],
     PegCornerEnv: [
-        (dict(friction=-1.0), "friction=-1.0 must be finite"),
-        (dict(tolerance=-1.0), "tolerance=-1.0 must be finite"),
-        (dict(sensor_noise_std=-1.0), "sensor_noise_std=-1.0 must be finite"),
-        (dict(max_action=-1.0), "max_action=-1.0 must be finite"),
-        (dict(actuator_gain=-1.0), "actuator_gain=-1.0 must be finite"),
+        ({name: -1.0}, f"{name}=-1.0 must be finite")
+        for name in ("friction", "tolerance", "sensor_noise_std", "max_action", "actuator_gain")
     ],
 }  # fmt: skip
 
@@ -400,12 +340,6 @@ def test_the_constructor_refuses_a_bad_keyword_and_names_the_mend(make, keywords
         make(**keywords)
 
 
-@pytest.mark.parametrize("make", REFUSED, ids=words)
-def test_a_misspelt_keyword_is_not_swallowed(make):
-    with pytest.raises(TypeError, match="sensor_nois"):
-        make(sensor_nois=0.1)
-
-
 def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no_such_wall.png'.*no such image file"):
         BallCatchEnv(texture=tmp_path / "no_such_wall.png")
@@ -415,42 +349,16 @@ def test_a_missing_or_broken_texture_file_is_an_error_that_names_it(tmp_path):
             BallCatchEnv(texture=kind(tmp_path / name))
 
 
-class Switch(POMDPEnv):
-    """Two actions, and a cost of 1 for the wrong one."""
-
-    def __init__(self):
-        super().__init__(horizon=3)
-        self.state_space = self.observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self.action_space = spaces.Discrete(2)
-
-    def initial_state(self, n):
-        return self.np_random.choice([-1.0, 1.0], (n, 1))
-
-    def dynamics(self, state, action):
-        return state
-
-    def sensor(self, state):
-        return state.astype(np.float32)
-
-    def cost(self, state, action):
-        return (action != (state[:, 0] > 0)).astype(float)
-
-    def terminal_cost(self, state):
-        return np.zeros(len(state))
-
-
-def test_actions_may_have_two_dimensions():
-    env = Switch()
+def test_actions_may_have_two_dimensions_or_be_discrete():
+    env = LinearProblem()
     env.action_space, env.cost = spaces.Box(-1, 1, (2, 2)), lambda state, action: action[:, 0, 1]
+    env.dynamics, env.terminal_cost = lambda state, action: state, lambda state: np.zeros(len(state))
     env.reset()
     assert env.step(np.array([[0.0, 0.5], [0.0, 0.0]]))[1] == -0.5
-
-
-def test_actions_may_be_discrete():
-    env = Switch()
-    observation, _ = env.reset(seed=0)
-    assert [env.step(action)[1] for action in (0, 1)] == [-1.0, 0.0] if observation[0] > 0 else [0.0, -1.0]
-    env = BatchedVecEnv(Switch(), 100)
+    env.action_space, env.cost = spaces.Discrete(2), lambda state, action: (action != (state[:, 0] > 0)).astype(float)
+    _, info = env.reset(seed=0)
+    assert [env.step(action)[1] for action in (0, 1)] == [-1.0, 0.0] if info["state"] > 0 else [0.0, -1.0]
+    env = BatchedVecEnv(env, 100)
     model = TDPG("TRVPolicy", env, n_episodes=100, beta=math.inf, learning_rate=1e-2, seed=0, device="cpu")
-    model.learn(100 * 3 * 30)
-    assert model.rollout_buffer.episode_costs.mean() < 0.8  # 1.5 by chance
+    model.learn(100 * 2 * 30)
+    assert model.rollout_buffer.episode_costs.mean() < 0.5  # 1.0 by chance

@@ -37,35 +37,13 @@ def camera():
     camera.close()
 
 
-def reference_depth(states, *, size, projection, from_row=0, from_column=0):
-    """Depth by PyBullet of the whole scene, table included, cut to 128 x 128."""
-    client = BulletClient()
-    client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
-    mug = add_mug_picture(client, SCENE)
-    view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
-    images = []
-    for x, y, z, yaw in states.tolist():
-        client.resetBasePositionAndOrientation(mug, (x, y, z), client.getQuaternionFromEuler((0, 0, yaw)))
-        buffer = client.getCameraImage(
-            size, size, view, projection(client), shadow=0, renderer=client.ER_TINY_RENDERER
-        )[3]  # fmt: skip
-        far = 998.6538  # 1000 m in the single precision of the projection
-        depth = far * NEAR / (far - (far - NEAR) * np.asarray(buffer, np.float64).reshape(size, size))
-        images.append(depth[from_row : from_row + IMAGE_SIZE, from_column : from_column + IMAGE_SIZE])
-    client.close()
-    return np.array(images)
-
-
-# -- geometry --------------------------------------------------------------------------------------------------------
-
-
 def test_the_eye_is_where_it_is_by_hand(camera):
     np.testing.assert_allclose(camera.eye, EYE, atol=1e-6)
     np.testing.assert_allclose(-camera.rotation[2], AXIS, atol=1e-6)
 
 
 @pytest.mark.parametrize("point", [
-    (0.5, 0.0, 0.0), (0.44, 0.04, 0.0), (0.6, -0.13, 0.0), (0.56, 0.06, 0.0), (0.42, -0.04, 0.0)
+    (0.5, 0.0, 0.0), (0.6, -0.13, 0.0), (0.42, -0.04, 0.0)
 ], ids=str)  # fmt: skip
 def test_a_point_of_the_table_has_the_depth_computed_by_hand(camera, point):
     nowhere = np.array([[0.5, 0.0, -1.0, 0.0]])  # the mug below the table
@@ -92,14 +70,10 @@ def test_points_of_the_mug_have_the_depths_computed_by_hand(camera, yaw):
         assert image[0, round(row), round(column)] == pytest.approx(depth, abs=0.002)
 
 
-def test_one_sees_into_the_mug(camera):
-    state = np.array([[0.5, 0.012, 0.0, 0.0]])  # its axis through (0.5, 0)
-    (image,) = camera.images(state)
+def test_one_sees_into_the_mug_and_the_handle_where_the_yaw_has_it(camera):
+    (image,) = camera.images(np.array([[0.5, 0.012, 0.0, 0.0]]))  # its axis through (0.5, 0)
     row, column, lid = pixel(camera, (0.5, 0.0, 0.081))
     assert image[0, round(row), round(column)] > lid + 0.01
-
-
-def test_the_handle_is_seen_where_the_yaw_has_it(camera):
     for yaw in (0.3, 0.8, 1.2):  # towards the camera
         (image,) = camera.images(np.array([[0.5, 0.0, 0.0, yaw]]))
         outermost = 0.0805 * 1.134 - 0.012  # from the frame's origin to the outer side of the handle
@@ -110,26 +84,21 @@ def test_the_handle_is_seen_where_the_yaw_has_it(camera):
         assert camera.table_depth()[round(row), round(column)] > depth + 0.02
 
 
-# -- against PyBullet's picture of the whole scene -------------------------------------------------------------------
-
-
-def test_the_mug_before_the_known_table_is_what_pybullet_draws_of_both(camera):
-    states = random_states(20, half_width=0.075)
-    edges = (-0.0035555558, 0.0035555558, -0.0023333333, 0.003)
-    whole = reference_depth(
-        states, size=IMAGE_SIZE, projection=lambda c: c.computeProjectionMatrix(*edges, NEAR, FAR)
-    )  # fmt: skip
-    np.testing.assert_allclose(camera.images(states)[:, 0], whole, atol=1e-5)
-
-
-def test_the_image_is_a_part_of_a_larger_one_with_a_field_of_view_of_90_degrees(camera):
-    states = random_states(3, seed=1, half_width=0.075)
-    part = reference_depth(
-        states, size=480, projection=lambda c: c.computeProjectionMatrixFOV(90.0, 4 / 3, NEAR, FAR),
-        from_row=168, from_column=176,
-    )  # fmt: skip
-    difference = abs(camera.images(states)[:, 0] - part)
-    assert np.quantile(difference, 0.99) < 1e-5  # but for pixels on the outline of the mug
+def test_the_image_is_a_part_of_what_pybullet_draws_of_mug_and_table_with_a_field_of_view_of_90_degrees(camera):
+    states = random_states(10, half_width=0.075)
+    client = BulletClient()
+    client.loadURDF(TABLE_FILE, TABLE_POSITION, useFixedBase=True)
+    mug = add_mug_picture(client, SCENE)
+    view = client.computeViewMatrixFromYawPitchRoll(TARGET, DISTANCE, YAW, PITCH, 0.0, 2)
+    projection = client.computeProjectionMatrixFOV(90.0, 4 / 3, NEAR, FAR)
+    far = 998.6538  # 1000 m in the single precision of the projection
+    for (image,), (x, y, z, yaw) in zip(camera.images(states), states.tolist(), strict=True):
+        client.resetBasePositionAndOrientation(mug, (x, y, z), client.getQuaternionFromEuler((0, 0, yaw)))
+        buffer = client.getCameraImage(480, 480, view, projection, shadow=0, renderer=client.ER_TINY_RENDERER)[3]
+        depth = far * NEAR / (far - (far - NEAR) * np.asarray(buffer, np.float64).reshape(480, 480))
+        part = depth[168 : 168 + IMAGE_SIZE, 176 : 176 + IMAGE_SIZE]
+        assert np.quantile(abs(image - part), 0.99) < 1e-5  # but for pixels on the outline of the mug
+    client.close()
 
 
 def test_depths_are_in_metres_within_the_space_and_finite():
@@ -145,26 +114,10 @@ def test_depths_are_in_metres_within_the_space_and_finite():
     env.close()
 
 
-def test_an_image_does_not_depend_on_those_before_it(camera):
-    states = random_states(10, half_width=0.075)
-    images = camera.images(states)
-    np.testing.assert_array_equal(camera.images(states[::-1])[::-1], images)
-    another = DepthCamera(SCENE)
-    np.testing.assert_array_equal(another.images(states[4:5])[0], images[4])
-    another.close()
-
-
-# -- noise -----------------------------------------------------------------------------------------------------------
-
-
-def test_depth_noise_has_the_standard_deviation_asked_for_and_leaves_the_state_alone():
+def test_depth_noise_has_the_standard_deviation_asked_for():
     clean, noisy = PandaGraspEnv(), PandaGraspEnv(depth_noise_std=0.01)
-    for seed in (0, 1):
-        expected, expected_info = clean.reset(seed=seed)
-        observation, info = noisy.reset(seed=seed)
-        np.testing.assert_array_equal(info["state"], expected_info["state"])
-        assert (observation - expected).std() == pytest.approx(0.01, rel=0.03)
-        assert abs((observation - expected).mean()) < 3e-4
-        assert observation.dtype == np.float32
-    clean.close()
-    noisy.close()
+    (expected, _), (observation, _) = (env.reset(seed=0) for env in (clean, noisy))
+    assert (observation - expected).std() == pytest.approx(0.01, rel=0.03)
+    assert abs((observation - expected).mean()) < 3e-4
+    assert observation.dtype == np.float32
+    clean.close(), noisy.close()

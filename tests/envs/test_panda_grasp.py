@@ -9,16 +9,9 @@ from panda_oracle import action_for, mixed_actions, oracle_actions, random_state
 from sb3_tdpg.envs.panda_grasp import NOMINAL_GRASP, PandaGraspEnv
 
 
-@pytest.fixture
-def env():
-    env = PandaGraspEnv()
-    yield env
-    env.close()
-
-
 @pytest.fixture(scope="module")
 def shared():
-    """For tests that need no fresh environment: outcomes do not depend on the trials before."""
+    """One environment for all tests: outcomes do not depend on the trials before."""
     env = PandaGraspEnv()
     yield env
     env.close()
@@ -28,15 +21,6 @@ def outcomes(env, states, actions):
     """Final states (N, 4) and contacts (N,)."""
     step = env.step_batch(np.asarray(states), np.asarray(actions), is_last=True)
     return step.state, np.array([more["contacts"] for more in step.details])
-
-
-def single_grasp(env, state, action):
-    env.reset()
-    env._state = np.array([state], dtype=np.float64)
-    return env.step(np.asarray(action))
-
-
-# -- what lifts the mug ----------------------------------------------------------------------------------------------
 
 
 def test_a_grasp_at_the_rim_never_fails_over_200_poses(shared):
@@ -61,20 +45,14 @@ def test_a_grasp_in_empty_air_always_fails_and_leaves_the_mug_where_it_was(share
         assert not any(more["success"] or more["contacts"] for more in step.details)
 
 
-def test_the_cost_is_one_up_to_a_height_of_five_centimetres(shared):
-    heights = np.array([0.0, 0.05, 0.0501, 0.2])
-    states = np.c_[np.zeros((4, 2)), heights, np.zeros(4)]
+def test_the_cost_is_one_up_to_a_height_of_five_centimetres(shared, monkeypatch):
+    states = np.array([[0.0, 0.0, height, 0.0] for height in (0.0, 0.05, 0.0501, 0.2)])
     np.testing.assert_array_equal(shared.terminal_cost(states), [1, 1, 0, 0])
     np.testing.assert_array_equal(shared.cost(states, np.zeros((4, 4))), 0)
-
-
-def test_a_mug_up_to_five_centimetres_above_the_table_is_no_success(shared, monkeypatch):
-    heights = np.array([0.0, 0.03, 0.05, 0.0501])
-    ends = np.c_[np.zeros((4, 2)), heights, np.zeros(4)]
-    monkeypatch.setattr(shared, "_shared", lambda *_, **__: [(end, 0) for end in ends])
+    monkeypatch.setattr(shared, "_shared", lambda *_, **__: [(state, 0) for state in states])
     shared.dynamics(np.zeros((4, 4)), np.zeros((4, 4)))
-    assert [more["success"] for more in shared._details] == [False, False, False, True]
-    assert [more["is_success"] for more in shared._details] == [False, False, False, True]
+    for name in ("success", "is_success"):
+        assert [more[name] for more in shared._details] == [False, False, True, True]
 
 
 def test_without_friction_nothing_is_lifted(shared):
@@ -94,9 +72,6 @@ def test_the_paper_s_slow_motion_lifts_the_mug_too_and_has_the_fast_one_s_result
     away = action_for(np.tile([0.64, 0.14, 0.06, 0.5], (2, 1)))
     np.testing.assert_array_equal(slow.step_batch(states[:2] - [0.1, 0.1, 0, 0], away, is_last=True).cost, 1.0)
     slow.close()
-
-
-# -- the mug ---------------------------------------------------------------------------------------------------------
 
 
 def hit_from_above(env, state, point):
@@ -157,11 +132,6 @@ def test_the_handle_can_block_a_grasp(shared):
     assert [fails(np.pi / 12 + off) for off in (-0.1, 0.0, 0.1)] == [1, 1, 1]
 
 
-def test_all_shapes_of_the_mug_arrive_in_bullet(shared):
-    assert len(shared._world.simulation.client.getCollisionShapeData(shared._world.simulation._body, -1)) == 16
-    assert len(shared.scene.collision_shapes()) == 16
-
-
 def test_the_mug_stands_still_when_nothing_touches_it(shared):
     state = np.array([0.5, 0.02, 0.0, 0.4])
     shared._world.simulation._restore(state)
@@ -170,18 +140,14 @@ def test_the_mug_stands_still_when_nothing_touches_it(shared):
     np.testing.assert_allclose(shared._world.simulation._mug_state(0.4), state, atol=5e-4)
 
 
-# -- actions ---------------------------------------------------------------------------------------------------------
-
-
-def test_an_action_is_a_tenth_around_the_nominal_grasp_and_is_clipped_to_the_bounds(env):
-    state = [0.5, 0.0, 0.0, 0.0]
-    info = single_grasp(env, state, [0.3, -0.2, 0.1, 1.0])[4]
-    np.testing.assert_allclose(info["grasp"], [0.53, -0.02, 0.07, np.pi / 6 + 0.1], atol=1e-7)
-    for beyond, bound in ((-99.0, [0.35, -0.15, 0.05, np.pi / 6 - 1]), (99.0, [0.65, 0.15, 0.16, np.pi / 6 + 1])):
-        info = single_grasp(env, state, [beyond] * 4)[4]
-        np.testing.assert_allclose(info["grasp"], bound, atol=1e-6)
-        clipped = single_grasp(env, state, action_for(bound))[4]
-        np.testing.assert_allclose(info["state"], clipped["state"], atol=1e-6)
+def test_an_action_is_a_tenth_around_the_nominal_grasp_and_is_clipped_to_the_bounds(shared):
+    low, high = [0.35, -0.15, 0.05, np.pi / 6 - 1], [0.65, 0.15, 0.16, np.pi / 6 + 1]
+    actions = [[0.3, -0.2, 0.1, 1.0], [-99.0] * 4, [99.0] * 4, *action_for([low, high])]
+    step = shared.step_batch(np.tile([0.5, 0.0, 0.0, 0.0], (5, 1)), np.array(actions), is_last=True)
+    grasps = [more["grasp"] for more in step.details]
+    np.testing.assert_allclose(grasps[0], [0.53, -0.02, 0.07, np.pi / 6 + 0.1], atol=1e-7)
+    np.testing.assert_allclose(grasps[1:], [low, high] * 2, atol=1e-6)
+    np.testing.assert_allclose(step.state[1:3], step.state[3:], atol=1e-6)
 
 
 def test_the_hand_gets_to_where_the_action_says_all_over_the_action_space(shared):
@@ -200,21 +166,22 @@ def hand_position(simulation, joints):
     return np.array(simulation.client.getLinkState(simulation._robot, 8, computeForwardKinematics=True)[4])
 
 
-# -- an outcome depends on state and action alone ----------------------------------------------------------------------
-
-
-def test_outcomes_do_not_depend_on_the_order_of_trials_nor_on_the_environment(env):
+def test_outcomes_do_not_depend_on_the_order_of_trials_nor_on_other_environments(shared):
     states = random_states(60, seed=6)
     actions = mixed_actions(states)
-    expected, contacts = outcomes(env, states, actions)
+    expected, contacts = outcomes(shared, states, actions)
+    images = shared.sensor(states[:6])
     assert 0.2 < (expected[:, 2] > 0.05).mean() < 0.8
     order = np.random.default_rng(0).permutation(60)
-    other = PandaGraspEnv()
-    for again in (env, other):
+    beside, other = PandaGraspEnv(), PandaGraspEnv(mug_scale=1.2, friction=0.9, frame_offset=0.0)
+    outcomes(other, states[:6] + 0.01, actions[:6])
+    other.sensor(states[:1])
+    for again in (shared, beside):
         shuffled, shuffled_contacts = outcomes(again, states[order], actions[order])
         np.testing.assert_array_equal(shuffled, expected[order])
         np.testing.assert_array_equal(shuffled_contacts, contacts[order])
-    other.close()
+        np.testing.assert_array_equal(again.sensor(states[:6]), images)
+    beside.close(), other.close()
 
 
 IN_ANOTHER_PROCESS = """
@@ -236,18 +203,3 @@ def test_outcomes_and_images_are_the_same_in_another_process(shared):
     final, sums = json.loads(run_python("-c", IN_ANOTHER_PROCESS, input=given).splitlines()[-1])
     np.testing.assert_array_equal(final[::-1], expected)
     np.testing.assert_array_equal(sums[::-1], shared.sensor(states).sum(axis=(1, 2, 3), dtype=float))
-
-
-def test_two_environments_in_one_process_do_not_disturb_each_other(env):
-    states = random_states(6, seed=8)
-    actions = mixed_actions(states)
-    alone, _ = outcomes(env, states, actions)
-    images = env.sensor(states)
-    other = PandaGraspEnv(mug_scale=1.2, friction=0.9, frame_offset=0.0)
-    for i in range(6):
-        outcomes(other, states[i : i + 1] + 0.01, actions[i : i + 1])
-        other.sensor(states[:1])
-        np.testing.assert_array_equal(outcomes(env, states[i : i + 1], actions[i : i + 1])[0][0], alone[i])
-        np.testing.assert_array_equal(env.sensor(states[i : i + 1])[0], images[i])
-    other.close()
-    np.testing.assert_array_equal(outcomes(env, states, actions)[0], alone)

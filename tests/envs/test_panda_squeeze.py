@@ -30,11 +30,8 @@ def squeeze(env, state, jaws):
 
 
 def episode(env, *jaws):
-    """The infos of an episode whose jaws have the given yaws in degrees."""
+    """The infos of an episode; the yaws of the jaws are in degrees."""
     return [env.step(np.array([yaw * DEGREE]))[4] for yaw in jaws]
-
-
-# -- the funnel ------------------------------------------------------------------------------------------------------
 
 
 def test_a_part_within_the_basin_turns_to_the_jaws_for_any_yaw_of_the_hand(env):
@@ -97,7 +94,6 @@ def test_the_fit_of_the_batched_model_holds(env):
     assert fit.aligned_up_to < fit.across_from
     assert fit.residual < 0.5 * DEGREE
     assert 0.02 < fit.stuck < 0.09
-    SqueezeInsertEnv(**PANDA_SQUEEZE)
 
 
 def test_the_fit_finds_the_keywords_of_the_batched_model():
@@ -114,27 +110,18 @@ def test_the_fit_finds_the_keywords_of_the_batched_model():
         fit_angles(away, away * 0.0)
 
 
-# -- episodes --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("yaw", [-80.0, -25.0, 20.0, 65.0])
-def test_squeezing_without_looking_inserts_the_part(env, yaw):
+@pytest.mark.parametrize(("yaw", "jaws", "is_inserted"), [
+    *((yaw, (45.0, 55.0, 0.0, 0.0), True) for yaw in (-80.0, -25.0, 65.0)), (80.0, (0.0, 0.0, 0.0, 0.0), False)
+])  # fmt: skip
+def test_squeezing_without_looking_inserts_the_part_unless_it_lies_across_the_slot(env, yaw, jaws, is_inserted):
     env.reset(seed=1)
     env._state = parts(yaw)
-    infos = episode(env, 45.0, 55.0, 0.0, 0.0)
-    assert infos[-1]["success"] and infos[-1]["is_success"]
-    assert infos[-1]["height"] < 0.003
-    assert set(infos[-2]) == {"state", "cost", "offset", "tilt"}
-    assert set(infos[-1]) == {"state", "cost", "offset", "tilt", "success", "is_success", "height"}
-
-
-def test_a_part_across_the_slot_is_not_inserted(env):
-    env.reset(seed=1)
-    env._state = parts(80.0)
-    info = episode(env, 0.0, 0.0, 0.0, 0.0)[-1]
-    assert not info["success"] and not info["is_success"]
-    assert info["height"] > 0.015
-    assert info["cost"] > 100 * (89 * DEGREE - 0.05)
+    *_, before, last = episode(env, *jaws)
+    assert last["success"] == last["is_success"] == is_inserted
+    assert last["height"] < 0.003 if is_inserted else last["height"] > 0.015
+    assert set(before) == {"state", "cost", "offset", "tilt"}
+    assert set(last) == {*before, "success", "is_success", "height"}
+    assert is_inserted or last["cost"] > 100 * (89 * DEGREE - 0.05)
 
 
 def test_the_cost_is_the_batched_model_s_of_the_engine_s_yaw(env):
@@ -153,21 +140,7 @@ def test_a_policy_for_the_batched_model_fits_this_environment(env):
         assert getattr(env, name) == getattr(model, name)
 
 
-def test_closing_gives_the_worlds_of_the_physics_and_of_the_pictures_back():
-    env = PandaSqueezeEnv(render_mode="rgb_array")
-    env.reset(seed=0)
-    env.render()
-    worlds = (env._world, env._view)
-    env.close()
-    for world in worlds:
-        with pytest.raises(RuntimeError, match="closed"):
-            world.client.getNumBodies()
-
-
-# -- the slot --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("tolerance", [0.02, 0.05, 0.1])
+@pytest.mark.parametrize("tolerance", [0.02, 0.1])
 def test_the_slot_forgives_its_tolerance_and_no_more(tolerance):
     env = PandaSqueezeEnv(tolerance=tolerance)
     angles = tolerance * np.array([-1.3, -1.1, -0.95, -0.5, 0.0, 0.5, 0.95, 1.1, 1.3])
@@ -177,23 +150,18 @@ def test_the_slot_forgives_its_tolerance_and_no_more(tolerance):
 
 
 def test_the_corners_of_a_part_turned_by_the_tolerance_meet_the_edge_of_the_chamfer():
-    for tolerance in (0.03, 0.05, 0.2):
-        boxes = SqueezeScene(0.05, tolerance).slot_boxes()
+    for tolerance in (0.03, 0.2):
         # The high wall of a long side begins where the chamfer ends.
-        edge = min(abs(box["position"][1]) - box["half_extents"][1] for box in boxes if is_high_long_wall(box))
-        corner = complex(PART[0] / 2, PART[1] / 2) * complex(math.cos(tolerance), math.sin(tolerance))
-        assert edge == pytest.approx(corner.imag)
-
-
-def is_high_long_wall(box):
-    return box["position"][1] != 0 and box["euler"] == (0.0, 0.0, 0.0) and box["half_extents"][2] == 0.01
+        edge = min(
+            abs(box["position"][1]) - box["half_extents"][1]
+            for box in SqueezeScene(0.05, tolerance).slot_boxes()
+            if box["position"][1] != 0 and box["euler"] == (0.0, 0.0, 0.0) and box["half_extents"][2] == 0.01
+        )
+        assert edge == pytest.approx(PART[0] / 2 * math.sin(tolerance) + PART[1] / 2 * math.cos(tolerance))
 
 
 def test_a_part_is_inserted_below_three_millimetres():
     assert [Inserted(height, 0.0).success for height in (-1e-3, 0.0029, 0.0031, 0.01)] == [True, True, False, False]
-
-
-# -- an outcome depends on nothing else ------------------------------------------------------------------------------
 
 
 def test_squeezes_do_not_depend_on_their_order(env):
@@ -214,10 +182,6 @@ def test_half_a_turn_of_the_hand_changes_nothing_and_the_wrist_stays_within_its_
         assert abs(low[6]) < 1.6 and abs(high[6]) < 1.6
         assert low[6] - high[6] == pytest.approx(simulation._low[6] - simulation._high[6])
         np.testing.assert_allclose(simulation._turned(yaw + math.pi + 1e-9)[0], low, atol=1e-6)
-        simulation._put_arm(low)
-        orientation = simulation.client.getLinkState(simulation._robot, 8, computeForwardKinematics=True)[5]
-        along = simulation._axes(orientation)[:2, 0]
-        assert abs(math.cos(yaw) * along[0] + math.sin(yaw) * along[1]) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_a_film_shows_the_last_squeeze_and_the_insertion(env):
@@ -233,6 +197,10 @@ def test_a_film_shows_the_last_squeeze_and_the_insertion(env):
     assert all((pictures[0] != other).any() for other in pictures[1:])
     orange = (pictures[0][..., 0] > 150) & (pictures[0][..., 2] < 60)
     assert orange.sum() > 200  # the part is visible
+    worlds = (watched._world, watched._view)
     watched.close()
+    for world in worlds:  # of the physics and of the pictures
+        with pytest.raises(RuntimeError, match="closed"):
+            world.client.getNumBodies()
     with pytest.raises(ValueError, match="must be 'rgb_array' for a video"):
         next(env.film())

@@ -55,6 +55,6 @@ def test_the_picture_shows_peg_hole_and_fence():
     env._state = np.array([[5.0, 5.0]])
     image = env.render()
     rows, columns = np.nonzero((image == (45, 90, 190)).all(-1))
-    assert (rows.mean() < 60, columns.mean() > 140) == (True, True)  # up and to the right
+    assert rows.mean() < 60 and columns.mean() > 140  # up and to the right
     rows, columns = np.nonzero((image == (90, 90, 95)).all(-1))
-    assert (rows.mean() > 130, columns.mean() < 70) == (True, True)
+    assert rows.mean() > 130 and columns.mean() < 70

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv, wrap
+from sb3_tdpg.envs.squeeze_insert import SqueezeInsertEnv
 
 DEGREE = math.pi / 180
 
@@ -41,8 +41,7 @@ def test_an_incomplete_squeeze_leaves_a_share_of_the_angle():
     env = SqueezeInsertEnv(turn=(0.75, 0.75))
     env.reset(seed=0)
     np.testing.assert_allclose(squeeze(env, parts(40.0, -20.0), 0.0), [10.0, -5.0])
-    # From 70 degrees the part turns away, towards 90.
-    np.testing.assert_allclose(squeeze(env, parts(70.0), 0.0), [85.0])
+    np.testing.assert_allclose(squeeze(env, parts(70.0), 0.0), [85.0])  # turns away, towards 90
 
 
 def test_squeezing_across_and_then_along_orients_every_part_without_looking(env):
@@ -84,10 +83,6 @@ def test_parts_start_with_any_yaw():
     state, _ = env.reset_batch(20_000)
     quantiles = np.quantile(env.yaw(state) / DEGREE, [0, 0.25, 0.5, 0.75, 1])
     np.testing.assert_allclose(quantiles, [-90, -45, 0, 45, 90], atol=2)
-
-
-def test_an_angle_is_wrapped_to_half_a_turn():
-    np.testing.assert_allclose(wrap(np.array([0.0, 91.0, -91.0, 180.0]) * DEGREE) / DEGREE, [0, -89, 89, 0], atol=1e-9)
 
 
 def test_the_picture_shows_the_part_turn_and_the_fingers_after_a_squeeze():

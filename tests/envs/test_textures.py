@@ -21,15 +21,6 @@ PICTURES = {
     "random-100": (160.696, 143.650, 117.039, 9.720, 9.817, -2.315, -0.592),
     "random-101": (26.182, 149.188, 83.112, 6.914, 5.827, 0.014, 0.099),
     "random-102": (93.637, 131.449, 134.047, 8.541, 8.579, -1.162, -2.124),
-    "random-103": (47.644, 73.812, 149.917, 6.554, 6.549, 1.093, -1.154),
-    "random-104": (67.994, 145.010, 139.093, 10.197, 11.729, 5.215, 11.583),
-    "random-105": (146.843, 144.121, 94.129, 6.421, 6.419, -3.990, -0.016),
-    "random-106": (122.602, 56.410, 67.484, 7.993, 7.837, -15.949, 2.536),
-    "random-107": (69.323, 52.569, 166.841, 7.882, 7.835, 1.057, -2.022),
-    "random-108": (62.528, 148.279, 154.825, 5.807, 7.680, 0.053, -0.133),
-    "random-109": (38.421, 149.087, 157.152, 8.149, 7.898, 12.400, -2.998),
-    "random-110": (186.156, 96.574, 162.033, 9.689, 5.830, -5.394, -0.941),
-    "random-111": (86.274, 154.474, 71.268, 6.747, 7.597, -1.902, -3.898),
     "40%-violet_dots": (152.993, 97.507, 114.846, 10.271, 12.961, 1.967, 1.738),
 }
 
@@ -50,13 +41,10 @@ def test_a_wall_is_the_picture_that_the_results_were_measured_with(name):
     assert described(picture) == pytest.approx(PICTURES[name], abs=0.01)
 
 
-def test_every_wall_of_the_test_is_checked():
-    assert set(TEST_TEXTURES) < set(PICTURES)
-
-
 def test_the_built_in_textures_differ_in_hue_and_the_seventh_is_reddish_like_the_brick():
     mean = {name: load_texture(name).reshape(-1, 3).mean(axis=0) for name in ("brick", *TEST_TEXTURES)}
     assert len(TEST_TEXTURES) == 7
+    assert set(TEST_TEXTURES) < set(PICTURES)
     redness = {name: red / max(green, blue) for name, (red, green, blue) in mean.items()}
     reddish = ("brick", TEST_TEXTURES[6])
     assert min(redness[name] for name in reddish) > 1.4
@@ -85,7 +73,6 @@ def test_a_texture_is_the_same_every_time_and_a_random_one_follows_its_seed():
 def test_a_texture_continues_over_its_edges():
     for name in ("brick", *TEST_TEXTURES):
         texture = load_texture(name).astype(int)
-        inside = abs(np.diff(texture, axis=0)).mean(axis=(1, 2)).max()
-        assert abs(texture[0] - texture[-1]).mean() <= 1.1 * inside, name
-        inside = abs(np.diff(texture, axis=1)).mean(axis=(0, 2)).max()
-        assert abs(texture[:, 0] - texture[:, -1]).mean() <= 1.1 * inside, name
+        for rows in (texture, texture.transpose(1, 0, 2)):
+            inside = abs(np.diff(rows, axis=0)).mean(axis=(1, 2)).max()
+            assert abs(rows[0] - rows[-1]).mean() <= 1.1 * inside, name

@@ -84,18 +84,15 @@ def frames_of(path):
     return frames, durations
 
 
-def animate(path, *, n_trvs=2, trv=0.0, width=400, fps=10):
+def animate(path, n_trvs):
     """Record three steps with white pictures and constant TRVs."""
-    pictures = [np.full((40, width, 3), 255, np.uint8)] * 4
-    save_animation([Episode(pictures, np.full((3, n_trvs), trv), np.ones(3))], path, horizon=3, fps=fps)
+    pictures = [np.full((40, 400, 3), 255, np.uint8)] * 4
+    save_animation([Episode(pictures, np.zeros((3, n_trvs)), np.ones(3))], path, horizon=3, fps=1000)
     return path
 
 
 def costs_printed(text):
     return [float(cost) for cost in re.findall(r"episode \d+: cost (\S+)(?:,|\n)", text)]
-
-
-# -- what is printed ------------------------------------------------------------------------------------------
 
 
 def test_each_episodes_cost_and_final_state_are_printed_and_no_file_is_written(lava, tmp_path, monkeypatch, capsys):
@@ -137,16 +134,14 @@ def test_recording_does_not_change_the_episodes(ball, tmp_path):
 
 def test_keywords_of_the_environment_reach_it(ball, tmp_path, capsys):
     keywords = ["renderer=fast", "texture=violet_dots", "robot_range=[0.5, 0.5]", "control_gain=1.0e-9"]
-    command = ["enjoy", str(ball), "--env", "BallCatch-v0", "--record", str(tmp_path / "film.gif")]
+    film = tmp_path / "film.gif"
+    command = ["enjoy", str(ball), "--env", "BallCatch-v0", "--record", str(film)]
     assert main([*command, "--env-kwargs", *keywords[:2], "--env-kwargs", *keywords[2:]]) == 0
     printed = capsys.readouterr().out
     assert "final state [ 0.5 " in printed, "a robot that starts there and cannot move ends there"
-    assert f"the video is {tmp_path / 'film.gif'}\n" in printed
-    red, green, blue = frames_of(tmp_path / "film.gif")[0][0][:200, 400:500].reshape(-1, 3).mean(0)
+    assert f"the video is {film}\n" in printed
+    red, green, blue = frames_of(film)[0][0][:200, 400:500].reshape(-1, 3).mean(0)
     assert min(red, blue) > 1.2 * green, "the wall is not violet"
-
-
-# -- the film -------------------------------------------------------------------------------------------------
 
 
 def test_a_gif_has_a_frame_for_each_state_and_holds_the_last_one(lava, tmp_path):
@@ -163,6 +158,9 @@ def test_a_frame_has_the_environments_picture_above_the_lines_up_to_the_present(
     frames, _ = frames_of(tmp_path / "film.gif")
     for frame, picture in zip(frames, episode.pictures, strict=True):
         assert np.abs(frame[: len(picture)].astype(int) - picture).mean() < 4  # a GIF has 256 colours
+        # Neither the axis of the TRVs moves, nor that of the time.
+        np.testing.assert_array_equal(frame[137:, :70], frames[0][137:, :70])
+        np.testing.assert_array_equal(frame[272:], frames[0][272:])
     # The first TRV is drawn in vermillion, in columns 74 to 389; right of them is the legend.
     lines = [(np.abs(frame[127:262, 74:389].astype(int) - (0xD5, 0x5E, 0x00)).sum(-1) < 60) for frame in frames]
     reach = [np.flatnonzero(line.any(0)).max() for line in lines]
@@ -173,14 +171,6 @@ def test_a_frame_has_the_environments_picture_above_the_lines_up_to_the_present(
     assert reach[5] == reach[4], "there is no x~_T"
 
 
-def test_the_axes_do_not_move_while_the_lines_grow(lava, tmp_path):
-    enjoy(lava, "Lava-v0", n_episodes=2, record=tmp_path / "film.gif")
-    frames, _ = frames_of(tmp_path / "film.gif")
-    for frame in frames[1:]:
-        np.testing.assert_array_equal(frame[137:, :70], frames[0][137:, :70])  # ticks and label of the TRVs
-        np.testing.assert_array_equal(frame[272:], frames[0][272:])  # and of the time
-
-
 def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(own, tmp_path):
     episodes = enjoy(own, "Own-v0", n_episodes=6, record=tmp_path / "film.gif")
     assert {len(episode.signals) for episode in episodes} == {1, 3}
@@ -189,16 +179,9 @@ def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(own, tmp_path)
     assert frames[0].shape == (8 * 30 + 180, 8 * 50, 3)
 
 
-def test_the_letters_grow_with_the_picture(tmp_path):
-    panels = [frames_of(animate(tmp_path / "film.gif", width=width))[0][0][40:] for width in (400, 800)]
-    small, large = (panel.mean(-1) < 128 for panel in panels)
-    assert large.shape == (2 * small.shape[0], 2 * small.shape[1])
-    assert large.mean() == pytest.approx(small.mean(), rel=0.3)  # half as dark if letters and lines stayed as they are
-
-
 def test_only_few_trvs_have_a_legend(tmp_path):
     for n_trvs, has_legend in ((8, True), (9, False)):
-        frames, durations = frames_of(animate(tmp_path / "film.gif", n_trvs=n_trvs, fps=1000))
+        frames, durations = frames_of(animate(tmp_path / "film.gif", n_trvs))
         assert durations == [20, 20, 20, 1000]
         assert (frames[0][40 + 26 : -42, -70:].min() < 128) == has_legend
 
@@ -218,30 +201,25 @@ def test_a_grasp_is_shown_from_beginning_to_end(tmp_path):
     assert len(episode.between[0]) > 5
     assert len(frames) == len(episode.pictures) + len(episode.between[0])
     times = [time for time, _ in episode.film()]
-    assert times == sorted(times)
-    assert (times[0], times[-1]) == (0.0, 1.0)
-
-
-# -- bad input ------------------------------------------------------------------------------------------------
+    assert [times[0], *times, times[-1]] == [0.0, *sorted(times), 1.0]
 
 
 def test_keywords_are_read_as_yaml():
-    texts = ["texture=violet_dots", "a=0.2", "b=1e-3", "c=[[8.0, 1], [8, 1e0]]", "d=null", "e=true", "f=7", "g=x=y"]
-    texts += ["h='007'", "i=info", "j=-.5", "k=inf", "l=1/25"]
-    values = dict(texture="violet_dots", a=0.2, b=0.001, c=[[8.0, 1], [8, 1.0]], d=None, e=True, f=7, g="x=y")
-    values |= dict(h="007", i="info", j=-0.5, k=math.inf, l="1/25")
-    assert parse_keywords(texts) == values
-    assert [type(value) for value in parse_keywords(texts).values()] == [type(value) for value in values.values()]
+    values = {
+        "violet_dots": "violet_dots", "0.2": 0.2, "1e-3": 0.001, "[[8.0, 1], [8, 1e0]]": [[8.0, 1], [8, 1.0]],
+        "null": None, "true": True, "7": 7, "x=y": "x=y", "'007'": "007", "info": "info", "-.5": -0.5, "inf": math.inf,
+        "1/25": "1/25",
+    }  # fmt: skip
+    read = parse_keywords([f"{chr(97 + i)}={text}" for i, text in enumerate(values)])
+    assert [(type(value), value) for value in read.values()] == [(type(value), value) for value in values.values()]
 
 
 @pytest.mark.parametrize(("texts", "message"), [
     (["texture"], "'texture' is not a keyword .* key=value"),
     (["=3"], "'=3' is not a keyword"),
     (["a b=3"], "'a b=3' is not a keyword"),
-    (["a={b: 1}"], "must be a number, a text, .* or a list of these"),
-    (["a=[{b: 1}]"], "must be a number"),
+    (["a=[{b: 1}]"], "must be a number, a text, .* or a list of these"),
     (["a=[1, 2"], "must be a number"),
-    (["a=2020-01-31"], "must be a number"),
     (["a=1", "a=2"], "a is given twice"),
 ], ids=str)  # fmt: skip
 def test_a_keyword_that_cannot_be_read_is_refused(texts, message):
@@ -254,10 +232,8 @@ def test_a_keyword_that_cannot_be_read_is_refused(texts, message):
     (["--env", "BallCatch-v0", "--env-kwargs", "renderer=fast"], ["observation_space", "does not fit"]),
     (["--env", "Lava-v0", "--env-kwargs", "horizon=7"], ["horizon of 5", "has 7"]),
     (["--env", "Lava-v0", "--env-kwargs", "depth=1"], ["depth"]),
-    (["--env", "Lava-v0", "--env-kwargs", "depth"], ["'depth' is not a keyword"]),
     (["--env", "Lava-v0", "--seed", "-1"], ["seed=-1 must be an integer of at least 0"]),
     (["--env", "Lava-v0", "--record", "film.avi"], ["film.avi", "'.avi'", ".gif or .mp4"]),
-    (["--env", "Lava-v0", "--record", "film"], ["''", ".gif or .mp4"]),
     (["--env", "Lava-v0", "--record", "film.gif", "--env-kwargs", "render_mode=null"], ["None", "'rgb_array'"]),
 ], ids=str)  # fmt: skip
 def test_bad_input_is_reported_in_one_line_with_exit_code_2(arguments, fragments, lava, tmp_path, monkeypatch, capsys):
@@ -296,9 +272,6 @@ def test_ctrl_c_has_exit_code_130_and_leaves_no_file(lava, tmp_path, monkeypatch
     assert main(["enjoy", str(lava), "--env", "Lava-v0", "--record", str(tmp_path / "film.gif")]) == 130
     assert capsys.readouterr().err.strip() == "interrupted"
     assert not list(tmp_path.iterdir())
-
-
-# -- other algorithms ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("algorithm", ["A2C", "DQN", "MaskablePPO", "PPO", "RecurrentPPO", "TRPO"])

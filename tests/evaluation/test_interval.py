@@ -12,7 +12,6 @@ from sb3_tdpg.evaluation.interval import (
     LOWER_BOUNDS,
     UPPER_BOUNDS,
     _gap,
-    component_estimates,
     joint_quantile,
     limit,
     min_episodes,
@@ -180,14 +179,6 @@ def test_only_living_episodes_count_and_a_step_with_too_few_has_no_interval():
     # Nothing is left out of a sum after the last episode has ended.
     ended = information_interval(batch._replace(alive=batch.alive & (th.arange(4) < 3)[:, None]))
     assert (ended.n_left_out, ended.n_episodes[3]) == (0, 0)
-
-
-def test_the_limit_of_a_component_lies_below_its_estimate_and_a_constant_one_has_none():
-    batch = gaussian_batch(100, [[1.0, 1.0]], generator=generator())
-    states = th.cat([batch.states, th.ones(1, 100, 1)], dim=2)
-    estimates, limits = component_estimates(batch._replace(states=states))
-    assert (limits[:, :2] < estimates[:, :2]).all()
-    assert np.isnan(estimates[:, 2]).all() and np.isnan(limits[:, 2]).all()
 
 
 def test_many_trvs_need_more_than_two_living_episodes_for_each():

@@ -1,5 +1,7 @@
 """From per-episode records to statistics and tables."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -31,9 +33,8 @@ def of_seeds(n, costs_of):
 
 
 def test_the_summary_has_the_statistics_of_the_costs_in_the_order_of_the_records():
-    table = summary_table(
-        some_records({"B": {"y": [1.0, 2.0, 6.0], "x": [4.0, 4.0, 4.0]}, "A": {"y": [0.0, 0.0, 3.0]}})
-    )
+    costs = {"B": {"y": [1.0, 2.0, 6.0], "x": [4.0, 4.0, 4.0]}, "A": {"y": [0.0, 0.0, 3.0]}}
+    table = summary_table(some_records(costs))
     assert table[["model", "scenario"]].to_numpy().tolist() == [["B", "y"], ["B", "x"], ["A", "y"]]
     assert table["n"].tolist() == [3, 3, 3]
     assert table["mean"].tolist() == [3.0, 4.0, 1.0]
@@ -128,11 +129,6 @@ def test_scenarios_of_the_same_seeds_do_not_narrow_the_interval():
     assert widths[0] == pytest.approx(widths[1])
 
 
-def test_one_seed_alone_has_an_interval_of_no_width():
-    (row,) = aggregate_seeds(some_records({"A": {"x": [1.0, 3.0]}}, train_seed=0)).to_dict("records")
-    assert row["low"] == row["iqm"] == row["high"] == 2.0
-
-
 SCENARIOS = (
     Scenario("a|b", "Lava-v0", paper=dict(PG=PaperResult(1.0, 0.5), TDPG=PaperResult(2.0, 0.25))),
     Scenario("second", "Lava-v0"),
@@ -153,32 +149,25 @@ def test_the_markdown_table_has_ours_beside_the_papers_and_the_best_in_bold():
         "Mean episode cost (standard deviation over episodes); the paper's columns: mean (standard deviation). "
         "2 episodes per scenario, evaluation seed 0, stochastic policy. Lowest in bold.",
     ]
-
-
-def test_a_paper_without_standard_deviations_is_shown_without_them():
-    (row,) = (Scenario("a|b", "Lava-v0", paper=dict(A=PaperResult(8.702, distance=0.085))),)
-    lines = comparison_markdown(summary_table(some_records({"A": {"a|b": [4.0, 6.0]}})), [row]).splitlines()
-    assert lines[2] == r"| a\|b | 5.00 (1.41) | 8.70 |"
+    without_std = [replace(SCENARIOS[0], paper=dict(PG=PaperResult(8.702, distance=0.085)))]
+    lines = comparison_markdown(summary_table(records[:2].assign(scenario="a|b")), without_std).splitlines()
+    assert lines[2] == r"| a\|b | 9.00 (0.00) | 8.70 |"
     assert "the paper's columns: mean. " in lines[4]
 
 
-def test_the_markdown_table_over_seeds_shows_the_interval_and_says_so():
+def test_the_markdown_table_over_seeds_shows_the_interval_if_there_are_several():
     records = of_seeds(4, lambda i: {"ours": {"a|b": [float(i)] * 2}})
-    text = comparison_markdown(aggregate_seeds(records), SCENARIOS[:1])
+    text = comparison_markdown(aggregate_seeds(records.assign(seed=records["train_seed"])), SCENARIOS[:1])
     assert r"| a\|b | 1.50 [" in text  # alone in its row: nothing to mark
     assert "over 4 training seeds [95% bootstrap interval over seeds]" in text
+    assert "evaluation seed 0, 1, 2, 3, stochastic" in text
     assert "paper" not in text  # a model by another name than the paper's has nothing beside it
-
-
-def test_one_training_seed_has_no_interval():
-    text = comparison_markdown(aggregate_seeds(of_seeds(1, lambda i: {"ours": {"a|b": [1.0, 2.0]}})), SCENARIOS[:1])
-    assert r"| a\|b | 1.50 |" in text
+    alone = aggregate_seeds(records[records["train_seed"] == 1])
+    (row,) = alone.to_dict("records")
+    assert row["low"] == row["iqm"] == row["high"] == 1.0
+    text = comparison_markdown(alone, SCENARIOS[:1])
+    assert r"| a\|b | 1.00 |" in text
     assert "Mean episode cost of one training seed, hence without an interval." in text
-
-
-def test_the_markdown_table_says_it_when_each_training_seed_had_its_own_evaluation_seed():
-    records = pd.concat([some_records({"A": {"a|b": [1.0]}}, train_seed=i).assign(seed=i) for i in range(3)])
-    assert "evaluation seed 0, 1, 2, stochastic" in comparison_markdown(aggregate_seeds(records), SCENARIOS[:1])
 
 
 def test_a_table_that_cannot_be_made_is_an_error_that_says_why():

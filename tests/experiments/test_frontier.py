@@ -50,6 +50,10 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
     assert "| 90 %" in measured and f"| {NO_PENALTY}" in measured
 
     runs = pd.read_csv(out / "runs.csv")
+    episodes = pd.concat(pd.read_csv(out / "runs" / folder / "episodes.csv") for folder in runs["folder"])
+    costs = episodes.groupby(["model", "train_seed"], sort=False)["cost"]
+    np.testing.assert_allclose(runs[["cost", "std"]], costs.agg(["mean", "std"]))
+    assert (runs["information_lower"] <= runs["information"]).all()
     settings = {
         label: json.loads((out / "runs" / folder / "config.json").read_text())["settings"]
         for label, folder in zip(runs["label"], runs["folder"], strict=True)

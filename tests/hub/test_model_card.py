@@ -37,28 +37,12 @@ def test_the_metadata_has_the_mean_of_the_records_and_the_training_environment_f
     assert data.model_name == "TDPG"
     assert [result.dataset_config for result in data.eval_results] == ["Training", "Sensor noise 1e-3"]
     for result in data.eval_results:
+        named = (result.task_type, result.metric_type, result.metric_name, result.dataset_type, result.dataset_name)
+        assert named == ("reinforcement-learning", "mean_reward", "mean_reward", "Lava-v0", "Lava-v0")
         mean, std = map(float, result.metric_value.split(" +/- "))
         costs = costs_of(card, result.dataset_config)
         assert mean == pytest.approx(-costs.mean(), abs=0.005)
         assert std == pytest.approx(costs.std(), abs=0.005)
-
-
-def test_the_metadata_is_what_the_hub_reads_of_other_stable_baselines3_models(card):
-    data = huggingface_hub.repocard.metadata_load(card / "README.md")
-    first = data["model-index"][0]["results"][0]
-    expected = huggingface_hub.metadata_eval_result(
-        model_pretty_name="TDPG",
-        task_pretty_name="reinforcement-learning",
-        task_id="reinforcement-learning",
-        metrics_pretty_name="mean_reward",
-        metrics_id="mean_reward",
-        metrics_value=first["metrics"][0]["value"],
-        dataset_pretty_name="Lava-v0",
-        dataset_id="Lava-v0",
-        dataset_config="Training",
-    )["model-index"][0]["results"][0]
-    expected["metrics"][0].pop("verified")  # by the Hub's own evaluation service
-    assert first == expected
 
 
 def test_the_table_has_the_95_percent_interval_of_every_scenario(card):
@@ -159,13 +143,6 @@ def test_the_card_of_stacked_observations_says_how_to_stack(tmp_path):
     assert "`VecFrameStack(env, 3)`" in text_of(write_model_card(publication, tmp_path / "card", REPO_ID))
 
 
-def test_results_of_the_training_need_its_row(tmp_path):
-    model = tiny_tdpg()
-    records = evaluate_scenarios(model, LAVA[1:3], 4)
-    with pytest.raises(ValueError, match="no row of the records is called 'Training'"):
-        write_model_card(Publication(model=model, env_id="Lava-v0", records=records), tmp_path / "card", REPO_ID)
-
-
 def test_a_card_that_is_written_is_not_given_other_settings_or_another_name(card, capsys):
     line = error_line(capsys, "push", card, "--repo-id", REPO_ID, "--dry-run", "--film-episodes", "2")
     assert "has a card already" in line
@@ -173,21 +150,14 @@ def test_a_card_that_is_written_is_not_given_other_settings_or_another_name(card
     assert f"is for {REPO_ID}, not for other/name" in line
 
 
-def test_shares_of_failures_have_wilsons_interval():
-    records = pd.DataFrame(
-        dict(model="PG", scenario="Training", cost=[0.0] * 10, failure=[False] * 10, seed=0, deterministic=False)
-    )
-    row = results_with_intervals(records).iloc[0]
-    assert (row["failure_low"], row["failure_high"]) == (pytest.approx(0), pytest.approx(0.27753, abs=1e-5))
-    records["failure"] = [True] + [False] * 9
-    row = results_with_intervals(records).iloc[0]
-    assert (row["failure_low"], row["failure_high"]) == (
-        pytest.approx(0.01788, abs=1e-5),
-        pytest.approx(0.40415, abs=1e-5),
-    )
-    publication = Publication(model=Path("model.zip"), env_id="Lava-v0", records=records)
-    text = model_card(publication, results_with_intervals(records), REPO_ID).text
-    assert "| Training |  | 10 | 0.00 [0.00, 0.00] | 0.00 | 10.0% [1.8%, 40.4%] |" in text
+@pytest.mark.parametrize(("n", "low", "high"), [(0, 0, 0.27753), (1, 0.01788, 0.40415)])
+def test_shares_of_failures_have_wilsons_interval(n, low, high):
+    failed = [True] * n + [False] * (10 - n)
+    records = pd.DataFrame(dict(model="PG", scenario="Training", cost=0.0, failure=failed, seed=0, deterministic=False))
+    results = results_with_intervals(records)
+    assert results.loc[0, ["failure_low", "failure_high"]].tolist() == pytest.approx([low, high], abs=1e-5)
+    text = model_card(Publication(model=Path("model.zip"), env_id="Lava-v0", records=records), results, REPO_ID).text
+    assert f"0.00 [0.00, 0.00] | 0.00 | {10 * n:.1f}% [{100 * low:.1f}%, {100 * high:.1f}%] |" in text
 
 
 def test_the_video_of_an_episode_is_in_the_folder_of_the_card(runs, tmp_path, capsys):
@@ -212,9 +182,7 @@ def cut(share):
        r"config\.json does not describe a run \(.*\): give a run's folder")
       for text in ("{}", "[]", "3", "{", '{"settings": 3}')),
 ])  # fmt: skip
-def test_a_run_that_is_not_whole_is_refused_in_a_line_and_nothing_is_written(
-    name, damage, message, runs, tmp_path, capsys
-):
+def test_a_run_that_is_not_whole_is_refused_in_a_line_and_writes_nothing(name, damage, message, runs, tmp_path, capsys):
     copy = shutil.copytree(runs / "pg-seed0", tmp_path / "run")
     damage(copy / name)
     line = error_line(capsys, "push", copy, "--repo-id", REPO_ID, "--dry-run", "--card", tmp_path / "card")
@@ -243,18 +211,22 @@ def test_records_that_are_not_of_one_policy_or_a_damaged_model_are_refused(runs,
         (dict(records=pd.concat([run.records, run.records.assign(model="TDPG")])), r"are of model \['PG', 'TDPG'\]"),
         (dict(records=run.records[:31]), "at least 2 episodes of each scenario"),
         (dict(records=run.records[:0]), "at least 2 episodes of each scenario"),
+        (dict(records=run.records.replace("Training", "Other")), "no row of the records is called 'Training'"),
         (dict(model=damaged), "wasn't a zip-file"),
     ):
         with pytest.raises(ValueError, match=message):
             write_model_card(replace(run, **change), tmp_path / "card", REPO_ID)
+    with pytest.raises(ValueError, match="film_episodes=-1 must be at least 0"):
+        write_model_card(run, tmp_path / "card", REPO_ID, film_episodes=-1)
     assert not (tmp_path / "card").exists()
 
 
-def test_an_interrupted_card_leaves_nothing_and_can_be_written_again(runs, tmp_path, monkeypatch):
+def test_an_interrupted_card_leaves_nothing_and_is_written_again_without_unpickling(runs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("sb3_tdpg.hub.transfer.model_card", Mock(side_effect=KeyboardInterrupt))
         write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
     assert not (tmp_path / "card").exists()
+    monkeypatch.setattr("sb3_tdpg.TDPG.load", lambda *args, **kwargs: pytest.fail("it unpickles the model"))
     write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)
     assert [path.name for path in tmp_path.iterdir()] == ["card"]
 
@@ -265,11 +237,6 @@ def test_a_folder_that_is_not_empty_is_left_alone(card, runs, tmp_path):
         with pytest.raises(ValueError, match="exists already: choose another folder, or remove it"):
             refused()
     assert {path: path.read_bytes() for path in card.rglob("*") if path.is_file()} == before
-
-
-def test_a_negative_number_of_filmed_episodes_is_refused(runs, tmp_path):
-    with pytest.raises(ValueError, match="film_episodes=-1 must be at least 0"):
-        write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=-1)
 
 
 @pytest.mark.parametrize("start", ["../../evil", "/tmp", "..", 3])
@@ -295,8 +262,3 @@ def test_a_symbolic_link_is_never_published(runs, card, tmp_path, capsys):
     with pytest.raises(ValueError, match="ready/secret is a symbolic link"):
         push_to_hub(ready, REPO_ID)
     assert not (tmp_path / "card").exists()
-
-
-def test_the_card_of_a_run_is_written_without_unpickling_its_model(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_tdpg.TDPG.load", lambda *args, **kwargs: pytest.fail("it unpickles the model"))
-    write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID)

@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import huggingface_hub
 import numpy as np
@@ -111,36 +112,22 @@ def test_results_json_has_the_format_of_the_zoo(card):
     )
 
 
-# -- push and pull ----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def api(monkeypatch):
     """A stand-in for the client, which records its calls and can be made to fail."""
-    api = SimpleNamespace(calls=[], error=None)
-
-    def make(**kwargs):
-        api.calls.append(("HfApi", kwargs))
-        return api
-
-    def create_repo(repo_id, **kwargs):
-        api.calls.append(("create_repo", {"repo_id": repo_id, **kwargs}))
-        if api.error is not None:
-            raise api.error
-        return "https://huggingface.co/" + repo_id
-
-    api.create_repo, api.upload_folder = create_repo, lambda **kwargs: api.calls.append(("upload_folder", kwargs))
-    monkeypatch.setattr("huggingface_hub.HfApi", make)
+    api = Mock()
+    api.create_repo.side_effect = lambda repo_id, **_: "https://huggingface.co/" + repo_id
+    api.made = Mock(return_value=api)
+    monkeypatch.setattr("huggingface_hub.HfApi", api.made)
     return api
 
 
 def test_a_push_makes_the_repository_and_uploads_the_folder(card, api):
     url = push_to_hub(card, REPO_ID, private=True, commit_message="More epochs", token="secret")
     assert url == "https://huggingface.co/someone/tdpg-Lava-v0"
-    (_, client), (create, repository), (upload, folder) = api.calls
-    assert client["token"] == "secret"
-    assert (create, repository) == ("create_repo", dict(repo_id=REPO_ID, private=True, exist_ok=True))
-    assert upload == "upload_folder"
+    assert api.made.call_args.kwargs["token"] == "secret"
+    api.create_repo.assert_called_once_with(REPO_ID, private=True, exist_ok=True)
+    folder = api.upload_folder.call_args.kwargs
     # A video of an earlier model is deleted, and files of the user stay.
     gone = folder.pop("delete_patterns")
     assert {"replay.mp4", "vec_normalize.pkl"} <= set(gone)
@@ -151,7 +138,7 @@ def test_a_push_makes_the_repository_and_uploads_the_folder(card, api):
 def test_a_folder_without_a_card_is_not_pushed(runs, api):
     with pytest.raises(ValueError, match=r"has no README.md: let write_model_card write the folder first"):
         push_to_hub(runs / "pg-seed0", REPO_ID)
-    assert not api.calls
+    assert not api.create_repo.called
 
 
 def http_error(status, text):
@@ -167,11 +154,11 @@ def http_error(status, text):
     (errors.HTTPError("refused"), r"\(refused\): try again"),
 ])  # fmt: skip
 def test_errors_of_the_hub_are_reported_in_one_line(error, message, card, api):
-    api.error = error
+    api.create_repo.side_effect = error
     with pytest.raises(ValueError, match="someone/tdpg-Lava-v0 cannot be written " + message) as told:
         push_to_hub(card, REPO_ID)
     assert "\n" not in str(told.value)
-    assert api.calls[-1][0] == "create_repo", "nothing is uploaded"
+    assert not api.upload_folder.called
 
 
 def test_a_pull_downloads_the_repository_and_leaves_nothing_of_a_broken_download(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch as th
-from information_problems import gaussian_batch, random_batch
+from information_problems import batch_of, gaussian_batch, random_batch
 from small_problems import lava_env, tiny_tdpg
 
 from sb3_tdpg.information import InformationBatch
@@ -51,10 +51,9 @@ def test_a_reading_that_is_fresh_is_charged_in_full(estimator, undirected):
 
 def test_a_bit_costs_a_bit_however_far_its_values_are_apart():
     bit = th.randn(1, 2000, 1).sign()
-    for distance, expected in ((6.0, math.log(2)), (60.0, math.log(2))):
-        means, stds = distance / 2 * bit, th.ones_like(bit)
-        batch = InformationBatch(bit, means + th.randn_like(bit), means, stds, prev_trvs=th.zeros_like(bit))
-        assert DirectedLeaveOneOut(1, 1, 1)(batch).item() == pytest.approx(expected, abs=0.03)
+    for distance in (6.0, 60.0):
+        batch = batch_of(distance / 2 * bit, th.ones_like(bit))._replace(prev_trvs=th.zeros_like(bit))
+        assert DirectedLeaveOneOut(1, 1, 1)(batch).item() == pytest.approx(math.log(2), abs=0.03)
     assert DirectedLogDet(1, 1, 1)(batch).item() > 3.0
 
 
@@ -98,4 +97,4 @@ def test_training_charges_the_rebuilt_memory():
     rebuilt = batch._replace(trvs=batch.trvs.clone().requires_grad_())
     assert rebuilt.information_batch().prev_trvs.requires_grad
     pooled = batch.information_batch(pooled=True)
-    assert pooled.prev_trvs.shape == pooled.trvs.shape == (1, batch.trvs.shape[0] * batch.trvs.shape[1], 2)
+    assert pooled.prev_trvs.shape == pooled.trvs.shape == (1, batch.trvs[..., 0].numel(), 2)

@@ -16,9 +16,7 @@ def tiny(monkeypatch):
     give_settings(monkeypatch, dict(n_episodes=4, batch_size=4 * 25, mi_kwargs={}, mi_estimator="logdet"))
     monkeypatch.setattr(ball_paper, "LEVELS", (1e6, 8.7))
     monkeypatch.setattr(ball_paper, "PRICES", (16, 40))
-    monkeypatch.setattr(
-        ball_paper, "complete_runs", lambda tasks, **given: complete_runs_here(tasks, n_eval_episodes=2)
-    )
+    monkeypatch.setattr(ball_paper, "complete_runs", lambda tasks, **_: complete_runs_here(tasks, n_eval_episodes=2))
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.paper import common, grasp, knowledge
 from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
-from sb3_tdpg.paper.plots import failures_by_camera, failures_by_yaw
+from sb3_tdpg.paper.plots import failures_by_yaw
 
 
 @pytest.fixture
@@ -122,18 +122,6 @@ def test_the_failures_are_drawn_in_the_sector_of_their_yaw():
     assert angles[5] == pytest.approx(5.5 * 2 * np.pi / 24)
 
 
-def test_the_failures_are_drawn_over_the_camera_s_height():
-    camera = np.repeat([-0.06, -0.02, 0.02, 0.06], 5)
-    cost = np.repeat([1.0, 0.0, 0.0, 0.4], 5)
-    (line,) = failures_by_camera(pd.DataFrame(dict(model="PG", camera=camera, cost=cost)), n_bins=4).axes[0].lines
-    middles, shares = line.get_data()
-    np.testing.assert_allclose(middles, [-4.5, -1.5, 1.5, 4.5], atol=1e-6)
-    np.testing.assert_allclose(shares, [1.0, 0.0, 0.0, 0.4])
-
-
-# -- what is told of the policies --------------------------------------------------------------------------------------
-
-
 def test_the_bounds_enclose_an_information_that_is_known():
     rng = th.Generator().manual_seed(0)
     batch = gaussian_batch(2000, [[2.0, 1.0]], generator=rng)
@@ -173,14 +161,7 @@ def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
         "rollout/ep_cost_mean": [0.9, 0.05, 0.01, 0.01, 0.02, 0.01],
     })  # fmt: skip
     with_penalty, without = knowledge.penalty_table({1: log, 2: log.assign(**{"train/mi_coef": 0.0})})
-    assert with_penalty == {
-        "seed": 1,
-        "first epoch with the penalty": "2",
-        "last weight": "0.04",
-        "information in the first epoch": "5.00",
-        "information in the last epoch": "3.50",
-        "failed grasps": "0.020",
-    }
+    assert list(with_penalty.values()) == [1, "2", "0.04", "5.00", "3.50", "0.020"]
     assert (without["first epoch with the penalty"], without["last weight"]) == ("none", "0")
     (of_one_epoch,) = knowledge.penalty_table({1: log.drop(columns="train/mi_coef")[:1]})
     assert of_one_epoch["first epoch with the penalty"] == "none"

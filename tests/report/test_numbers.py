@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from sb3_tdpg.common.provenance import how_made, provenance
-from sb3_tdpg.report.charts import comparison_figure, degradation_curves, own_rows_figure
+from sb3_tdpg.report.charts import comparison_figure
 from sb3_tdpg.report.numbers import make_numbers, p_value
 from sb3_tdpg.report.page import Page, write_page
 from sb3_tdpg.report.plan import Plan
@@ -101,33 +100,12 @@ def test_there_is_one_verdict_over_all_perturbations_and_then_one_for_each():
     assert numbers_of(4, rows=rows).comparisons["perturbation"].tolist() == [UNPERTURBED, "x", "y", ALL]
 
 
-def points(figure):
-    """Numbers of points of the lines without a connection, by panel."""
-    return [
-        sum(len(line.get_xdata()) for line in axes.lines if line.get_marker() == "." and line.get_linestyle() == "None")
-        for axes in figure.axes
-    ]
-
-
-def test_every_figure_has_a_dot_for_each_model():
-    numbers = numbers_of(4)
-    assert points(degradation_curves(numbers)) == [2 * 4 * 3]
-    assert points(own_rows_figure(numbers)) == [2 * 4 * 2]
-    assert points(comparison_figure(numbers)) == [4 * 3]
-
-
 def test_the_dots_of_a_comparison_are_shares_of_the_first_methods_models():
     records = made_up(4, control=8.0, rows=ROWS[:1])
     records.loc[(records["model"] == "B") & (records["train_seed"] == 0), "cost"] = 8.15  # below two of four
     (axes,) = comparison_figure(make_numbers(records)).axes
     (dots,) = [line for line in axes.lines if line.get_marker() == "." and len(line.get_xdata()) == 4]
     assert sorted(dots.get_xdata()) == [0.125, 0.375, 0.5, 0.625]
-
-
-def test_a_page_of_an_installed_package_names_no_commit():
-    how = provenance()
-    assert " at commit " in how_made("make", how)
-    assert how_made("make", {**how, "git": None}).startswith(f"Made by `make`, {how['utc_time']}")
 
 
 def test_of_one_policy_that_fails_or_not_the_share_has_wilsons_interval():

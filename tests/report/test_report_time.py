@@ -86,9 +86,6 @@ def test_unfinished_pages_take_a_small_share_of_the_time(tmp_path, monkeypatch):
     assert written == [dict(reload=True), dict(reload=False)]
 
 
-# -- the information in the TRVs -------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def few_information_episodes(monkeypatch):
     """Measuring the information takes long."""

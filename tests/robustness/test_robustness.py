@@ -5,20 +5,7 @@ import functools
 import gymnasium as gym
 import numpy as np
 import pytest
-from perturbed_problems import (
-    APPLYING,
-    HORIZON,
-    PROBLEMS,
-    SEVERITIES,
-    PictureEnv,
-    countdown,
-    differs,
-    dummy,
-    episodes,
-    pendulum,
-    perturbed,
-    run,
-)
+from perturbed_problems import APPLYING, PROBLEMS, PictureEnv, countdown, differs, dummy, episodes, perturbed, run
 from small_problems import lava_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
@@ -113,7 +100,7 @@ def test_a_higher_severity_changes_more(problem, name, smooth):
     env, expected = smooth(problem)
     distances = [
         np.abs(run(perturbed(env, name, severity), len(expected) - 1).observations - expected.astype(float)).mean()
-        for severity in SEVERITIES
+        for severity in range(1, 6)
     ]
     assert distances[0] > 0
     assert (np.diff(distances) > 0).all(), distances
@@ -128,9 +115,6 @@ def test_environments_in_processes_show_the_same_as_in_this_one():
     np.testing.assert_array_equal(*([observation for _, observation in each.terminal] for each in runs))
 
 
-# -- episodes --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("severity", [1, 3])
 def test_a_delay_shows_what_was_some_steps_ago_and_nothing_of_an_earlier_episode(severity):
     plain, late = countdown(), PerturbedVecEnv(countdown(), "vector_delay", severity, scale=1.0)
@@ -140,6 +124,7 @@ def test_a_delay_shows_what_was_some_steps_ago_and_nothing_of_an_earlier_episode
     np.testing.assert_array_equal(shown.observations, expected)
     for (_, last), (_, delayed) in zip(seen.terminal, shown.terminal, strict=True):
         np.testing.assert_array_equal(delayed, [*last[:2], max(last[2] - severity, 0)])
+    np.testing.assert_array_equal(late.reset(), plain.reset())  # also of an episode that is left
 
 
 def test_a_lost_frame_leaves_the_last_one_that_arrived():
@@ -171,28 +156,16 @@ def test_an_occluder_stays_for_an_episode_and_is_another_one_in_the_next_and_bes
 def test_reset_infos_can_be_read_from_the_wrapper():
     env = perturbed(PROBLEMS["unbounded vector"](3), "vector_noise")
     env.reset()
-    for _ in range(HORIZON):
+    for _ in range(8):
         _, _, dones, _ = env.step(np.zeros((3, 1), np.float32))
         assert env.reset_infos == env.unwrapped.reset_infos
     assert dones.all()
 
 
-def test_a_second_reset_begins_new_episodes():
-    env = PerturbedVecEnv(countdown(), "vector_delay", 5, scale=1.0)
-    env.reset()
-    env.step(np.zeros((2, 1), np.float32))
-    np.testing.assert_array_equal(env.reset(), [[0, 1, 0], [1, 1, 0]])
-
-
-# -- bad input -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("problem", "arguments", "fragment"), [
     ("colour", dict(perturbation="fog"), r"'fog' is unknown: use one of \['noise'"),
     ("colour", dict(perturbation="blur", severity=0), "severity=0 of 'blur' must be an integer from 1 to 5"),
-    ("colour", dict(perturbation="blur", severity=2.5), "severity=2.5"),
     ("colour", dict(perturbation="blur", severity=2.0), "severity=2.0"),
-    ("colour", dict(perturbation="blur", severity="2"), "severity='2'"),
     ("colour", dict(perturbation="blur", severity=True), "severity=True"),
     ("colour", dict(perturbation="blur", seed=-1), "seed=-1 must be None or an integer of at least 0"),
     ("colour", dict(perturbation="vector_noise"), "it is for vectors"),
@@ -203,7 +176,6 @@ def test_a_second_reset_begins_new_episodes():
     ("bounded vector", dict(perturbation="vector_noise", scale=0.0), "no component"),
     ("grey", dict(perturbation="hue"), "needs images of 3 channels, and these have 1"),
     ("depth", dict(perturbation="texture_overlay"), "in a depth image"),
-    ("depth", dict(perturbation="hue"), "needs images of 3 channels"),
     ("depth", dict(perturbation="delay"), "with a horizon of 1 there is no other"),
 ])  # fmt: skip
 def test_what_does_not_fit_is_refused(problem, arguments, fragment):
@@ -218,7 +190,7 @@ def one(env_id):
 @pytest.mark.parametrize(("make", "fragment"), [
     (lambda: one("FrozenLake-v1"), "is not a Box"),
     (lambda: one("CartPole-v1"), "changes the actions of a Box, and the action space is Di"),
-    (pendulum, "is not a VecEnv of Stable-Baselines3.*DummyVecEnv"),
+    (lambda: gym.make("Pendulum-v1"), "is not a VecEnv of Stable-Baselines3.*DummyVecEnv"),
     (lambda: gym.make_vec("Pendulum-v1", 2), "is not a VecEnv of Stable-Baselines3"),
     (lambda: VecNormalize(lava_env()), r"VecNormalize\(PerturbedVecEnv"),
 ])  # fmt: skip
@@ -228,7 +200,8 @@ def test_an_environment_that_cannot_be_wrapped_is_refused(make, fragment):
 
 
 def test_actuators_are_perturbed_only_where_actions_are_a_box():
-    for env, expected in ((pendulum(), {"actuator_gain", "actuator_delay"}), (gym.make("CartPole-v1"), set())):
+    for env_id, expected in (("Pendulum-v1", {"actuator_gain", "actuator_delay"}), ("CartPole-v1", set())):
+        env = gym.make(env_id)
         names = applicable(env.observation_space, None, env.action_space)
         assert {name for name in names if PERTURBATIONS[name].kind == "action"} == expected
 

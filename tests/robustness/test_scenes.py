@@ -44,9 +44,6 @@ def test_a_scene_of_ones_own_needs_five_severities(monkeypatch):
         scene_perturbations("Mine-v0")
 
 
-# -- textures laid over the brick ------------------------------------------------------------------------------------
-
-
 def test_a_texture_gives_way_to_another_one_by_its_share():
     lower, upper = (load_texture(name).astype(float) for name in (TRAINING_TEXTURE, "violet_dots"))
     np.testing.assert_array_equal(load_texture("0%-violet_dots"), lower)
@@ -59,9 +56,6 @@ def test_a_texture_gives_way_to_another_one_by_its_share():
 def test_a_blend_that_cannot_be_made_is_refused(name):
     with pytest.raises(ValueError, match=r"must be '<0 to 100>%-<name>'"):
         load_texture(name)
-
-
-# -- gallery ---------------------------------------------------------------------------------------------------------
 
 
 def pictures(figure):
@@ -97,9 +91,6 @@ def test_the_gallery_refuses_what_it_cannot_show():
         perturbation_gallery("BallCatch-v0", [])
     with pytest.raises(ValueError, match="give its id in place of it"):
         perturbation_gallery(toy_vec_env(), env_kwargs=dict(renderer="fast"))
-
-
-# -- page ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["image", "vector", "any", "action"])

@@ -4,9 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from perturbed_problems import DICT, ClockEnv, PictureEnv, dummy, pendulum, perturbed
+from perturbed_problems import DICT, ClockEnv, PictureEnv, dummy, perturbed
 from small_problems import ToyEnv
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdpg.robustness import PerturbedVecEnv, observation_scale
 from sb3_tdpg.robustness.sensor import Sensor
@@ -116,9 +116,6 @@ def test_nothing_is_zero_or_black_as_far_as_the_bounds_allow():
     np.testing.assert_array_equal(seen, np.tile([0.0, 2.0], (8, 1)))
 
 
-# -- the plant -------------------------------------------------------------------------------------------------------
-
-
 def acted(name, severity, actions, n=40):
     """The actions that reach the environments in an episode, ``(N, T, 2)``, given ``(T, 2)``."""
     env = PerturbedVecEnv(clock(n), name, severity, seed=0)
@@ -146,9 +143,6 @@ def test_the_gain_of_an_actuator_is_a_factor_for_an_episode_within_the_bounds():
         assert set(np.round(of_component[:, 0], 3)) == {0.667, 1.5}
     assert (factors[:, 0, 0] != factors[:, 0, 1]).any()  # each actuator has its own
     assert np.abs(acted("actuator_gain", 4, ACTIONS)).max() == 1
-
-
-# -- Dict and stacks -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "changed"), [("noise", "camera"), ("vector_noise", "gyro"), ("delay", "camera")])
@@ -205,10 +199,3 @@ def test_the_images_of_a_stack_are_perturbed_one_by_one():
         seen.append(single.step(np.zeros((2, 1), np.float32))[0])
         stacked = env.step(np.zeros((2, 1), np.float32))[0]
     np.testing.assert_array_equal(stacked, np.stack(seen[-3:], axis=1))
-
-
-def test_a_stack_around_the_wrapper_holds_what_it_showed():
-    env = VecFrameStack(perturbed(dummy(pendulum, 1), "vector_bias", 3), 2)
-    env.reset()
-    (first,), (second,) = (env.step(np.zeros((1, 1), np.float32))[0] for _ in range(2))
-    np.testing.assert_array_equal(first[3:], second[:3])

@@ -98,9 +98,6 @@ def test_images_that_are_drawn_together_have_patterns_of_several_sizes():
         assert np.ptp(part) <= 0.05 * part.max()
 
 
-# -- noise of a strength that is drawn ---------------------------------------------------------------------------
-
-
 def episode(env):
     """The observations of one episode without actions, ``(T, N, D)``, and the first one of the next."""
     observations = [env.reset()]

@@ -22,8 +22,8 @@ from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
 
 pytest.importorskip("rl_zoo3")
-from sb3_tdpg.experiments.studies import open_storage
 from sb3_tdpg.zoo.search import put_in, read_space, relevant, sample
+from sb3_tdpg.zoo.studies import open_storage
 from sb3_tdpg.zoo.tuning import _Measuring, _rank, best_trial, block_of_trial
 
 SMALL = ["--env", "Lava-v0", "--block", "Lava-v0-logdet", "-params", "n_episodes:20", "--eval-episodes", "40"]

@@ -2,28 +2,22 @@
 Run Optuna studies that any number of worker processes share, on one machine or on many.
 
 Optuna's heartbeats show which workers are alive. The trial of a dead worker is put back into the queue. This module
-adds heartbeats for journal files, jobs that are run only once, and a loop that waits for the trials of other workers.
+adds heartbeats for journal files, and a loop that waits for the trials of other workers.
 """
 
 import contextlib
-import json
+import math
 import os
 import re
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-try:
-    import optuna
-    import sqlalchemy as sa
-except ImportError as e:
-    raise ImportError("studies need Optuna: pip install sb3_tdpg[zoo]") from e
-
+import optuna
+import sqlalchemy as sa
 from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, StorageInternalError, TrialPruned
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.storages._heartbeat import BaseHeartbeat
@@ -42,7 +36,7 @@ OUTAGE = (StorageInternalError, sa.exc.DBAPIError)
 PATIENCE = 60.0  # seconds
 
 SPACE = "space"  # attribute of a study
-JOB, HEARTBEAT, STARTED, REASON = "job", "heartbeat", "started", "reason"  # attributes of a trial
+HEARTBEAT, STARTED, REASON = "heartbeat", "started", "reason"  # attributes of a trial
 DONE = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -157,7 +151,7 @@ def open_study(storage: BaseStorage, name: str, *, space: Mapping[str, Any], **o
     :param storage: From :func:`open_storage`.
     :param name: Name of the study.
     :param space: Everything that must be equal for trials to be comparable: search space, environment, settings.
-    :param options: ``directions``, ``sampler`` and ``pruner`` of ``optuna.create_study``.
+    :param options: ``sampler`` and ``pruner`` of ``optuna.create_study``.
     :raises ValueError: if the study was made with another space; the message names the differences.
     """
     try:
@@ -175,28 +169,12 @@ def open_study(storage: BaseStorage, name: str, *, space: Mapping[str, Any], **o
     return study
 
 
-def enqueue_once(study: optuna.Study, jobs: Sequence[Mapping[str, Any]]) -> None:
-    """
-    Enqueue the jobs that a study does not contain yet and the jobs that have failed.
-
-    If several workers enqueue a job at the same time, it is in the queue several times, but :func:`work` runs it once.
-
-    :param study: From :func:`open_study`.
-    :param jobs: The parameters of each job. The objective reads them with ``trial.suggest_*``.
-    """
-    known = {trial.user_attrs.get(JOB) for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL}
-    for job in jobs:
-        name = json.dumps(jsonable(job), sort_keys=True)
-        if name not in known:
-            study.enqueue_trial(dict(job), user_attrs={JOB: name})
-
-
 def work(
     study: optuna.Study,
-    objective: Callable[[optuna.Trial], float | Sequence[float]],
-    n_trials: int | None = None,
+    objective: Callable[[optuna.Trial], float],
+    n_trials: int,
     *,
-    describe: Callable[[FrozenTrial], str] = lambda trial: ", ".join(map("{:.4g}".format, trial.values)),
+    describe: Callable[[FrozenTrial], str] = lambda trial: f"{trial.value:.4g}",
     report: Callable[[str], None] = print,
 ) -> None:
     """
@@ -207,32 +185,27 @@ def work(
     worker was killed, another worker or the next one puts its trial back.
 
     :param study: From :func:`open_study`.
-    :param objective: Function that gets a trial and returns its value or values.
+    :param objective: Function that gets a trial and returns its value.
     :param n_trials: Number of complete and pruned trials of all workers together. Each worker may add up to one more.
-        ``None``: run the jobs of :func:`enqueue_once`.
-    :param describe: Function that describes a complete trial; default: its values.
+    :param describe: Function that describes a complete trial; default: its value.
     :param report: Function that gets a line of text for each trial.
     :raises ValueError: if the storage does not answer for a minute. After a shorter outage, the lost trials are run
         again.
     """
-    if n_trials is not None and n_trials < 1:
+    if n_trials < 1:
         raise ValueError(f"n_trials={n_trials} must be at least 1")
     number: int | None = None  # number of the trial that this worker runs
     is_interrupted = False
 
-    def attempt(trial: optuna.Trial) -> float | Sequence[float]:
+    def attempt(trial: optuna.Trial) -> float:
         nonlocal number, is_interrupted
-        if n_trials is None:
-            job, earlier = trial.user_attrs.get(JOB), study.get_trials(deepcopy=False)[: trial.number]
-            if job is None or any(t.user_attrs.get(JOB) == job and t.state != TrialState.FAIL for t in earlier):
-                return [float("nan")] * len(study.directions)  # for Optuna, the trial has failed
         number = trial.number
         trial.set_user_attr(STARTED, number)  # a repeated trial inherits the attribute
         try:
-            values = objective(trial)
-            if np.isnan(values).any():
-                raise ValueError(f"the result is {values}")
-            return values
+            value = objective(trial)
+            if math.isnan(value):
+                raise ValueError(f"the result is {value}")
+            return value
         except KeyboardInterrupt:  # Optuna loses this exception if it cannot store the state of the trial
             is_interrupted = True
             raise
@@ -244,7 +217,7 @@ def work(
         if trial.state in DONE:
             text = describe(trial) if trial.state == TrialState.COMPLETE else f"pruned: {trial.user_attrs[REASON]}"
             n_done = len(study.get_trials(deepcopy=False, states=DONE))
-            report(f"trial {trial.number}: {text} ({n_done}{'' if n_trials is None else f' of {n_trials}'} finished)")
+            report(f"trial {trial.number}: {text} ({n_done} of {n_trials} finished)")
 
     is_waiting = False
     while True:
@@ -253,10 +226,10 @@ def work(
             fail_stale_trials(study)
             n = Counter(trial.state for trial in study.get_trials(deepcopy=False))
             n_done, n_running = n[TrialState.COMPLETE] + n[TrialState.PRUNED], n[TrialState.RUNNING]
-            if n[TrialState.WAITING] or (n_trials is not None and n_done + n_running < n_trials):
+            if n[TrialState.WAITING] or n_done + n_running < n_trials:
                 is_waiting = False
                 study.optimize(attempt, n_trials=1, callbacks=[say])
-            elif n_running and (n_trials is None or n_done < n_trials):
+            elif n_running and n_done < n_trials:
                 if not is_waiting:
                     report(f"waiting for {n_running} trials of other workers; trials of dead workers will be run again")
                 is_waiting = True
