@@ -20,7 +20,7 @@ from sb3_tdpg.common.threads import threads
 from sb3_tdpg.envs.lava import GOAL, WALL
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.environments import check_models_fit, scenario_env
-from sb3_tdpg.evaluation.loading import statistics_beside
+from sb3_tdpg.evaluation.loading import load_model
 from sb3_tdpg.robustness.nuisance import held_family
 from sb3_tdpg.tdpg import TDPG
 
@@ -45,18 +45,19 @@ def certify_nuisance(
     """
     Certify policies under a declared nuisance, and compare the bounds with the measured costs.
 
-    The first row of a model is the whole family, with a member for each episode. Each other row is one random member.
+    In the first row of a model in ``nuisance.csv``, each episode has its own random member of the nuisance. In every
+    other row, all episodes have the same random member.
 
     :param models: Files that ``model.save()`` wrote.
-    :param env_id: The training environment, one of this package.
-    :param declared: See :class:`~sb3_tdpg.robustness.families.Family`.
+    :param env_id: Id of the training environment, which must be one of this package.
+    :param declared: The nuisance, declared as for :class:`~sb3_tdpg.robustness.families.Family`.
     :param out: Folder for ``summary.md``, ``nuisance.csv`` and ``config.json``.
-    :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava:
-        the cost of standing at the wall.
+    :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava: the
+        cost of standing at the wall.
     :param env_kwargs: Keywords of the training environment.
-    :param n_episodes: Number of recorded training episodes. Each member perturbs the first ``n_budget_episodes`` of
-        them.
-    :param n_test_episodes: Number of episodes under each member, to measure the cost.
+    :param n_episodes: Number of training episodes for the distribution of the cost.
+    :param n_budget_episodes: Number of further training episodes, in which each member perturbs the observations.
+    :param n_test_episodes: Number of episodes in which the cost under each member is measured.
     :param confidence: Confidence of each certificate.
     :return: the summary, as Markdown
     :raises ValueError: if an argument is invalid; no episode has been run then.
@@ -66,14 +67,18 @@ def certify_nuisance(
     if seed < 0:
         raise ValueError(f"seed={seed} must be at least 0")
     training = Scenario("Training", env_id, dict(env_kwargs or {}))
-    loaded = load_models(models, training)
+    loaded = {str(path): load_model(path, env_id, training.env_kwargs) for path in models}
+    if unfit := [
+        path for path, model in loaded.items() if not isinstance(model, TDPG) or model.get_vec_normalize_env()
+    ]:
+        raise ValueError(f"{unfit[0]} is not certified: it must be a TDPG model that was trained without VecNormalize")
+    check_models_fit(loaded, [training])
     if cost_bound is None:
         if env_id.rpartition(":")[2] != "Lava-v0":
             raise ValueError(f"cost_bound is needed for {env_id}: an upper bound on the cost of an episode")
         # The stage costs at the wall, and the terminal cost there, which has a weight of 100.
         cost_bound = (next(iter(loaded.values())).horizon + 100.0) * float(GOAL[0] - WALL)
     out.mkdir(parents=True, exist_ok=True)
-    n_budget_episodes = min(n_budget_episodes, n_episodes)
     settings: dict[str, Any] = dict(n_episodes=n_episodes, cost_bound=cost_bound, confidence=confidence, seed=seed)
     rows: list[dict[str, Any]] = []
     with threads(1):
@@ -85,7 +90,7 @@ def certify_nuisance(
             shifts += [Shift(f"member {i}", nuisance=partial(family.one, seed + i)) for i in range(n_members)]
             for i, shift in enumerate(tqdm(shifts, desc=label)):
                 row = dict(model=label, shift=shift.name, training_cost=episodes.costs.mean())
-                rows.append(row | _compare(episodes, shift, n_test_episodes, seed + 1 + i))
+                rows.append(row | _compare(episodes, shift, n_test_episodes, cost_bound, seed + 1 + i))
     records = pd.DataFrame(rows)
     write_frame_atomically(records, out / "nuisance.csv")
     settings.update(nuisance=str(declared), n_members=n_members, n_budget_episodes=n_budget_episodes)
@@ -100,35 +105,13 @@ def certify_nuisance(
     return summary
 
 
-def load_models(paths: Sequence[Path], training: Scenario) -> dict[str, TDPG]:
-    """Load policies, label them, and check that they fit the training environment."""
-    models: dict[str, TDPG] = {}
-    if twice := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
-        raise ValueError(f"{twice[0]} is given twice")
-    for path in paths:
-        if found := statistics_beside(path):
-            raise ValueError(f"{path} acts on normalised observations ({found}): train one without VecNormalize")
-        try:
-            model = TDPG.load(path, device="cpu")
-        except OSError as e:
-            raise ValueError(f"{path} cannot be read ({e.strerror}): give .zip files that model.save() wrote") from e
-        method = "PG" if model.beta == math.inf else "TDPG"
-        # Choose the shortest label that is free; only the last one contains the whole path.
-        labels = (method, f"{method} ({path.parent.name}/{path.stem})", f"{method} ({path})")
-        models[next(label for label in labels if label not in models)] = model
-    check_models_fit(models, [training])
-    return models
-
-
-def _compare(episodes: TrainingEpisodes, shift: Shift, n_test_episodes: int, seed: int) -> dict[str, Any]:
+def _compare(episodes: TrainingEpisodes, shift: Shift, n_test_episodes: int, cost_bound: float, seed: int) -> dict:
     """Certify one shift, and measure the cost under it."""
     certified = episodes.certify(shift)
     costs, measured_kl = episodes.measure(shift, n_test_episodes, seed=seed)
-    row: dict[str, Any] = dict(cost=costs.mean(), standard_error=costs.std(ddof=1) / math.sqrt(len(costs)))
-    row["clipped_cost"] = np.minimum(costs, certified.trivial).mean()
-    row.update((name, getattr(certified, name)) for name in ("bound", "through_trvs", "through_sensor"))
-    row.update(kl=certified.budget.kl, exceedance=certified.budget.exceedance)
-    return dict(**row, measured_kl=measured_kl, sensor_kl=certified.sensor_kl)
+    cost = dict(cost=costs.mean(), standard_error=costs.std(ddof=1) / math.sqrt(len(costs)))
+    bound = dict(clipped_cost=np.minimum(costs, cost_bound).mean(), bound=certified.bound)
+    return dict(**cost, **bound, **certified.budget._asdict(), measured_kl=measured_kl)
 
 
 def nuisance_table(records: pd.DataFrame, trivial: float) -> str:

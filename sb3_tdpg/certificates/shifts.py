@@ -1,9 +1,9 @@
 r"""
-Declare shifts of sensor and start, and compute how far they move the distribution over episodes, in nats.
+Declare shifts of the sensor and of the start, and bound the divergence between shifted and training episodes.
 
-The actions depend on the observations only through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. A shift of
-the sensor therefore moves states and actions by no more than it moves the TRVs. The divergence of the TRVs can be
-computed, because the encoder's density is known. The derivation is in ``docs/guide/certificate.md``.
+The actions depend on the observations only through the encoder :math:`q(\tilde x_t | \tilde x_{t-1}, y_t)`. It is
+therefore sufficient to bound the divergence of the TRVs, which can be computed because the encoder's density is known.
+The derivation is in ``docs/guide/certificate.md``.
 
 Dimension key: T horizon, N episodes, X state, Z TRVs.
 """
@@ -34,7 +34,7 @@ from sb3_tdpg.vec_env import BatchedVecEnv
 EPISODES_AT_A_TIME = 100_000  # run side by side; a constant, because results depend on it
 EXCEEDANCE_LEVELS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # shares of episodes with a capped divergence that are tried
 
-_START, _SENSOR, _DYNAMICS, _POLICY, _TEST = range(5)  # streams of random numbers
+_START, _SENSOR, _DYNAMICS, _POLICY, _TEST, _BUDGET = range(6)  # streams of random numbers
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,10 @@ class Budget(NamedTuple):
 class ShiftCertificate(NamedTuple):
     """Upper bounds on the expected cost under one shift."""
 
-    bound: float  #: the lowest of the following three
+    bound: float  #: the lower of the following two
     through_trvs: float  #: from the divergence of the TRVs
     through_sensor: float  #: from the divergence of the sensor, which holds for every policy
-    trivial: float  #: upper bound on the episode cost
     budget: Budget  #: divergence of the TRVs for ``through_trvs``
-    sensor_kl: float  #: divergence of sensor and start over the whole episode in nats
 
 
 class RecordedEpisodes(NamedTuple):
@@ -85,28 +83,22 @@ class RecordedEpisodes(NamedTuple):
     densities: list[Normal]  # of the TRVs at each step, (N, Z), and of the last actions, (N, U)
     seed: tuple[int, ...]  # of the sensor
 
-    def first(self, n: int) -> RecordedEpisodes:
-        """Return the first n episodes."""
-        densities = [Normal(density.mean[:n], density.stddev[:n]) for density in self.densities]
-        arrays = (self.costs[:n], self.states[:, :n], self.prev_trvs[:, :n], self.last_trv_noise[:n])
-        return RecordedEpisodes(*arrays, densities, self.seed)
-
 
 class TrainingEpisodes:
     """
     Record training episodes of a policy; a shifted sensor then observes the recorded states.
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG`.
-    :param scenario: The training environment, one of this package.
-    :param cost_bound: Upper bound on the episode cost. The cost is clipped there. If an episode can cost more, the
-        certificate is for the clipped cost.
+    :param scenario: The training environment, which must be one of this package.
+    :param cost_bound: Upper bound on the cost of an episode; the cost is clipped there. If an episode can cost more,
+        the certificate is for the clipped cost.
     :param n_episodes: Number of episodes for the distribution of the cost.
-    :param n_budget_episodes: Number of the first episodes, which are used for the divergence of the TRVs.
-    :param confidence: Confidence of each certificate; ``None``: without allowance for the sampling error. Half of the
-        error probability is spent on the distribution of the cost, and half on the divergence.
+    :param n_budget_episodes: Number of further episodes for the divergence of the TRVs.
+    :param confidence: Confidence of each certificate. Half of the error probability is spent on the distribution of the
+        cost, and half on the divergence.
     :param seed: Seed of the episodes.
-    :raises ValueError: if the environment or that of the model is unsuitable, or a number is invalid; no episode has
-        been run then.
+    :raises ValueError: if the scenario or the model's own environment is unsuitable, or a number is invalid. No episode
+        has been run then.
     """
 
     def __init__(
@@ -117,25 +109,19 @@ class TrainingEpisodes:
         cost_bound: float,
         n_episodes: int = 1_000_000,
         n_budget_episodes: int = 50_000,
-        confidence: float | None = 0.95,
+        confidence: float = 0.95,
         seed: int = 0,
     ) -> None:
-        if not 1 <= n_budget_episodes <= min(n_episodes, EPISODES_AT_A_TIME):
-            most = f"at most n_episodes={n_episodes} and {EPISODES_AT_A_TIME}"
-            raise ValueError(f"n_budget_episodes={n_budget_episodes} must be at least 1 and {most}")
         check_allowance(confidence, cost_bound)
-        self.model, self.scenario, self.confidence, self.cost_bound = model, scenario, confidence, cost_bound
+        self.model, self.scenario, self.confidence = model, scenario, confidence
         self._env = _pomdp(model, scenario)
         costs: list[np.ndarray] = []
         for i in range(math.ceil(n_episodes / EPISODES_AT_A_TIME)):
             n = min(EPISODES_AT_A_TIME, n_episodes - i * EPISODES_AT_A_TIME)
-            episodes = record_episodes(model, self._env, n, (seed, i))
-            costs.append(episodes.costs)
-            if i == 0:
-                self.recorded = episodes.first(n_budget_episodes)
+            costs.append(record_episodes(model, self._env, n, (seed, i)).costs)
         self.costs = np.concatenate(costs)
-        share = None if confidence is None else (1 + confidence) / 2
-        self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, share)
+        self.distribution = cost_distribution(np.minimum(self.costs, cost_bound), cost_bound, (1 + confidence) / 2)
+        self.recorded = record_episodes(model, self._env, n_budget_episodes, (seed, _BUDGET))
 
     def divergences(self, shift: Shift) -> np.ndarray:
         """
@@ -150,14 +136,15 @@ class TrainingEpisodes:
         """
         Bound the divergence between episodes with and without the shift, from recorded episodes.
 
-        An episode consists of its TRVs, states and actions. Under the shifted distribution, the mean divergence of a
-        step is at most the largest mean over all distributions within the divergence of the earlier steps. Where the
-        divergence exceeds a cap, the bound assumes an unshifted step and the largest episode cost.
+        An episode consists of its TRVs, states and actions. The divergence of the earlier steps is bounded first. The
+        mean divergence of a step under the shift is then at most the largest mean under all distributions within that
+        bound. In an episode with a divergence above a cap, the bound assumes that the step is not shifted and that the
+        episode has the largest cost.
 
         :return: a budget for each of ``EXCEEDANCE_LEVELS``; all hold simultaneously
         """
         divergences = self.divergences(shift)
-        share = None if self.confidence is None else 1 - (1 - self.confidence) / (2 * len(divergences))
+        share = 1 - (1 - self.confidence) / (2 * len(divergences))
         steps = [cost_distribution(divergence, float(divergence.max()), share) for divergence in divergences]
         return [_budget(steps, shift.start_kl, level) for level in EXCEEDANCE_LEVELS]
 
@@ -165,19 +152,19 @@ class TrainingEpisodes:
         """
         Bound the expected cost under a shift, clipped at ``cost_bound``.
 
-        The certificates through the TRVs and through the sensor hold simultaneously, so the lowest is valid.
+        The bounds through the TRVs and through the sensor hold simultaneously, so the lower one is valid.
         """
 
         def bound_through_trvs(budget: Budget) -> float:
-            return worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl).bound
+            return worst_mean(self.distribution.with_largest(budget.exceedance), budget.kl)
 
         budget = min(self.budgets(shift), key=bound_through_trvs)
         sensor_kl = shift.start_kl + len(self.recorded.states) * shift.sensor_kl
-        bounds = (bound_through_trvs(budget), worst_mean(self.distribution, sensor_kl).bound, self.cost_bound)
-        return ShiftCertificate(min(bounds), *bounds, budget, sensor_kl)
+        through_trvs, through_sensor = bound_through_trvs(budget), worst_mean(self.distribution, sensor_kl)
+        return ShiftCertificate(min(through_trvs, through_sensor), through_trvs, through_sensor, budget)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
-        """Run the shifted environment; return the costs, ``(N,)``, and the mean divergence, which the budget bounds."""
+        """Run shifted episodes; return their costs, ``(N,)``, and their mean divergence, which a budget bounds."""
         shifted = record_episodes(self.model, self._shifted(shift), n_episodes, (seed, _TEST))
         by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
         return shifted.costs, shift.start_kl + float(by_step[:-2].sum() + by_step[-2:].min())
@@ -238,18 +225,17 @@ def _action_density(policy: Any, trvs: th.Tensor) -> Normal:
 
 
 def _divergences(shifted: Sequence[Normal], training: Sequence[Normal]) -> np.ndarray:
-    # Double precision is needed: a small divergence is a difference of numbers near 1, and must not be rounded down to
-    # 0.
+    # In single precision, a small divergence, which is a difference of numbers near 1, would be rounded to 0.
     double = [[Normal(d.mean.double(), d.stddev.double()) for d in densities] for densities in (shifted, training)]
     return np.stack([kl_divergence(p, q).sum(dim=1).clamp(min=0).cpu().numpy() for p, q in zip(*double, strict=True)])
 
 
 def _budget(steps: Sequence[CostDistribution], start_kl: float, level: float) -> Budget:
-    """Sum the divergences of the steps; of the last TRVs and the last action, only the lower divergence counts."""
+    """Add up the bounds of the steps, but of those of the last TRVs and the last action only the lower one."""
 
     def add(budget: Budget, step: CostDistribution) -> Budget:
         capped, exceedance = step.capped(level)
-        return Budget(budget.kl + worst_mean(capped, budget.kl).bound, budget.exceedance + exceedance)
+        return Budget(budget.kl + worst_mean(capped, budget.kl), budget.exceedance + exceedance)
 
     budget = Budget(start_kl, 0.0)
     for step in steps[:-2]:

@@ -1,7 +1,7 @@
 """Evaluate policies: run scenarios, record each episode, and make tables and figures."""
 
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map, save_figure, training_curves
-from sb3_tdpg.evaluation.information import InformationReport, information_report, interval_frame, state_knowledge
+from sb3_tdpg.evaluation.information import InformationReport, information_report, state_knowledge
 from sb3_tdpg.evaluation.interval import InformationInterval, information_interval
 from sb3_tdpg.evaluation.records import evaluate_scenarios, rollout_states
 from sb3_tdpg.evaluation.statistics import aggregate_seeds, paired_difference, probability_of_improvement
@@ -17,7 +17,6 @@ __all__ = [
     "information_interval",
     "information_report",
     "information_timeline",
-    "interval_frame",
     "knowledge_map",
     "paired_difference",
     "probability_of_improvement",

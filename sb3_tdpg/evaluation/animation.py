@@ -24,7 +24,6 @@ PANEL_HEIGHT = 180  # height of the plot of the TRVs
 LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # margins around the axes; the legend is at the right
 SYMBOLS = {"TRV": r"$\tilde{x}_t$", "action": "$u_t$"}
 HOLD = 1.0  # s: duration of the last frame of an episode
-MAX_LINES = 8  # more TRVs than this are drawn as rows of an image
 
 
 class Episode(NamedTuple):
@@ -36,7 +35,7 @@ class Episode(NamedTuple):
     between: Sequence[Sequence[np.ndarray]] = ()  # pictures between x_t and x_{t+1} for each step, or nothing
 
     def film(self) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield all pictures with their times in steps."""
+        """Yield the time in steps and the picture of each frame."""
         for t, picture in enumerate(self.pictures):
             yield float(t), picture
             between = self.between[t] if t < len(self.between) else ()
@@ -45,7 +44,7 @@ class Episode(NamedTuple):
 
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
-    """Raise an error if the file extension is unknown (``ValueError``), or matplotlib or ffmpeg is missing."""
+    """Raise an error if the extension is not ``.gif`` or ``.mp4``, or if matplotlib or ffmpeg is missing."""
     ending = Path(path).suffix
     if ending not in (".gif", ".mp4"):
         raise ValueError(f"{path}: the extension {ending!r} is not a video format: use .gif or .mp4")
@@ -55,7 +54,7 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
 
 
 def _ffmpeg() -> str | None:
-    """Return the path of ffmpeg from Matplotlib's settings (by default, on the PATH) or from imageio-ffmpeg, if any."""
+    """Return the path of the ffmpeg of Matplotlib's settings (by default, on the PATH) or of imageio-ffmpeg, if any."""
     import matplotlib as mpl
 
     if (found := shutil.which(mpl.rcParams["animation.ffmpeg_path"])) is not None:
@@ -77,7 +76,7 @@ def save_animation(
     :param episodes: Episodes with pictures of the same size.
     :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
     :param horizon: Number of controls T in an episode.
-    :param fps: Frames per second; a GIF is timed in hundredths of a second.
+    :param fps: Frames per second. A GIF rounds the duration of a frame to hundredths of a second.
     :param signal: ``"TRV"`` or ``"action"``: what is drawn below the pictures.
     :raises ValueError: if the video cannot be written there.
     """
@@ -95,14 +94,14 @@ class _Video:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        self.episodes, self._signal = episodes, signal
+        self.episodes = episodes
         height, width = episodes[0].pictures[0].shape[:2]
         self._factor = -(-MIN_WIDTH // width)
         height, width = self._factor * height, self._factor * width
         scale = width / MIN_WIDTH
         panel = round(scale * PANEL_HEIGHT)
         dpi, total = scale * DPI, height + panel
-        # A tenth of a pixel is added, because a quotient that is rounded down would cut a row off the picture.
+        # A tenth of a pixel is added, because rounding down the size would cut a row off the picture.
         self.figure: Figure = Figure(figsize=((width + 0.1) / dpi, (total + 0.1) / dpi), dpi=dpi)
         self.canvas = FigureCanvasAgg(self.figure)
         # The picture is drawn pixel by pixel, because axes would resample it.
@@ -115,63 +114,34 @@ class _Video:
         axes.locator_params(axis="x", integer=True)
         tidy(axes)
         # All frames share the limits of the axes.
-        signals = np.concatenate([episode.signals for episode in episodes])
-        self._lines: list[Any] = []
-        self._rows: Any = None
-        if signals.shape[1] <= MAX_LINES:
-            self._draw_lines(signals, horizon)
-        else:
-            self._draw_rows(signals, horizon)
-        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
-
-    def _draw_lines(self, signals: np.ndarray, horizon: int) -> None:
-        """Draw a line for each TRV: ``(n, Z)``."""
-        axes = self._axes
+        signals = np.concatenate([episode.signals for episode in episodes])  # (n, Z)
         low, high = float(signals.min()), float(signals.max())
         margin = 0.05 * (high - low) or 1.0
         axes.set(xlim=(0, horizon), ylim=(low - margin, high + margin))
         axes.grid(alpha=0.25)
-        axes.set_ylabel(f"{self._signal}s {SYMBOLS[self._signal]}", fontsize=9)
+        axes.set_ylabel(f"{signal}s {SYMBOLS[signal]}", fontsize=9)
         looks: dict[str, Any] = dict(linewidth=1.3, marker="o", markersize=2.5, clip_on=False)
         self._lines = [
-            axes.plot([], [], label=str(i + 1), color=color, **looks)[0]
-            for i, color in zip(range(signals.shape[1]), PALETTE, strict=False)
+            axes.plot([], [], label=str(i + 1), color=PALETTE[i % len(PALETTE)], **looks)[0]
+            for i in range(signals.shape[1])
         ]
-        axes.legend(
-            title=self._signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8,
-            title_fontsize=9, handlelength=1.2, labelspacing=0.2,
-        )  # fmt: skip
-
-    def _draw_rows(self, signals: np.ndarray, horizon: int) -> None:
-        """Draw a row of colours for each TRV: ``(n, Z)``."""
-        n_signals = signals.shape[1]
-        largest = float(np.abs(signals).max()) or 1.0
-        self._rows = self._axes.imshow(
-            np.full((n_signals, horizon), np.nan), aspect="auto", interpolation="nearest", cmap="RdBu_r",
-            vmin=-largest, vmax=largest, extent=(-0.5, horizon - 0.5, n_signals + 0.5, 0.5),
-        )  # fmt: skip
-        self._axes.set_xlim(-0.5, horizon + 0.5)  # the last picture shows the end, after the last TRVs
-        self._axes.set_ylabel(self._signal, fontsize=9)
-        box = self._axes.get_position()
-        bar = self.figure.add_axes((box.x1 + 0.012, box.y0, 0.012, box.height))
-        self.figure.colorbar(self._rows, cax=bar)
-        bar.tick_params(labelsize=8, length=2)
-        bar.set_title(SYMBOLS[self._signal], fontsize=9)
+        if len(self._lines) <= len(PALETTE):
+            axes.legend(
+                title=signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8,
+                title_fontsize=9, handlelength=1.2, labelspacing=0.2,
+            )  # fmt: skip
+        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
 
     def frames(self) -> Iterator[bool]:
-        """Set the figure to each frame in turn; yield whether the frame is the last of its episode."""
+        """Draw each frame in turn, and yield whether it is the last frame of its episode."""
         for number, episode in enumerate(self.episodes, start=1):
             cost_so_far = np.concatenate([[0.0], episode.costs.cumsum()])
             for time, picture in episode.film():
                 t = int(time)
                 self._picture.set_data(self._enlarged(picture))
                 self._now.set_xdata([time, time])
-                for line, values in zip(self._lines, episode.signals.T, strict=False):
+                for line, values in zip(self._lines, episode.signals.T, strict=True):
                     line.set_data(np.arange(len(values))[: t + 1], values[: t + 1])
-                if self._rows is not None:
-                    shown = np.full(self._rows.get_array().shape, np.nan)
-                    shown[:, : min(t + 1, len(episode.signals))] = episode.signals[: t + 1].T
-                    self._rows.set_data(shown)
                 self._axes.set_title(
                     f"episode {number}, step {t}: cost so far {cost_so_far[t]:.2f}", loc="left", fontsize=9, color=INK
                 )
@@ -206,7 +176,7 @@ def save_gif(
     :param path: The file; its folder exists.
     :param images: RGB images.
     :param durations: Duration of each image, in ms.
-    :param palette: An image whose palette to use; default: 256 colours of eight of the images.
+    :param palette: An image with the palette to use; default: 256 colours from eight of the images.
     """
     if palette is None:
         # MAXCOVERAGE keeps the colours of small objects, and k-means improves those of large ones.

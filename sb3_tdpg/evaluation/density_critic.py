@@ -38,11 +38,11 @@ class DensityCritic:
     r"""
     The critic :math:`F(x, \tilde x) = \log [r(\tilde x \mid x) / a(\tilde x) + 0.01]`, fitted without an optimiser.
 
-    For a Gaussian channel from the state to the TRVs it has the form of the optimal critic.
+    For a Gaussian channel from the state to the TRVs, the optimal critic has this form.
 
     - r is a Gaussian around a regression of the encoder's means on the state: a ridge regression plus a kernel ridge
-      regression of its residuals. The covariance of r is that of the residuals plus the encoder's variance. The
-      logarithm of this variance is predicted by the same kind of regression.
+      regression of its residuals. The covariance of r is that of the residuals plus the encoder's variance. The same
+      kind of regression predicts the logarithm of the encoder's standard deviation.
     - a is a smoothed mixture of the encoder's densities: every mean is moved towards the centre, and each density is
       widened so that the covariance of the mixture stays the same. A smoothing of 0 gives the mixture itself, and 1
       gives a Gaussian.
@@ -90,7 +90,7 @@ class DensityCritic:
         return log_density + self._noise_log_volume
 
     def _log_mixture(self, points: np.ndarray, smoothing: float, own: np.ndarray | None = None) -> np.ndarray:
-        """Return the log-density of the smoothed mixture at rotated points, without their ``own`` components."""
+        """Return the log-density of the smoothed mixture at rotated points, for each without its ``own`` component."""
         variances = self._variances + smoothing * self._spread
         log_density = log_gaussians(points, math.sqrt(1 - smoothing) * self._components, variances)
         if own is not None:
@@ -202,8 +202,8 @@ def _choose_ridge(
     :param basis: Orthonormal columns ``(n, R)``, with their squared singular values ``values``, ``(R,)``.
     :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
     :param leverage: Leverage of each episode in the fit of the mean that was subtracted from the targets.
-    :param spare_before: ``1 - h``, ``(n, Y)``, if the targets are residuals of an earlier regression, in which an
-        episode has the leverage h.
+    :param spare_before: If the targets are residuals of an earlier regression: ``1 - h``, ``(n, Y)``, with the leverage
+        h of each episode in that regression.
     :return: the shrinkage factors of the projections, ``(R, Y)``, and the leave-one-out residuals, ``(n, Y)``
     """
     n = len(targets)
@@ -222,7 +222,7 @@ def _choose_ridge(
 
 
 def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return a map to noise of variance 1 and a diagonal covariance, that diagonal, and the map's log-determinant."""
+    """Return a map that whitens the noise and diagonalises the covariance, the diagonal, and the log-determinant."""
     scale = 1 / np.sqrt(noise)
     values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
     return vectors.T * scale, np.maximum(values, 0.0), float(np.log(scale).sum())

@@ -39,8 +39,9 @@ def enjoy(
     :param seed: Seed of the environment and of the policy's sampling.
     :param n_episodes: Number of episodes.
     :param deterministic: Act without noise, which changes the policy: see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param record: File for a video, ``.gif`` or ``.mp4``. The TRVs are drawn below the picture; for other models, the
-        actions are drawn. If the environment has a method ``film``, it returns the pictures between two steps.
+    :param record: File for a video, ``.gif`` or ``.mp4``. The TRVs are drawn below the picture; for models without
+        TRVs, the actions. If the environment has a method ``film``, the video also shows the pictures between two steps
+        that this method returns.
     :return: the episodes; without ``record`` they have no pictures
     :raises ValueError: if the model cannot be loaded or does not fit the environment, or if the video cannot be made.
     """
@@ -78,7 +79,7 @@ def enjoy(
 
 
 class _Recorder(gym.Wrapper):
-    """Record pictures, and costs in double precision, which a vectorised environment loses at its automatic reset."""
+    """Keep an episode's pictures and exact costs, which a vectorised environment loses at its automatic reset."""
 
     def __init__(self, env: gym.Env, with_pictures: bool) -> None:
         super().__init__(env)
@@ -89,7 +90,7 @@ class _Recorder(gym.Wrapper):
         result = self.env.reset(**kwargs)
         self.costs: list[float] = []
         self.between: list[list[np.ndarray]] = []
-        self.pictures = [self._picture()] if self.with_pictures else []
+        self.pictures: list[Any] = [self.env.render()] if self.with_pictures else []
         return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -98,15 +99,6 @@ class _Recorder(gym.Wrapper):
         if self.film is not None:
             self.between.append(list(self.film()))
         if self.with_pictures:
-            self.pictures.append(self._picture())
+            self.pictures.append(self.env.render())
         recorded = (self.pictures, self.costs, self.between)
         return observation, reward, terminated, truncated, {**info, "recorded": recorded}
-
-    def _picture(self) -> np.ndarray:
-        try:
-            picture: Any = self.env.render()
-        except gym.error.DependencyNotInstalled as e:
-            raise ValueError(f"{self.env} cannot be drawn: {e}") from e
-        if not (isinstance(picture, np.ndarray) and picture.ndim == 3 and picture.dtype == np.uint8):
-            raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
-        return picture

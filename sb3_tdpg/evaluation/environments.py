@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_pkl
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
 
 from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.problem import read_problem
@@ -20,8 +20,8 @@ def scenario_env(scenario: Scenario, model: Any, *, n_episodes: int, n_envs: int
     """
     Make a new environment of a scenario (see ``make_episodes_env``), wrapped as an SB3 model needs it.
 
-    If the model's own environment normalises observations (``VecNormalize``), the new environment does so with the
-    same, frozen statistics. If the model's observations are stacked (``VecFrameStack``), the new observations are
+    If the model's own environment normalises observations (``VecNormalize``), the new environment normalises them with
+    the same, frozen statistics. If the model's observations are stacked (``VecFrameStack``), the new observations are
     stacked, too. The scenario's ``sensor`` wraps the environment, inside the wrappers of the model.
 
     :raises ValueError: if a model of TDPG was trained on normalised observations, and their statistics are missing.
@@ -43,16 +43,11 @@ def wrapped_for(model: Any, env: VecEnv) -> VecEnv:
         normalize.set_venv(env)
         normalize.training = normalize.norm_reward = False
         env = normalize
-    env = stacked_for(model, env)
-    space = env.observation_space
-    parts = space.values() if isinstance(space, spaces.Dict) else [space]
-    if any(is_image_space(p) and not is_image_space_channels_first(p) for p in parts if isinstance(p, spaces.Box)):
-        env = VecTransposeImage(env)  # as SB3 wraps the environment that it trains on
-    return env
+    return BaseAlgorithm._wrap_env(stacked_for(model, env), verbose=0)  # transposes images as for the training
 
 
 def check_statistics(model: Any, normalize: VecNormalize | None) -> None:
-    """Raise a ``ValueError`` if a model of TDPG was trained on normalised observations, and has no statistics."""
+    """Raise a ``ValueError`` if the statistics of the normalised observations of a TDPG model are missing."""
     if normalize is None and getattr(model, "normalizes", False):
         raise ValueError(
             "the policy was trained on normalised observations, and there are no statistics of VecNormalize: load the "
@@ -76,7 +71,8 @@ def load_statistics(path: Path, env: VecEnv, model: Any = None) -> VecNormalize:
     """
     Normalise an environment as in training, with the statistics that ``VecNormalize.save`` wrote.
 
-    :param model: Model whose observations are stacked before the normalisation if the statistics are of stacked ones.
+    :param model: Model with stacked observations. They are stacked before the normalisation if the statistics have the
+        shape of the stacked observations.
     :raises ValueError: if the file is damaged.
     """
     try:

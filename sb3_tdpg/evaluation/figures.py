@@ -54,9 +54,9 @@ def training_curves(progress: Mapping[str, pd.DataFrame]) -> Figure:
 
 def information_timeline(frame: pd.DataFrame) -> Figure:
     """
-    Draw the interval for I[x_t; x~_t] over the time steps, and mark the bounds that give its limits.
+    Draw the interval for I[x_t; x~_t] over the time steps, with a marker for the bound that gives each limit.
 
-    :param frame: Result of :func:`~sb3_tdpg.evaluation.interval_frame`.
+    :param frame: The frame of an :class:`~sb3_tdpg.evaluation.InformationReport`.
     """
     figure, ((axes,),) = new_panels(WIDTH * 0.75, 3.4)
     t, lower, upper = frame["t"], frame["lower"], frame["upper"]
@@ -83,7 +83,7 @@ def knowledge_map(frame: pd.DataFrame) -> Figure:
     """
     Draw the information in the TRVs about each component of the state at each time step, as a heat map.
 
-    Constant components are grey. Values in brackets are not distinguishable from 0.
+    Constant components are grey. Values in brackets have a lower confidence limit of 0.
 
     :param frame: Result of :func:`~sb3_tdpg.evaluation.state_knowledge`.
     :raises ValueError: if the frame has no component.
@@ -117,7 +117,7 @@ def knowledge_map(frame: pd.DataFrame) -> Figure:
 
 
 def short_name(row: str) -> str:
-    """Shorten the name of a row for a tick label: "Sensor noise 0.10" -> "0.10"."""
+    """Shorten the name of a scenario for a tick label: "Sensor noise 0.10" -> "0.10"."""
     last = row.rsplit(" ", 1)[-1]
     return last if last[0].isdigit() else "0" if row == "Training" else row
 

@@ -23,7 +23,7 @@ from sb3_tdpg.envs.scenarios import Scenario
 from sb3_tdpg.evaluation.density_critic import Regression
 from sb3_tdpg.evaluation.environments import check_env_fits, scenario_env
 from sb3_tdpg.evaluation.figures import information_timeline, knowledge_map
-from sb3_tdpg.evaluation.interval import InformationInterval, component_estimates, information_interval
+from sb3_tdpg.evaluation.interval import CONFIDENCE, InformationInterval, component_estimates, information_interval
 from sb3_tdpg.evaluation.interval_bounds import MAX_TRAINING
 from sb3_tdpg.evaluation.randomness import evaluation_seeds
 from sb3_tdpg.evaluation.rollout import rollout
@@ -44,7 +44,7 @@ class InformationBounds(NamedTuple):
     """Bounds on the information, summed over the time steps of an episode, in nats."""
 
     upper: float  # upper bound on I[x_t; x~_t]: the log-det bound
-    lower: float  # lower bound on I[encoder input; x~_t]; this is I[x_t; x~_t] without memory and sensor noise
+    lower: float  # lower bound on I[encoder input; x~_t], which equals I[x_t; x~_t] without memory and sensor noise
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,17 @@ class InformationReport:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The interval as a frame; see :func:`interval_frame`."""
-        return interval_frame(self.interval)
+        """
+        The interval as a frame with a row for each time step.
+
+        The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the names of the bounds that give them,
+        ``lower_name`` and ``upper_name``, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``,
+        ``marginal``) and ``n_episodes``.
+        """
+        interval = self.interval
+        columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
+        t = np.arange(len(interval.lower))
+        return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
     def figures(self) -> dict[str, Figure]:
         """Draw the interval over time (``"timeline"``) and the map of the components (``"knowledge"``)."""
@@ -74,7 +83,7 @@ class InformationReport:
         left_out = f", {n_left_out} steps with too few of them left out" if n_left_out else ""
         return (
             f"I[x_t; x~_t], summed over time: {lower:.2f} to {upper:.2f} nat "
-            f"({self.interval.confidence:.0%} at each step, {len(self.costs)} episodes{left_out})"
+            f"({CONFIDENCE:.0%} at each step, {len(self.costs)} episodes{left_out})"
         )
 
 
@@ -86,7 +95,7 @@ def information_report(
 
     :param model: A :class:`~sb3_tdpg.tdpg.TDPG` with the spaces and the horizon of ``env``.
     :param env: A ``VecEnv`` with any number of environments.
-    :param n_episodes: Number of episodes N; with fewer environments they are run in rounds.
+    :param n_episodes: Number of episodes N; if there are fewer environments, the episodes are run in rounds.
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
     :param at_end: Called at the end of each of the ``ESTIMATES``.
     :raises ValueError: if model and environment do not fit, or there are too few episodes for an interval.
@@ -123,9 +132,9 @@ def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None,
 
     :param batch: Rollouts ``(T, N, ...)``, for instance from :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
     :param names: Names of the X components; default: ``x0``, ``x1``, ...
-    :return: A row for each time step and component, with the columns ``t``, ``component``, ``nats`` (a lower bound on
-        I[x^k_t; x~_t], clipped at 0), ``nats_lower`` (its confidence limit of 95 %, clipped at 0) and ``r2`` (of a
-        leave-one-out regression of the component on the TRVs, clipped at 0). Values are NaN where a component is
+    :return: A row for each time step and component. The columns are ``t``, ``component``, ``nats`` (estimate of a lower
+        bound on I[x^k_t; x~_t]), ``nats_lower`` (95 % confidence limit of this bound) and ``r2`` (of a leave-one-out
+        regression of the component on the TRVs). The last three are clipped at 0. Values are NaN where a component is
         constant and where too few episodes are alive. Components that are constant at all time steps are left out.
     """
     horizon, _, n_components = batch.states.shape
@@ -147,19 +156,6 @@ def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None,
     return pd.DataFrame(
         dict(t=np.repeat(np.arange(horizon), len(shown)), component=[names[k] for k in shown] * horizon, **values)
     )
-
-
-def interval_frame(interval: InformationInterval) -> pd.DataFrame:
-    """
-    Convert an interval to a frame with a row for each time step.
-
-    The columns are ``t``, the limits ``lower`` and ``upper`` in nats, the names of the bounds that give them,
-    ``lower_name`` and ``upper_name``, the estimate of each bound (``critic``, ``gaussian``, ``logdet``, ``loo``,
-    ``marginal``) and ``n_episodes``.
-    """
-    columns = {name: getattr(interval, name) for name in ("lower", "upper", "lower_name", "upper_name")}
-    t = np.arange(len(interval.lower))
-    return pd.DataFrame(dict(t=t, **columns, **interval.estimates, n_episodes=interval.n_episodes))
 
 
 def encode_episodes(model: Any, env: VecEnv, *, seed: int = 0) -> tuple[InformationBatch, np.ndarray]:
@@ -193,9 +189,10 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     """
     Return an upper and a lower bound on the information of a batch, summed over time.
 
-    A step with too few living episodes for an estimate counts as much as the last step with enough episodes. If it
-    counted as 0, policies with many TRVs, which need more episodes, would seem to have less information. The estimate
-    of the lower bound can exceed the upper bound, because the TRVs are sampled. It is clipped at the upper bound.
+    A step with too few living episodes for an estimate counts as much as the last step with enough episodes. Policies
+    with many TRVs need more episodes for an estimate. If the step counted as 0, they would seem to have less
+    information. The estimate of the lower bound can exceed that of the upper bound, because the TRVs are sampled. It is
+    therefore clipped at the upper bound.
 
     :param batch: Result of :func:`encode_episodes`, ``(T, N, ...)``.
     """
@@ -223,8 +220,8 @@ def _lower_bound(at_t: InformationBatch) -> float:
 
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
     :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0 given
-    the encoder's inputs. This difference is the control variate. If the mixture were Gaussian, it would remove all of
-    the noise.
+    the encoder's inputs. This difference is the control variate. If the mixture were Gaussian, the control variate
+    would remove all of the noise.
     """
     log_density = log_density_matrix(at_t)[0].double()
     own = log_density.diagonal() - log_density.logsumexp(dim=1) + math.log(len(log_density))  # (N,)

@@ -1,4 +1,4 @@
-"""A callback that logs a confidence interval of the information."""
+"""Log a confidence interval of the information during training."""
 
 import warnings
 
@@ -12,21 +12,21 @@ from sb3_tdpg.problem import read_problem
 
 class InformationCallback(TDPGCallback):
     """
-    Log a confidence interval (95 %) of the information, in addition to the estimate that the policy is trained with.
+    Log a 95 % confidence interval of the information, in addition to the estimate that the policy is trained with.
 
     The interval is computed from the epoch's rollouts, which were made with the current policy. The callback works
     without the penalty and does not change the training. The keys ``mi/lower`` and ``mi/upper`` are the limits summed
     over time. The keys ``mi/lower_t00``, ``mi/upper_t00``, ... are the limits of each time step (TensorBoard only). The
     keys ``mi/knows_d``, ... are lower bounds of the information about each component of the state, averaged over the
-    time steps at which the component varies. Components are named as in the environment's ``state_names``, without the
-    unit, or ``x0``, ``x1``, ...; long keys are left out on the console.
+    time steps at which the component varies. The name of a component is that in the environment's ``state_names``,
+    without the unit, or ``x0``, ``x1``, ... The console does not show long keys.
 
     If the time steps share their weights, the interval uses one random step of each episode, since the steps of an
     episode are not independent. Every episode then has the same weight. An epoch with too few episodes is skipped with
     a warning.
 
     :param eval_freq: Number of epochs from one interval to the next, beginning with the first epoch.
-    :raises ValueError: if ``eval_freq`` is below 1, and at the start of the training if an epoch has too few episodes.
+    :raises ValueError: if ``eval_freq`` is below 1.
     """
 
     def __init__(self, eval_freq: int = 10) -> None:
@@ -35,16 +35,6 @@ class InformationCallback(TDPGCallback):
             raise ValueError(f"eval_freq={eval_freq} must be at least 1 (epochs)")
         self.eval_freq = eval_freq
         self.interval: InformationInterval | None = None  # the latest
-
-    def _on_training_start(self) -> None:
-        model, needed = self.tdpg, min_episodes(self.tdpg.policy.trv_dim)
-        n_episodes = model.epoch_size // model.horizon
-        # With epoch_steps an epoch may have more episodes, if some end early.
-        if model.epoch_steps is None and n_episodes < needed:
-            raise ValueError(
-                f"n_episodes={n_episodes} is too small for an interval of the information in {model.policy.trv_dim} "
-                f"TRVs: use at least {needed}"
-            )
 
     def _on_rollout_end(self) -> None:
         model = self.tdpg
@@ -64,7 +54,7 @@ class InformationCallback(TDPGCallback):
             t = (np.random.default_rng(model.epoch).random(n_episodes) * lengths).astype(int)
             batch = InformationBatch(*(x[t, np.arange(n_episodes)][None] for x in batch[:4]))
         self.interval = information_interval(batch, seed=model.epoch)
-        # As for mi/total, the values are those of an episode, also if its steps share one estimate.
+        # As for mi/total, the values are sums over an episode, even if its steps share one estimate.
         n_steps = model.rollout_buffer.mean_length if model.pools_information else 1.0
         for limit, total in zip(("lower", "upper"), self.interval.total, strict=True):
             self.logger.record(f"mi/{limit}", total * n_steps)

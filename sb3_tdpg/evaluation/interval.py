@@ -1,5 +1,5 @@
 """
-Confidence intervals for I[x_t; x~_t] from named lower and upper bounds.
+Compute confidence intervals for I[x_t; x~_t] from several lower and upper bounds.
 
 Dimension key: T time steps, N episodes, X state, Z TRVs.
 """
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-import torch as th
 from scipy.special import owens_t
 
 from sb3_tdpg.common.threads import threads
@@ -27,8 +26,9 @@ from sb3_tdpg.information.base import InformationBatch
 
 MIN_EPISODES = 20
 TINY = 1e-12  # nats
-COMPONENT_CONFIDENCE = 0.95  # of the one-sided lower limit for a component of the state
-# Shares of the error probability. The rest allows for skewness, which turns 2 % into about 3 % above and 1.5 % below.
+CONFIDENCE = 0.95  # of the interval of a time step, and of the one-sided lower limit for a component of the state
+# Shares of the error probability of the lower and the upper limit. The rest allows for skewness, which turns 2 % into
+# about 3 % above and 1.5 % below.
 SPENT_BELOW, SPENT_ABOVE = 0.6, 0.2
 
 LOWER_BOUNDS = ("critic", "gaussian")
@@ -37,7 +37,7 @@ UPPER_BOUNDS = ("logdet", "loo", "marginal")
 
 @dataclass(frozen=True)
 class InformationInterval:
-    """Confidence limits of I[x_t; x~_t] at every time step, in nats; NaN with fewer than ``min_episodes`` alive."""
+    """95 % confidence limits of I[x_t; x~_t] at each time step, in nats; NaN with fewer than ``min_episodes`` alive."""
 
     lower: np.ndarray
     """``(T,)``: lower confidence limits, never below 0."""
@@ -54,8 +54,6 @@ class InformationInterval:
     """Standard error of each estimate, ``(T,)``, by name."""
     n_episodes: np.ndarray
     """``(T,)``: number of living episodes."""
-    confidence: float
-    """Minimum probability that the interval of a step contains the true value."""
 
     @property
     def total(self) -> tuple[float, float]:
@@ -77,14 +75,14 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
     Divide the error probability between two limits, given the gap between their bounds.
 
-    The true value lies in the gap, and a limit that is far from it cannot miss it. In the worst case the true value is
-    at either end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that are c
-    standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets half
-    of the probability. With a wide gap each limit gets the whole probability, because the true value can be
-    close to one of them only.
+    The true value lies in the gap, and a limit that is far from the true value cannot miss it. In the worst case the
+    true value is at one end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that
+    are c standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets
+    half of the probability. With a wide gap each limit gets the whole probability, because the true value can be close
+    to only one limit.
 
     :param miss: Probability that either limit misses the true value.
-    :param gap: Upper minus lower bound, in standard errors; negative values and NaN count as 0.
+    :param gap: Upper minus lower estimate, in standard errors; negative values and NaN count as 0.
     """
     from scipy.optimize import brentq  # its import takes half a second
 
@@ -102,11 +100,11 @@ def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     r"""
     Return how many standard errors any of several correlated Gaussians exceeds with a probability of at most ``miss``.
 
-    Hunter's inequality (1976, Journal of Applied Probability 13(3)) bounds this probability by the sum of the single
-    probabilities minus the joint probabilities of the first Gaussian with each other one. With Owen's function T, the
-    bound for c standard errors is :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully
-    correlated Gaussians give the quantile of a single Gaussian, and independent ones about Bonferroni's quantile.
-    ``miss`` must be below 0.5.
+    Hunter's inequality (1976, Journal of Applied Probability 13(3)) gives the following upper bound: the sum of the
+    probabilities that each Gaussian exceeds this limit, minus the probabilities that the first Gaussian and each other
+    Gaussian exceed it together. With Owen's function T, the bound for c standard errors is
+    :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
+    of a single Gaussian, and independent Gaussians give about Bonferroni's quantile. ``miss`` must be below 0.5.
     """
     from scipy.optimize import brentq
 
@@ -122,7 +120,7 @@ def limit(bounds: dict[str, Estimate], miss: float, sign: int) -> tuple[str, flo
     """
     Return the name and the value of the tightest upper limit (``sign=1``) or lower limit (``sign=-1``).
 
-    :param miss: Probability that any limit is on the wrong side of its bound's expectation.
+    :param miss: Probability that at least one limit is on the wrong side of the expectation of its bound.
     """
     if not bounds:
         return "", sign * math.inf
@@ -148,33 +146,25 @@ def min_episodes(trv_dim: int) -> int:
 
 def _steps(batch: InformationBatch, seed: int) -> Iterator[tuple[int, Encoded, np.random.Generator]]:
     """Yield the time steps with enough living episodes, each with draws of the TRVs and a random generator."""
-    check_batch(batch)
     for t in np.flatnonzero(batch.living.sum(1).cpu() >= min_episodes(batch.trvs.shape[2])).tolist():
         rng = np.random.default_rng((seed, t))
         yield t, draw_trvs(batch.at(t), rng), rng
 
 
 @threads(1)
-def information_interval(batch: InformationBatch, *, confidence: float = 0.95, seed: int = 0) -> InformationInterval:
+def information_interval(batch: InformationBatch, *, seed: int = 0) -> InformationInterval:
     r"""
-    Compute confidence limits for I[x_t; x~_t] at every time step from fresh rollouts of a policy.
+    Compute confidence limits (95 %) for I[x_t; x~_t] at every time step from fresh rollouts of a policy.
 
     **Lower limits** come from the Donsker-Varadhan bound of a critic on x and x~,
 
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
     which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
-    on the others. There are two kinds of critics, and the larger bound counts:
+    on the others. Of two kinds of critics, the larger bound counts:
 
-    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to one half of the episodes and
-      evaluated on the other half, and vice versa. Up to 300 episodes are divided in three ways, since each division
-      misses some pairs.
-    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, which is fast to fit and therefore
-      fitted to more episodes: to all but two of eight groups (of five groups for more than 300 episodes), and evaluated
-      on these two. It is tighter if states and TRVs are about jointly Gaussian.
-
-    The means over episodes and pairs are taken over all critics of a kind before the logarithm. The encoder's density
-    alone gives no lower bound, because it bounds the information about the encoder's *input*, which can be larger.
+    - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to halves of the episodes;
+    - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, fitted to most of the episodes.
 
     **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
     e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
@@ -184,25 +174,12 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
     - ``"marginal"``: :math:`E \log q(\tilde x | e) / a(\tilde x)` with the marginal density a of the critic, also on
       fresh episodes.
 
-    Each episode uses the mean over several draws of x~ given e, since the encoder's density is known. Control variates
-    remove the deviation of the noise from its expected mean square. Both methods reduce the error and leave the
-    expectation unchanged.
-
-    Each limit is a multiple of the standard error away from its estimate. The lower limit spends three fifths of the
-    error probability, ``1 - confidence``, and the upper limit one fifth. The rest allows for the skewness of the
-    contributions of episodes, where means that are too low come with standard errors that are too small. The
-    probabilities of the two limits also depend on the gap between the estimates (``miss_of_each_limit``). Each limit is
-    valid for all bounds of its side together, because the tightest bound is chosen (``joint_quantile``). The confidence
-    holds for each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot exceed about
-    ``ln(N^2 / 10)``.
+    The confidence of 95 % holds for each step alone. Above about ``ln N`` nats the lower limit becomes loose; it cannot
+    exceed about ``ln(N^2 / 10)``. ``docs/guide/information.md`` explains how the limits allow for the sampling error.
 
     :param batch: Rollouts ``(T, N, ...)`` of independent episodes that the encoder has not been trained on.
-    :param confidence: Minimum probability that the interval of a step contains the true value.
     :param seed: Seed of the divisions of the episodes and of the noise.
-    :raises ValueError: if ``confidence`` is not in (0, 1), or the batch fails ``check_batch``.
     """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1, for instance 0.95")
     horizon, n_episodes = len(batch.trvs), batch.living.sum(1).cpu().numpy()
     estimates, errors = ({name: np.full(horizon, np.nan) for name in LOWER_BOUNDS + UPPER_BOUNDS} for _ in range(2))
     limits = np.full((2, horizon), np.nan)
@@ -215,31 +192,28 @@ def information_interval(batch: InformationBatch, *, confidence: float = 0.95, s
             estimates[name][t], errors[name][t] = bound.value, bound.error
         below, above = ({name: b for name, b in side.items() if np.isfinite(b.value)} for side in (below, above))
         gap = _gap(below.values(), above.values())
-        miss = [miss_of_each_limit(spent * (1 - confidence), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)]
+        miss = [miss_of_each_limit(spent * (1 - CONFIDENCE), gap) for spent in (SPENT_BELOW, SPENT_ABOVE)]
         lower_by[t], lower = limit(below, miss[0], sign=-1)
         upper_by[t], upper = limit(above, miss[1], sign=1)
         if lower <= 0:
             lower_by[t], lower = "zero", 0.0
         upper = max(upper, 0.0)
         limits[:, t] = min(lower, upper), upper
-    return InformationInterval(
-        limits[0], limits[1], tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes, confidence
-    )
+    return InformationInterval(limits[0], limits[1], tuple(lower_by), tuple(upper_by), estimates, errors, n_episodes)
 
 
 def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     r"""
     Bound the information of the TRVs about each component of the state from below, I[x^k_t; x~_t].
 
-    The result is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
+    The bound is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
     state. If the TRVs depend on several components, their density given one component has a complicated shape, and the
     Gaussian critic gives the better bound.
 
     :param batch: As in :func:`information_interval`.
     :param seed: Seed of the division of the episodes and of the noise.
-    :return: the estimates and their lower limits, each with a confidence of 95 %, ``(T, X)`` each, nats; NaN where a
-        component is constant and where too few episodes are alive
-    :raises ValueError: if the batch fails ``check_batch``.
+    :return: the estimates of the bounds and their lower 95 % confidence limits, ``(T, X)`` each, in nats; NaN where a
+        component is constant or too few episodes are alive
     """
     values = np.full((2, len(batch.states), batch.states.shape[-1]), np.nan)
     for t, step, rng in _steps(batch, seed):
@@ -247,20 +221,5 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
             of_one = step._replace(states=step.states[:, [k]])
             bounds = dict(critic=critic_bounds(of_one, rng)[0], gaussian=gaussian_bound(of_one, rng))
             values[0, t, k] = max(bound.value for bound in bounds.values())
-            _, values[1, t, k] = limit(bounds, 1 - COMPONENT_CONFIDENCE, sign=-1)
+            _, values[1, t, k] = limit(bounds, 1 - CONFIDENCE, sign=-1)
     return values[0], values[1]
-
-
-def check_batch(batch: InformationBatch) -> None:
-    """Raise a ValueError if the shapes do not fit, a value is not finite, or a standard deviation is not positive."""
-    shapes = {name: tuple(getattr(batch, name).shape) for name in ("states", "trvs", "means", "stds")}
-    states, *others = shapes.values()
-    if len(states) != 3 or len(set(others)) != 1 or len(others[0]) != 3 or states[:2] != others[0][:2]:
-        raise ValueError(
-            f"the batch has shapes {shapes}: expected (T, N, X) for the states and (T, N, Z) for trvs, means and stds"
-        )
-    for name in shapes:
-        if not th.isfinite(getattr(batch, name)[batch.living]).all():
-            raise ValueError(f"the batch's {name} are not all finite")
-    if not (batch.stds[batch.living] > 0).all():
-        raise ValueError("the batch's stds must be positive: they are the encoder's standard deviations")

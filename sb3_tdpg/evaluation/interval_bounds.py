@@ -1,5 +1,5 @@
 """
-The bounds behind the limits of an information interval, each with its standard error, at one time step.
+Estimate the bounds that give the limits of an information interval at one time step, with their standard errors.
 
 Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode.
 """
@@ -63,12 +63,13 @@ def draw_trvs(batch: InformationBatch, rng: np.random.Generator) -> Encoded:
 
 def noise_controls(step: Encoded) -> np.ndarray:
     r"""
-    Return two control variates, ``(n, 2)``: by how much each episode's noise exceeds its expected size.
+    Return two control variates, ``(n, 2)``, which measure by how much each episode's noise exceeds its expected size.
 
-    Log-densities are about quadratic in the noise: the encoder's in units of its standard deviations, the marginal one
-    in units of the TRVs' covariance S. The control variates are :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and
-    :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with :math:`\nu = \tilde x - \mu`, averaged over
-    the draws. Their expectations are 0 for every distribution of the means and any S that is independent of the noise.
+    Log-densities are approximately quadratic in the noise. The units are the standard deviations for the encoder's
+    density, and the TRVs' covariance S for the marginal density. The control variates are
+    :math:`\sum_i (\nu_i^2 / \sigma_i^2 - 1)` and :math:`\nu^\top S^{-1} \nu - \sum_i S^{-1}_{ii} \sigma_i^2` with
+    :math:`\nu = \tilde x - \mu`, averaged over the draws. Their expectations are 0 for every distribution of the means
+    and any S that is independent of the noise.
     """
     scale = np.sqrt(np.square(step.stds).mean(axis=0))
     stds, centred = step.stds / scale, (step.means - step.means.mean(axis=0)) / scale
@@ -81,7 +82,7 @@ def noise_controls(step: Encoded) -> np.ndarray:
 
 class FreshPairs:
     """
-    Collect the scores F of frozen critics on fresh episodes and on all their pairs, for n episodes.
+    Collect the scores F of frozen critics on fresh episodes and on all pairs of these, for n episodes in total.
 
     Scores are clipped from above so that single pairs do not dominate the mean of e^F. A clipped critic is a valid
     critic, too.
@@ -103,7 +104,7 @@ class FreshPairs:
         self._pair_times[pairs] += 1
 
     def bound(self) -> Estimate:
-        """Bound the information from below; all episodes must have been fresh equally often, and at least once."""
+        """Bound the information from below; each episode must have been fresh equally often, at least once."""
         times = np.where(np.eye(len(self._times)), 0, self._pair_times)  # no episode is paired with itself
         ratios = np.divide(self._ratios, times, out=np.zeros_like(times), where=times > 0)
         return donsker_varadhan(self._joint / self._times, ratios, int((times > 0).sum()), self.log_clip)
@@ -113,7 +114,8 @@ def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Es
     """
     Fit critics to halves of the episodes and evaluate them on the other halves, averaged over several divisions.
 
-    A division misses the pairs of episodes from different halves. Three divisions of quarters cover all pairs.
+    One division into halves misses all pairs of episodes from different halves. Three divisions, each of which combines
+    quarters of the episodes to halves, cover all pairs.
 
     :return: the lower bound of the critic and the upper bound of its marginal density
     """
@@ -157,12 +159,12 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
     Compute the Donsker-Varadhan bound from the scores.
 
     With several critics, e^F is averaged over all of them before the logarithm. By Jensen's inequality the result is
-    still a lower bound, and its mean is estimated from more pairs. The mean is at least that of a few clipped pairs, so
-    that the bound stays finite where no episode's TRVs fit the state of another.
+    still a lower bound, and its mean is estimated from more pairs. The mean of e^F is at least that of ``MIN_HITS``
+    clipped pairs, so that the bound stays finite if no episode's TRVs fit the state of another.
 
     :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
     :param ratios: e^F of the TRVs of each episode with each state, ``(n, n)``; 0 where they are not paired.
-    :param n_pairs: Number of pairs, about equally many for each episode.
+    :param n_pairs: Number of pairs over all episodes; each episode is in about equally many pairs.
     :param log_clip: Upper bound of F.
     """
     n = len(joint)
@@ -175,8 +177,7 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
         # An episode contributes through its state and through its TRVs (Hoeffding's projection).
         influence = (ratios.sum(axis=0) + ratios.sum(axis=1)) * n / n_pairs / mean
         relative_variance = influence.var(ddof=1) / n
-        # The variance is at least that of as many independent pairs, since the projection can be almost constant by
-        # chance.
+        # The projection can be almost constant by chance, but the variance is at least that of independent pairs.
         parts = joint - influence
         least_variance = float(np.square(ratios).sum() / n_pairs / mean**2 - 1) / n_pairs
     # The logarithm of a mean is biased downward by half its relative variance.

@@ -10,7 +10,7 @@ from typing import Any
 from sb3_tdpg.evaluation.environments import load_statistics, stacked_for
 from sb3_tdpg.vec_env import make_episodes_env
 
-# A model is recognised by the module of its policy, or by a setting that only its algorithm has.
+# The first entry counts that is the beginning of the module of the policy, or the name of a setting of the algorithm.
 ALGORITHMS = {
     "sb3_tdpg.": "sb3_tdpg:TDPG",
     "sb3_contrib.common.recurrent.": "sb3_contrib:RecurrentPPO",
@@ -22,8 +22,6 @@ ALGORITHMS = {
     "stable_baselines3.dqn.": "stable_baselines3:DQN",
     "stable_baselines3.sac.": "stable_baselines3:SAC",
     "stable_baselines3.td3.": "stable_baselines3:TD3",  # and DDPG, which acts in the same way
-}
-SETTINGS = {
     "mi_estimator": "sb3_tdpg:TDPG",
     "cg_max_steps": "sb3_contrib:TRPO",
     "clip_range": "stable_baselines3:PPO",
@@ -39,7 +37,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     Hub), the observations are normalised as in training. Loading unpickles the file, which can run any code: load only
     files that you trust.
 
-    :param path: The file that ``model.save`` wrote.
+    :param path: The ``.zip`` file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
     :param env_kwargs: Keywords of the environment.
     :raises ValueError: if the file cannot be read, or its algorithm is unknown.
@@ -52,8 +50,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
         raise ValueError(f"{path} cannot be read ({reason}): give the .zip file that model.save() wrote") from e
     policy = settings.get("policy_class")
     module = str(policy.get("__module__", "")) if isinstance(policy, dict) else ""
-    known = [name for prefix, name in ALGORITHMS.items() if module.startswith(prefix)]
-    known += [name for setting, name in SETTINGS.items() if setting in settings]
+    known = [name for mark, name in ALGORITHMS.items() if module.startswith(mark) or mark in settings]
     if not known:
         raise ValueError(f"{path} is of an unknown algorithm: load it in Python")
     package, name = known[0].split(":")
@@ -61,14 +58,9 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
         model = getattr(import_module(package), name).load(path, device="cpu")
     except Exception as e:
         reason = " ".join(str(e).split())
-        if str(path) in reason:
-            raise ValueError(reason) from e
         raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
     if found := statistics_beside(path):
-        try:
-            env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
-        except Exception as e:
-            raise ValueError(f"{env_id} cannot be made with {dict(env_kwargs)}: {e}") from e
+        env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
         model.set_env(stacked_for(model, load_statistics(found, env, model)))
     return model
 
@@ -77,10 +69,8 @@ def statistics_beside(path: Path) -> Path | None:
     """
     Return the file with the statistics of observations of a model, or ``None`` if there is none.
 
-    The file is called ``vecnormalize.pkl`` by rl-zoo3 and ``vec_normalize.pkl`` on the Hub.
-
-    It lies beside the model or in a folder with the model's name. For ``<id>_1/best_model.zip`` it lies in
-    ``<id>_1/<id>/``.
+    The file is searched beside the model and in a folder with the model's name. For ``<id>_1/best_model.zip`` it is
+    also searched in ``<id>_1/<id>/``.
     """
     folder = path.parent
     folders = [folder, path.with_suffix(""), folder / folder.resolve().name.rpartition("_")[0]]

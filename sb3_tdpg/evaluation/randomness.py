@@ -33,8 +33,8 @@ def isolated_randomness(seed: int, model: Any) -> Iterator[None]:
     """
     Seed every generator that ``model.predict`` may sample from, and restore all of them afterwards.
 
-    They are the global generators of torch, NumPy and Python, and that of the model's action space, which DQN uses to
-    explore.
+    These generators are the global ones of torch, NumPy and Python, and that of the model's action space, with which
+    DQN explores.
     """
     numpy_state, python_state, action_space = np.random.get_state(), random.getstate(), model.action_space  # noqa: NPY002
     device = th.device(getattr(model, "device", "cpu"))

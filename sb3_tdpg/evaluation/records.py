@@ -5,7 +5,6 @@ Dimension key: T horizon, N episodes, X state.
 """
 
 import contextlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
@@ -40,30 +39,30 @@ def evaluate_scenarios(
     """
     Run models in scenarios and record every episode.
 
-    The frame has one row for each model, scenario and episode, in this order, with the columns ``model``, ``scenario``,
-    ``env_id``, ``episode``, ``cost`` (the negative return), ``length`` (steps), ``final_*`` (every number in the last
-    ``info``; the components of an array are ``final_state_0``, ...), ``seed`` and ``deterministic``. If the
-    environment reports ``info["is_success"]``, there is also a column ``failure``.
+    The frame has one row for each model, scenario and episode, in this order. The columns are ``model``, ``scenario``,
+    ``env_id``, ``episode``, ``cost`` (the negative return), ``length`` (steps), ``final_*``, ``seed`` and
+    ``deterministic``. Every number in the last ``info`` has a column ``final_*``; the components of an array are
+    ``final_state_0``, ... If the environment reports ``info["is_success"]``, there is also a column ``failure``.
 
-    The same seed gives the same frame. In a scenario all models start from the same initial states, and they meet the
-    same noise if the number of random numbers that the environment draws does not depend on the actions. Under the same
-    condition, all scenarios of one environment share their initial states and noise. The global random generators are
-    restored at the end.
+    The same seed gives the same frame. In a scenario all models start from the same initial states. If the number of
+    random numbers that the environment draws does not depend on the actions, the models also meet the same noise, and
+    all scenarios of one environment share their initial states and noise. The global random generators are restored at
+    the end.
 
     :param model: One SB3 model, or a mapping from labels to models.
     :param scenarios: The scenarios to run, in the order of the rows.
-    :param n_episodes: Number of episodes of each model in each scenario that has no number of its own.
+    :param n_episodes: Number of episodes of each model in each scenario without an ``n_episodes`` of its own.
     :param seed: Seed of the environments and of the policies' sampling.
     :param deterministic: Act without noise. The default is the stochastic policy, which the paper's tables use.
     :param env_kwargs: Keywords for the environments of all scenarios; a scenario's own keywords take precedence.
-    :param labels: Constant columns to put in front, for instance ``dict(train_seed=3)``.
+    :param labels: Names and values of constant columns to add in front, for instance ``dict(train_seed=3)``.
     :param progress_bar: Show a progress bar.
     :raises ValueError: if an argument is invalid; no episode has been run then.
     """
-    models = _named_models(model)
+    models = dict(model) if isinstance(model, Mapping) else {type(model).__name__: model}
     rows = [scenario.with_kwargs(**(env_kwargs or {})) for scenario in scenarios]
     labels = labels or {}
-    _check_arguments(rows, n_episodes, labels)
+    _check_arguments(models, rows, n_episodes)
     check_models_fit(models, rows)
 
     frames = []
@@ -123,20 +122,15 @@ def rollout_states(
     """
     Run episodes of a fixed horizon side by side and keep the true states ``info["state"]``.
 
-    :param scenario: A scenario whose environment has a horizon and reports its state.
+    :param scenario: A scenario whose environment reports its state and ends each episode at the horizon.
     :return: the states, ``(T + 1, N, X)``, and the costs of the whole episodes, ``(N,)``
-    :raises ValueError: if the model does not fit, or an episode ends before the horizon.
     """
-    check_models_fit({type(model).__name__: model}, [scenario])
     states: list[Any] = []
     costs = np.zeros(n_episodes)
     with contextlib.closing(scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)) as env:
         problem = read_problem(env)
         steps = rollout(model, env, seeds=evaluation_seeds(seed), problem=problem)
         for step in islice(steps, problem.horizon):
-            if step.dones.any() and len(states) < problem.horizon - 1:
-                ended = f"an episode ended after {len(states) + 1} of {problem.horizon} steps"
-                raise ValueError(f"{ended}: rollout_states needs episodes of equal length")
             states.append(step.states)
             costs -= step.rewards
         states.append(np.stack([np.ravel(info["state"]) for info in step.infos]))
@@ -160,24 +154,14 @@ def _final_columns(info: Mapping[str, Any]) -> dict[str, float]:
     return columns
 
 
-def _named_models(model: Any) -> dict[str, Any]:
-    models = dict(model) if isinstance(model, Mapping) else {type(model).__name__: model}
-    if not models:
-        raise ValueError("model is an empty mapping: give at least one model, for instance {'TDPG': model}")
-    for label, each in models.items():
-        if isinstance(each, type) or getattr(each, "policy", None) is None:
-            raise ValueError(f"model {label!r} is {each!r}, expected a Stable-Baselines3 model with a policy")
-    return models
-
-
-def _check_arguments(scenarios: Sequence[Scenario], n_episodes: int, labels: Mapping[str, Any]) -> None:
-    if not scenarios:
-        raise ValueError("scenarios is empty: give at least one, for instance sb3_tdpg.envs.scenarios.LAVA")
-    counts = Counter(scenario.name for scenario in scenarios)
-    if twice := sorted(name for name, count in counts.items() if count > 1):
-        raise ValueError(f"scenario names must differ, but {twice} occur more than once")
+def _check_arguments(models: Mapping[str, Any], scenarios: Sequence[Scenario], n_episodes: int) -> None:
+    if not (models and scenarios):
+        raise ValueError("give at least one model and one scenario, for instance sb3_tdpg.envs.scenarios.LAVA")
+    for label, model in models.items():
+        if getattr(model, "policy", None) is None:
+            raise ValueError(f"model {label!r} is {model!r}, expected a Stable-Baselines3 model with a policy")
+    names = [scenario.name for scenario in scenarios]
+    if len(set(names)) < len(names):
+        raise ValueError(f"scenario names must differ, not {names}")
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
         raise ValueError(f"n_episodes={n_episodes!r} must be an integer of at least 1: the episodes per scenario")
-    taken = [name for name in labels if name in {*COLUMNS, "failure"} or name.startswith("final_")]
-    if taken:
-        raise ValueError(f"labels={dict(labels)}: {taken} are names of columns already, choose others")

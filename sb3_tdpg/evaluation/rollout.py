@@ -53,18 +53,18 @@ def rollout(
     Run a policy and yield every step.
 
     As in SB3's ``evaluate_policy``, each environment has a quota of episodes, because the first N episodes that finish
-    would be short ones. After its quota an environment runs on, with a cleared memory. Only steps with ``finished`` end
-    an episode that counts.
+    would be mostly short episodes. After its quota an environment continues to run, and the policy's memory is cleared
+    at every step. Only steps with ``finished`` end an episode that counts.
 
     With ``seeds`` the rollout uses the global random generators until it ends, so do not draw from them in the body of
-    the loop. They are restored when the loop ends, also by ``break`` or an exception.
+    the loop. The generators are restored when the loop ends, also by ``break`` or an exception.
 
     :param model: An SB3 model, or an object with the same method ``predict``.
     :param env: E environments; they are reset first. MaskablePPO gets their ``action_masks()``.
     :param n_episodes: Number of episodes of all environments together; ``None``: run until the caller stops.
     :param seeds: Seeds of the environments and of the policy's sampling; ``None``: use the generators as they are.
     :param deterministic: Act without noise; see :meth:`~sb3_tdpg.TRVPolicy.predict`.
-    :param problem: Result of ``read_problem(env)``, to yield the true states, too.
+    :param problem: Result of ``read_problem(env)``. If given, the true states are yielded, too.
     :param encode: Whether to yield the TRVs with their densities, too (only for TDPG models and a stochastic policy).
     :param observe: Function that changes the observations before the policy gets them, for instance ``normalize_obs``.
     """

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdpg.evaluation.tables import one_or_all, require_columns, summary_table
+from sb3_tdpg.evaluation.tables import one_or_all, summary_table
 
 LEVEL = 0.95  # of the intervals
 N_BOOTSTRAP = 2000
@@ -29,7 +29,8 @@ def aggregate_seeds(records_by_seed: pd.DataFrame) -> pd.DataFrame:
         ``episode_std`` (interquartile mean over seeds of the standard deviation over episodes), ``n`` (episodes of a
         seed), ``level``, ``seed`` and ``deterministic``
     """
-    require_columns(records_by_seed, ["train_seed"])
+    if "train_seed" not in records_by_seed:
+        raise ValueError(f"the records have no column train_seed; they have {list(records_by_seed)}")
     rows = []
     for (model, scenario), group in summary_table(records_by_seed).groupby(["model", "scenario"], sort=False):
         means, stds = group[["mean", "std"]].to_numpy().T
@@ -45,11 +46,12 @@ def probability_of_improvement(records_by_seed: pd.DataFrame, model: str, contro
     """
     Estimate the probability that a seed of one method has a lower mean cost than a seed of another method.
 
-    The mean is over all given scenarios: the same policy runs in all of them, so they are resampled together.
+    The mean is over all given scenarios. The policy of a seed runs in all scenarios, so these are resampled together.
 
     :param records_by_seed: Records with a column ``train_seed``, of the scenarios to average over.
     :param control: Label of the method to compare with.
-    :return: the probability, 0.5 for no difference (a tie counts half), and the ends of its interval
+    :return: the probability, which is 0.5 if there is no difference (a tie counts half), and the ends of its 95 %
+        interval
     """
 
     def share(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -63,12 +65,13 @@ def probability_of_improvement(records_by_seed: pd.DataFrame, model: str, contro
 
 def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str) -> tuple[float, ...]:
     """
-    Estimate by how much the mean cost of a method exceeds that of another method, seed by seed.
+    Estimate the mean over seeds of the cost of one method minus the cost of another method with the same seed.
 
     Pairing removes the differences between seeds if both methods start from the same policy and run the same episodes.
 
     :param control: Label of the method to compare with; it must have the same seeds.
-    :return: the mean difference over seeds, negative if the method is better, and the ends of its interval
+    :return: the mean difference over seeds, which is negative if ``model`` costs less, and the ends of its 95 %
+        interval
     """
     means = _seed_means(records_by_seed, (model, control))
     seeds, of_control = (sorted(means[label].index) for label in (model, control))
@@ -84,7 +87,7 @@ def interquartile_means(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, 
 
     :param scores: ``(seeds, rows)``; each row is resampled on its own.
     :param seed: Seed of the resampling.
-    :return: the means and the ends of their intervals, each ``(rows,)``
+    :return: the means and the ends of their 95 % intervals, each ``(rows,)``
     """
     return _bootstrap(_interquartile_mean, scores, seed=seed)
 

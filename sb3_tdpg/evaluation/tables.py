@@ -15,11 +15,11 @@ def summary_table(records: pd.DataFrame) -> pd.DataFrame:
     Summarise the cost over the episodes of each model in each scenario, and of each ``train_seed`` if there are any.
 
     :param records: Result of :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :return: the columns ``model``, ``scenario``, ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem`` (standard
-        error of the mean), ``median``; ``failure_share`` if there is a column ``failure``; ``seed``, ``deterministic``
+    :return: a frame with the columns ``model``, ``scenario``, ``n`` (episodes), ``mean``, ``std`` (with n - 1), ``sem``
+        (standard error of the mean), ``median``, ``failure_share`` (if there is a column ``failure``), ``seed`` and
+        ``deterministic``
     """
     keys = [*(["train_seed"] if "train_seed" in records.columns else []), "model", "scenario"]
-    require_columns(records, [*keys, "cost", "seed", "deterministic"])
     if n_missing := int(records["cost"].isna().sum()):
         raise ValueError(f"{n_missing} of {len(records)} episodes cost NaN, and a mean over the others would hide them")
     groups = records.groupby(keys, sort=False, dropna=False)
@@ -50,18 +50,17 @@ def comparison_markdown(
     summary: pd.DataFrame, scenarios: Sequence[Scenario], *, quantity: str = "episode cost", digits: int = 2
 ) -> str:
     """
-    Write a Markdown table with a row for each scenario, and for each model its numbers beside the paper's.
+    Write a Markdown table with a row for each scenario and, for each model, columns of its numbers and the paper's.
 
     :param summary: Result of :func:`summary_table`, or of :func:`aggregate_seeds`; with the latter, a cell shows the
         interquartile mean over seeds and its interval.
     :param scenarios: The rows, in this order. The paper's numbers are shown for models whose label is a key of
         ``scenario.paper``.
     :param quantity: Name of the compared quantity, for the line below the table.
-    :return: the table, with our lowest number and the paper's lowest number of each row in bold, and a line on how the
-        table was made
+    :return: the table, and a line on how it was made; our lowest number and the paper's lowest number of each row are
+        bold
     """
     over_seeds = "iqm" in summary.columns
-    require_columns(summary, ["model", "scenario", *(("iqm", "low", "high") if over_seeds else ("mean", "std"))])
     if summary.duplicated(["model", "scenario"]).any():
         raise ValueError("the summary has several rows for a model in a scenario: use aggregate_seeds or select a seed")
     if missing := [scenario.name for scenario in scenarios if scenario.name not in set(summary["scenario"])]:
@@ -126,9 +125,3 @@ def one_or_all(values: pd.Series) -> Any:
     """Return the value that all rows share, or else all values as text: ``"0, 1, 2"``."""
     unique = values.unique()
     return unique[0] if len(unique) == 1 else ", ".join(str(value) for value in unique)
-
-
-def require_columns(frame: pd.DataFrame, columns: Sequence[str]) -> None:
-    """Raise a ``ValueError`` if a column is missing."""
-    if missing := [name for name in columns if name not in frame.columns]:
-        raise ValueError(f"the frame has no column {missing}; it has {list(frame.columns)}")

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp, rel_entr
 
-from sb3_tdpg.certificates.certificate import certificate, cost_distribution, entropic_risk, worst_mean
+from sb3_tdpg.certificates.certificate import (
+    CostDistribution,
+    certificate,
+    cost_distribution,
+    entropic_risk,
+    worst_mean,
+)
 
 
 def kl(p, q):
@@ -53,20 +59,18 @@ def test_the_best_beta_gives_the_worst_mean_within_the_divergence():
         beta = random.uniform(0.1, 3) / costs.std()
         tilted = p * np.exp(beta * (costs - costs.max()))
         tilted /= tilted.sum()
-        distribution = cost_distribution(costs, confidence=None)._replace(values=costs, probabilities=p)
-        found = worst_mean(distribution, kl(tilted, p))
-        assert found.bound == pytest.approx(tilted @ costs, rel=1e-5, abs=1e-5 * np.ptp(costs))
-        assert found.beta == pytest.approx(beta, rel=0.05)
-        assert found.risk + found.kl / found.beta == pytest.approx(found.bound)
+        found = worst_mean(CostDistribution(costs, p), kl(tilted, p))
+        assert found == pytest.approx(tilted @ costs, rel=1e-5, abs=1e-5 * np.ptp(costs))
 
 
 def test_a_divergence_of_nothing_gives_the_mean_and_a_large_one_the_largest_cost():
     costs = np.array([1.0, 2.0, 6.0])
-    assert certificate(costs, 0.0, confidence=None).bound == pytest.approx(3.0)
-    assert certificate(costs, math.log(3) + 1e-9, confidence=None).bound == 6.0
-    assert certificate(costs, math.inf, cost_bound=10.0).bound == 10.0
-    assert certificate(costs, math.log(3) - 0.01, confidence=None).bound < 6.0
-    assert certificate(np.full(4, 2.5), 1.0, confidence=None).bound == 2.5
+    exact = CostDistribution(costs, np.full(3, 1 / 3))
+    assert worst_mean(exact, 0.0) == pytest.approx(3.0)
+    assert worst_mean(exact, math.log(3) + 1e-9) == 6.0
+    assert certificate(costs, math.inf, cost_bound=10.0) == 10.0
+    assert worst_mean(exact, math.log(3) - 0.01) < 6.0
+    assert worst_mean(CostDistribution(np.full(4, 2.5), np.full(4, 0.25)), 1.0) == 2.5
 
 
 def test_the_printed_condition_is_met_where_the_printed_bound_fails():
@@ -104,7 +108,7 @@ def test_the_confidence_bound_covers_all_betas_at_once(name, n):
     n_covered = 0
     for _ in range(200):
         distribution = cost_distribution(sample(random, n), cost_bound, confidence=0.9)
-        risks = [worst_mean(distribution, 0.0).bound]
+        risks = [worst_mean(distribution, 0.0)]
         risks += [entropic_risk(distribution.values, beta, distribution.probabilities) for beta in betas]
         n_covered += (np.array(risks) >= np.append(truth[0], truth) - 1e-9).all()
     assert n_covered >= 175  # 180 expected if the band were exact; it is wider
@@ -116,24 +120,23 @@ def test_the_band_is_narrow_in_the_tail():
     assert distribution.probabilities.sum() == pytest.approx(1.0)
     assert (distribution.probabilities >= 0).all()
     assert 1 / len(costs) < distribution.probabilities[-1] < 15 / len(costs)
-    assert worst_mean(distribution, 0.0).bound < 0.5 + 1000 * 15 / len(costs) + 0.02
+    assert worst_mean(distribution, 0.0) < 0.5 + 1000 * 15 / len(costs) + 0.02
 
 
 def test_a_cap_cuts_off_no_more_than_the_level():
     costs = np.random.default_rng(7).exponential(1.0, 5000)
-    for confidence, bound in ((None, None), (0.95, 1e6)):
-        distribution = cost_distribution(costs, bound, confidence)
-        for level in (0.0, 1e-3, 0.1):
-            capped, beyond = distribution.capped(level)
-            assert capped.probabilities.sum() == pytest.approx(1.0)
-            assert capped.values[-1] <= costs.max()
-            assert (costs > capped.values[-1]).mean() <= beyond + 1e-12  # the band leaves more than the sample
-            assert beyond <= max(level, 1 - distribution.probabilities[:-1].sum()) + 1e-12
+    distribution = cost_distribution(costs, 1e6)
+    for level in (0.0, 1e-3, 0.1):
+        capped, beyond = distribution.capped(level)
+        assert capped.probabilities.sum() == pytest.approx(1.0)
+        assert capped.values[-1] <= costs.max()
+        assert (costs > capped.values[-1]).mean() <= beyond + 1e-12  # the band leaves more than the sample
+        assert beyond <= max(level, 1 - distribution.probabilities[:-1].sum()) + 1e-12
     assert distribution.capped(0.1)[0].values[-1] < distribution.capped(1e-3)[0].values[-1]
 
 
 def test_an_event_raises_the_lowest_costs_to_the_largest():
-    distribution = cost_distribution(np.array([0.0, 1.0, 2.0, 3.0]), confidence=None)
+    distribution = CostDistribution(np.arange(4.0), np.full(4, 0.25))
     raised = distribution.with_largest(0.3)
     np.testing.assert_allclose(raised.probabilities, [0.0, 0.2, 0.25, 0.55])
     np.testing.assert_allclose(distribution.with_largest(0.0).probabilities, distribution.probabilities)
@@ -141,10 +144,9 @@ def test_an_event_raises_the_lowest_costs_to_the_largest():
 
 
 BAD = {
-    "no cost bound": (dict(), "cost_bound=None must be finite"),
+    "no cost bound": (dict(cost_bound=math.inf), "cost_bound=inf must be finite"),
     "cost above the bound": (dict(cost_bound=2.0), "a cost of 3 exceeds cost_bound=2"),
     "confidence": (dict(cost_bound=5.0, confidence=1.0), "confidence=1.0 must lie between 0 and 1"),
-    "beta": (dict(cost_bound=5.0, beta=0.0), "beta=0.0 must be finite and positive"),
     "kl": (dict(cost_bound=5.0, kl=-0.1), "kl=-0.1 must be at least 0"),
     "nan": (dict(cost_bound=5.0, costs=np.array([1.0, np.nan])), "costs must be a vector of finite numbers"),
     "no costs": (dict(cost_bound=5.0, costs=np.array([])), "costs must be a vector of finite numbers"),

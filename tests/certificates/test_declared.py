@@ -7,10 +7,9 @@ import pytest
 from small_problems import error_line, tiny_tdpg, train_epochs
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_tdpg.certificates.declared import FAMILY, certify_nuisance, load_models, nuisance_table
+from sb3_tdpg.certificates.declared import FAMILY, certify_nuisance, nuisance_table
 from sb3_tdpg.cli import main
 from sb3_tdpg.envs.lava import LavaEnv
-from sb3_tdpg.envs.scenarios import Scenario
 
 
 def test_certified_bounds_hold_for_random_members(tmp_path):
@@ -35,8 +34,6 @@ NUISANCE = ["--nuisance", "vector_bias"]
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["nothing.zip", *NUISANCE], "nothing.zip cannot be read"),
-    (["nothing.zip", *NUISANCE, "--env", "sb3_tdpg:Lava-v0"], "nothing.zip cannot be read"),
-    (["model.zip", "model.zip", *NUISANCE], "model.zip is given twice"),
     (["model.zip", *NUISANCE, "--seed", "-1"], "seed=-1 must be at least 0"),
     (["model.zip", *NUISANCE, "--n-test-episodes", "1"], "n_test_episodes=1 must be at least 2"),
     (["model.zip", *NUISANCE, "--confidence", "1.5"], "confidence=1.5 must lie between 0 and 1"),
@@ -64,17 +61,8 @@ def test_a_model_of_normalised_observations_is_refused(tmp_path):
     env = VecNormalize(DummyVecEnv([LavaEnv]), norm_reward=False)
     tiny_tdpg(env, n_episodes=2).save(tmp_path / "model.zip")
     env.save(tmp_path / "vecnormalize.pkl")
-    with pytest.raises(ValueError, match="acts on normalised observations"):
-        load_models([tmp_path / "model.zip"], Scenario("Training", "Lava-v0"))
-
-
-def test_models_from_folders_of_one_name_are_all_certified(tmp_path):
-    paths = [tmp_path / name / "model.zip" for name in ("a", "b", "c/a", "d/a")]
-    for path in paths:
-        path.parent.mkdir(parents=True)
-        tiny_tdpg().save(path)
-    labels = ["TDPG", "TDPG (b/model)", "TDPG (a/model)", f"TDPG ({paths[3]})"]
-    assert list(load_models(paths, Scenario("Training", "Lava-v0"))) == labels
+    with pytest.raises(ValueError, match="without VecNormalize"):
+        certify_nuisance([tmp_path / "model.zip"], "Lava-v0", "vector_bias", tmp_path)
 
 
 def test_a_cost_above_its_bound_counts_from_three_standard_errors_on():

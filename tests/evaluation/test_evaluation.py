@@ -206,13 +206,11 @@ def test_the_last_infos_success_becomes_a_failure_column(tdpg, monkeypatch):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (dict(scenarios=[]), "scenarios is empty"),
-    (dict(scenarios=[LAVA[0], LAVA[0]]), "'Training'.*more than once"),
+    (dict(scenarios=[]), "at least one model and one scenario"),
+    (dict(scenarios=[LAVA[0], LAVA[0]]), "names must differ.*'Training', 'Training'"),
     (dict(n_episodes=2.5), "n_episodes=2.5"),
     (dict(seed=-1), "seed=-1"),
-    (dict(model={}), "empty mapping"),
     (dict(model="model.zip"), "expected a Stable-Baselines3 model"),
-    (dict(labels=dict(cost=1)), "cost"),
     (dict(env_kwargs=dict(typo=1)), "'Training'.*typo"),
     (dict(scenarios=[*LAVA, Scenario("other", "NoSuch-v0")]), "'other'.*NoSuch"),
     (dict(scenarios=[*LAVA, Scenario("pole", "CartPole-v1")]), "'TDPG'.*'pole'.*observation_space"),

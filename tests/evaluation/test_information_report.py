@@ -16,18 +16,18 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdpg import InformationCallback, SelectionCallback, make_episodes_env
 from sb3_tdpg.envs.lava import LavaEnv
 from sb3_tdpg.envs.scenarios import LAVA
-from sb3_tdpg.evaluation import information as information_module
 from sb3_tdpg.evaluation import (
+    InformationReport,
     information_interval,
     information_report,
     information_timeline,
-    interval_frame,
     knowledge_map,
     save_figure,
     state_knowledge,
 )
+from sb3_tdpg.evaluation import information as information_module
 from sb3_tdpg.evaluation.information import encode_episodes, information_bounds, rollout_information
-from sb3_tdpg.evaluation.interval import component_estimates, min_episodes
+from sb3_tdpg.evaluation.interval import component_estimates
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.loo import own_sample_bound
 
@@ -162,7 +162,7 @@ def test_the_map_shows_every_value_and_marks_what_is_not_known():
 
 def test_the_timeline_names_the_bounds():
     interval = information_interval(gaussian_batch(100, [[0.0, 0.0], [100.0, 100.0]], generator=generator()))
-    axes = information_timeline(interval_frame(interval)).axes[0]
+    axes = information_timeline(InformationReport(interval, pd.DataFrame(), np.zeros(0)).frame).axes[0]
     labels = axes.get_legend_handles_labels()[1]
     assert {"lower: frozen critic", "lower: never negative"} < set(labels)
     assert any("ln N" in label for label in labels)
@@ -186,12 +186,6 @@ def test_the_callback_logs_the_interval_at_its_epochs_and_changes_nothing_in_the
     # The CSV logger fills what is missing in a row with nothing.
     assert watched["mi/upper"].notna().tolist() == [True, False, True, False]
     assert (watched["mi/lower"].dropna() <= watched["mi/upper"].dropna()).all()
-
-
-def test_a_callback_is_refused_where_an_epoch_has_too_few_episodes_for_an_interval():
-    model = tiny_tdpg(PROBLEM, n_episodes=min_episodes(2) - 1)
-    with pytest.raises(ValueError, match=r"n_episodes=19 is too small.* at least 20"):
-        train_epochs(model, 1, callback=InformationCallback())
 
 
 def of_gaussian_noise(means):

@@ -36,7 +36,7 @@ def test_the_interval_holds_the_information_of_gaussian_channels_and_is_narrow()
 def test_the_limits_spend_three_fifths_and_one_fifth_of_the_probability_to_miss():
     # With all of it, some rows of tests/benchmarks/interval_coverage.py fall below 95 %: by chance, and by skewness.
     batch = gaussian_batch(100, [[0.3, 0.3], [1.0, 1.0], [4.0, 4.0]], generator=generator())
-    interval = information_interval(batch, confidence=0.9)
+    interval = information_interval(batch)
     for t in range(3):
         (below, below_error), (above, above_error) = (
             np.array([(interval.estimates[name][t], interval.errors[name][t]) for name in names]).T
@@ -44,14 +44,14 @@ def test_the_limits_spend_three_fifths_and_one_fifth_of_the_probability_to_miss(
         )
         best, nearest = below.argmax(), above.argmin()
         gap = (above[nearest] - below[best]) / max(below_error[best], above_error[nearest])
-        miss = miss_of_each_limit(0.06, gap)
-        assert 0.03 <= miss <= 0.06
+        miss = miss_of_each_limit(0.03, gap)
+        assert 0.015 <= miss <= 0.03
         # Between the limit of a bound alone and that of bounds that are independent of each other.
         alone, independent = normal_quantile(miss), normal_quantile(miss / 2)
         assert (below - independent * below_error).max() <= interval.lower[t] or interval.lower[t] == 0
         assert interval.lower[t] <= max((below - alone * below_error).max(), 0)
-        miss = miss_of_each_limit(0.02, gap)
-        assert 0.01 <= miss <= 0.02
+        miss = miss_of_each_limit(0.01, gap)
+        assert 0.005 <= miss <= 0.01
         alone, independent = normal_quantile(miss), normal_quantile(miss / 3)
         assert (above + alone * above_error).min() <= interval.upper[t] <= (above + independent * above_error).min()
 
@@ -188,24 +188,6 @@ def test_many_trvs_need_more_than_two_living_episodes_for_each():
     interval = information_interval(batch._replace(alive=alive))
     assert np.isfinite([interval.lower, interval.upper]).tolist() == [[True, False], [True, False]]
     assert (min_episodes(30), min_episodes(2)) == (62, 20)
-
-
-@pytest.mark.parametrize(("change", "message"), [
-    (dict(states=th.zeros(4, 60)), "shapes"),
-    (dict(trvs=th.zeros(4, 60, 3)), "shapes"),
-    (dict(states=th.zeros(4, 59, 2)), "shapes"),
-    (dict(means=th.full((4, 60, 2), math.nan)), "means are not all finite"),
-    (dict(stds=th.zeros(4, 60, 2)), "stds must be positive"),
-])  # fmt: skip
-def test_a_batch_that_is_not_fit_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        information_interval(random_batch()._replace(**change))
-
-
-@pytest.mark.parametrize("confidence", [0.0, 1.0, math.nan])
-def test_a_confidence_out_of_its_range_is_refused(confidence):
-    with pytest.raises(ValueError, match="confidence="):
-        information_interval(random_batch(), confidence=confidence)
 
 
 def test_the_gap_is_counted_in_the_larger_of_the_two_errors():

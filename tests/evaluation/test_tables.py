@@ -172,10 +172,8 @@ def test_the_markdown_table_over_seeds_shows_the_interval_if_there_are_several()
 
 def test_a_table_that_cannot_be_made_is_an_error_that_says_why():
     records = some_records({"A": {"x": [1.0]}})
-    with pytest.raises(ValueError, match=r"no column \['train_seed'\]"):
+    with pytest.raises(ValueError, match="no column train_seed"):
         aggregate_seeds(records)
-    with pytest.raises(ValueError, match="no column"):
-        summary_table(records.drop(columns="cost"))
     with pytest.raises(ValueError, match=r"no row for the scenarios \['second'\]"):
         comparison_markdown(summary_table(some_records({"A": {"a|b": [1.0]}})), SCENARIOS)
     twice = of_seeds(2, lambda i: {"A": {"a|b": [1.0]}})
