@@ -90,7 +90,7 @@ class _Recorder(gym.Wrapper):
         result = self.env.reset(**kwargs)
         self.costs: list[float] = []
         self.between: list[list[np.ndarray]] = []
-        self.pictures: list[Any] = [self.env.render()] if self.with_pictures else []
+        self.pictures: list[Any] = [self._picture()] if self.with_pictures else []
         return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -99,6 +99,12 @@ class _Recorder(gym.Wrapper):
         if self.film is not None:
             self.between.append(list(self.film()))
         if self.with_pictures:
-            self.pictures.append(self.env.render())
+            self.pictures.append(self._picture())
         recorded = (self.pictures, self.costs, self.between)
         return observation, reward, terminated, truncated, {**info, "recorded": recorded}
+
+    def _picture(self) -> Any:
+        try:
+            return self.env.render()
+        except gym.error.DependencyNotInstalled as e:
+            raise ValueError(f"{self.env} cannot be drawn: {e}") from e

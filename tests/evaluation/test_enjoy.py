@@ -179,6 +179,13 @@ def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(own, tmp_path)
     assert frames[0].shape == (8 * 30 + 180, 8 * 50, 3)
 
 
+def test_an_environment_that_cannot_draw_is_not_recorded(own, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(PictureEnv, "render", Mock(side_effect=gym.error.DependencyNotInstalled("no pygame")))
+    out = tmp_path / "film.gif"
+    assert "cannot be drawn: no pygame" in error_line(capsys, "enjoy", own, "--env", "Own-v0", "--record", out)
+    assert not out.exists()
+
+
 def test_only_few_trvs_have_a_legend(tmp_path):
     for n_trvs, has_legend in ((8, True), (9, False)):
         frames, durations = frames_of(animate(tmp_path / "film.gif", n_trvs))
