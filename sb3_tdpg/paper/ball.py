@@ -21,14 +21,14 @@ from sb3_tdpg.envs.scenarios import (
     PaperResult,
     Scenario,
 )
-from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure, training_curves
-from sb3_tdpg.experiments.runs import complete_runs, read_progress
+from sb3_tdpg.evaluation import aggregate_seeds, comparison_markdown, save_figure
+from sb3_tdpg.experiments.runs import complete_runs
 from sb3_tdpg.features import TRVCnn
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.paper import common
 from sb3_tdpg.paper.common import Method
-from sb3_tdpg.paper.knowledge import pooled_information, trv_knowledge
-from sb3_tdpg.paper.plots import diagnosis_bars, robustness_curves, sorted_walls
+from sb3_tdpg.paper.knowledge import pooled_information
+from sb3_tdpg.paper.plots import diagnosis_bars, robustness_curves
 from sb3_tdpg.presets import IMAGE_ENCODER
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
@@ -180,12 +180,8 @@ def reproduce_ball(
     write_frame_atomically(by_seed, out / "seeds.csv")
 
     folders, labels = common.folders_of(tasks), [method.label for method in chosen]
-    first_seed = {m.label: seed for m, seed in reversed(everything)}
-    first = {m.label: read_progress(folders[m.label, first_seed[m.label]]) for m in chosen if m.algo == "tdpg"}
     save_figure(robustness_curves(records[is_row], NOISE_ROWS, BACKGROUND_ROWS), out / "robustness.png")
-    save_figure(sorted_walls(by_seed[by_seed["scenario"].isin(WALL_ROWS)]), out / "walls.png")
     save_figure(diagnosis_bars(records[~is_row & ~is_shift]), out / "diagnosis.png")
-    save_figure(training_curves(first), out / "training.png")
 
     cost_rows = [*rows, *group_rows(rows)]
     of_paper = table[table["model"].isin(("TDPG", "PG")) & table["scenario"].isin([row.name for row in cost_rows])]
@@ -196,12 +192,7 @@ def reproduce_ball(
     ]
     with threads(1):  # with one thread, sums do not depend on the number of cores
         knowledge = [
-            dict(
-                model=m.label,
-                train_seed=seed,
-                information=pooled_information(model, launch_kwargs),
-                **trv_knowledge(model, launch_kwargs),
-            )
+            dict(model=m.label, train_seed=seed, information=pooled_information(model, launch_kwargs))
             for m, seed in everything
             if m.algo == "tdpg"
             for model in [TDPG.load(folders[m.label, seed] / "model.zip", device="cpu")]

@@ -61,16 +61,12 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
     :param n_seeds: Number of training seeds of each method.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
-    :raises ValueError: if ``camera`` is unknown; no run has started in this case.
     """
-    if camera not in METHODS:
-        raise ValueError(f"camera={camera!r} must be one of {list(METHODS)}")
     given = common.Options(**options)
     is_fixed, methods = camera == "fixed", METHODS[camera]
     rows = PANDA_GRASP if is_fixed else PANDA_GRASP_CAMERA
     first_seed = FIRST_SEEDS[camera]
-    seeds = range(first_seed, first_seed + n_seeds)
-    everything = [(m, seed) for m in methods for i, seed in enumerate(seeds) if i < m.max_seeds]
+    everything = common.seed_by_seed(methods, first_seed, n_seeds)
     tasks = common.make_tasks("PandaGrasp-v0", out / "runs", everything, lambda _: rows, given.overrides)
     complete_runs(tasks, **given.of_runs)
     folders = common.folders_of(tasks)
@@ -95,12 +91,10 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
 
     aggregated = aggregate_seeds(records)
     kinds = {row.name.lower(): (row.name,) for row in rows}
-    logs = {seed: read_progress(folders["TDPG", seed]) for seed in seeds}
+    logs = {seed: read_progress(folder) for (label, seed), folder in folders.items() if label == "TDPG"}
     models = {key: TDPG.load(folder / "model.zip", device="cpu") for key, folder in folders.items()}
     with threads(1):  # with one thread, sums do not depend on the number of cores
         known = knowledge.knowledge_table(models, rows[:2])
-        first = {label: models[label, first_seed] for label in ("PG", "TDPG")}
-        estimates = markdown_table(knowledge.estimates_table(first), digits=2) if is_fixed else ""
         comparisons = common.comparisons_table(records, COMPARISONS, kinds, "failed grasps")
     return common.write_results(
         out,
@@ -117,7 +111,4 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
         knowledge=common.write_knowledge(known, ["model", "mugs"], out),
         n_bound=knowledge.N_BOUND,
         ln_bound=f"{math.log(knowledge.N_BOUND):.1f}",
-        estimates=estimates,
-        n_fitted=knowledge.FITTED_MUGS,
-        ln_fitted=f"{math.log(knowledge.FITTED_MUGS):.1f}",
     )

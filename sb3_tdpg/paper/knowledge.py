@@ -1,14 +1,11 @@
 """
-Measure what the TRVs of the image problems encode, by regression and by bounds on the information.
+Measure what the TRVs of the image problems encode, by bounds on the information and, for grasping, by regression.
 
-Dimension key: T horizon, N episodes, Z TRVs.
+Dimension key: N mugs, Z TRVs.
 """
 
-import contextlib
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import islice
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -16,78 +13,23 @@ import pandas as pd
 import torch as th
 
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.envs.textures import load_texture
-from sb3_tdpg.evaluation.environments import scenario_env
 from sb3_tdpg.evaluation.information import rollout_information
-from sb3_tdpg.evaluation.randomness import EvaluationSeeds, evaluation_seeds, isolated_randomness
-from sb3_tdpg.evaluation.rollout import act, rollout
+from sb3_tdpg.evaluation.randomness import evaluation_seeds, isolated_randomness
+from sb3_tdpg.evaluation.rollout import act
 from sb3_tdpg.information import InformationBatch
 from sb3_tdpg.information.logdet import LogDet
 from sb3_tdpg.information.loo import LeaveOneOut, own_sample_bound
-from sb3_tdpg.information.mine import Mine
-from sb3_tdpg.problem import read_problem
 from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
-# No policy was trained or tested on walls from this number on.
-FIRST_WALL = 1000
-DARKEST = 0.4
 MUGS_AT_A_TIME = 1000  # limits the memory
 N_MUGS = 10_000  # for the regression
 N_BOUND = 2_000  # for the bounds, which compare all pairs of mugs
-FITTED_MUGS = 400  # for MINE, as many as in an epoch
 LAST_EPOCHS = 5
-CRITICS: Mapping[str, Mapping[str, Any]] = {
-    # The numbers of steps are the paper's. Learning rate, layer sizes and minibatches are the paper's values for the
-    # lava problem, because it prints none for grasping. There are no refits, and the optimiser is never reset.
-    "MINE at 5e-5, the paper's numbers of steps": dict(
-        learning_rate=5e-5, warmup_gradient_steps=500_000, gradient_steps=100_000,
-        refit_below=-math.inf, refit_above=math.inf, reset_moments=False,
-    ),
-    "MINE at 1e-3": dict(warmup_gradient_steps=2000, gradient_steps=1000),
-    "MINE at 1e-3, standardised state": dict(warmup_gradient_steps=2000, gradient_steps=1000, standardize=True),
-}  # fmt: skip
 
 
-def trv_knowledge(
-    model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_walls: int = 64, n_episodes: int = 10
-) -> dict[str, float]:
-    """
-    Regress the robot's position, the brightness and the wall's colour on the TRVs of a ball-catching policy.
-
-    Episodes run in front of random walls. All images of an episode are darkened by the same random factor. At each time
-    step a linear regression is fitted on half of the walls, and R^2 is computed on the other half, because on the same
-    walls the regression could memorise the colours.
-
-    :param n_walls: Number of random walls, which must be even.
-    :param n_episodes: Number of episodes in front of each wall.
-    :return: R^2, averaged over time and clipped at 0, of ``"position"`` (d_t), ``"brightness"`` (the factor) and
-        ``"wall"`` (the wall's mean colour; this R^2 is averaged over red, green and blue)
-    """
-    seeds = evaluation_seeds(0)
-    rng = np.random.default_rng(seeds.env)
-    trvs, targets = [], []
-    for wall in range(FIRST_WALL, FIRST_WALL + n_walls):
-        texture = load_texture(f"random-{wall}")
-        scenario = Scenario(str(wall), "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast", "texture": texture})
-        of_wall = EvaluationSeeds(int(rng.integers(2**31)), seeds.policy)
-        factor = rng.uniform(DARKEST, 1.0, (n_episodes, 1, 1, 1))
-        with contextlib.closing(scenario_env(scenario, model, n_episodes=n_episodes, n_envs=n_episodes)) as env:
-            observe = partial(_darkened, factor=factor)
-            steps = rollout(model, env, seeds=of_wall, problem=read_problem(env), observe=observe)
-            known, states = zip(*((step.memory[0], step.states) for step in islice(steps, model.horizon)), strict=True)
-        trvs.append(np.stack(known))
-        position, color = np.stack(states)[..., :1], texture.mean(axis=(0, 1))
-        values = (position, factor[:, :, 0, 0], color)  # factor and colour are constant over time
-        targets.append([np.broadcast_to(each, (*position.shape[:2], np.shape(each)[-1])) for each in values])
-    names = ("position", "brightness", "wall")
-    all_trvs = np.concatenate(trvs, axis=1)  # (T, N, Z)
-    of_all = (np.concatenate(of_walls, axis=1) for of_walls in zip(*targets, strict=True))
-    return {name: _r2(all_trvs, target) for name, target in zip(names, of_all, strict=True)}
-
-
-def pooled_information(model: Any, env_kwargs: Mapping[str, Any] | None = None, *, n_episodes: int = 160) -> float:
+def pooled_information(model: Any, env_kwargs: Mapping[str, Any], n_episodes: int = 160) -> float:
     """
     Bound the information of a ball-catching policy on its training images, in nats, as the penalty does.
 
@@ -95,15 +37,11 @@ def pooled_information(model: Any, env_kwargs: Mapping[str, Any] | None = None, 
     that are declared for training.
     """
     sensor = partial(PerturbedVecEnv, perturbation="images")
-    scenario = Scenario("training", "BallCatch-v0", {**(env_kwargs or {}), "renderer": "fast"}, sensor=sensor)
+    scenario = Scenario("training", "BallCatch-v0", {**env_kwargs, "renderer": "fast"}, sensor=sensor)
     batch = rollout_information(model, scenario, n_episodes)
     pooled = batch.pooled()
     with th.no_grad():
         return model.horizon * LogDet(1, batch.states.shape[2], batch.trvs.shape[2])(pooled).item()
-
-
-def _darkened(images: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    return np.rint(images * factor).astype(np.uint8)
 
 
 class Mugs(NamedTuple):
@@ -113,10 +51,10 @@ class Mugs(NamedTuple):
     images: np.ndarray  # (N, 1, 128, 128)
 
 
-def draw_mugs(env_kwargs: Mapping[str, Any] | None = None, *, n_mugs: int, seed: int = 0) -> Mugs:
+def draw_mugs(env_kwargs: Mapping[str, Any], n_mugs: int) -> Mugs:
     """Sample mugs and their images from ``PandaGrasp-v0`` with these keywords, without simulating a grasp."""
     env = make_episodes_env("PandaGrasp-v0", n_episodes=n_mugs, env_kwargs=env_kwargs, use_processes=False)
-    env.seed(evaluation_seeds(seed).env)
+    env.seed(evaluation_seeds(0).env)
     images = cast(np.ndarray, env.reset())
     states = np.stack([info["state"] for info in env.unwrapped.reset_infos])
     env.close()
@@ -148,36 +86,28 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     x, y, _, yaw, *camera = batch.states[0].numpy().astype(np.float64).T
     trvs = batch.trvs[0].numpy().astype(np.float64)
     row, column = np.triu_indices(trvs.shape[1])
-    known = np.concatenate([trvs, trvs[:, row] * trvs[:, column]], axis=1)[None]
+    known = np.concatenate([trvs, trvs[:, row] * trvs[:, column]], axis=1)
     targets = dict(x=x[:, None], y=y[:, None], yaw=np.stack([np.sin(yaw), np.cos(yaw)], axis=1))
     if camera:
         targets["camera"] = camera[0][:, None]
-    return {name: _r2(known, target[None], pooled=True) for name, target in targets.items()}
+    return {name: _r2(known, target) for name, target in targets.items()}
 
 
-def _r2(trvs: np.ndarray, targets: np.ndarray, *, pooled: bool = False) -> float:
-    """
-    Fit a linear regression to the first half of the episodes, and average its R^2 on the second half over time.
-
-    ``pooled`` weights the components by their variance instead of equally.
-    """
-    half = trvs.shape[1] // 2
-    x = np.concatenate([trvs, np.ones_like(trvs[..., :1])], axis=-1)
-    values = []
-    for x_t, y_t in zip(x, targets, strict=True):
-        coefficients, *_ = np.linalg.lstsq(x_t[:half], y_t[:half], rcond=None)
-        residual = y_t[half:] - x_t[half:] @ coefficients
-        total = y_t[half:] - y_t[:half].mean(axis=0)
-        axis = None if pooled else 0
-        values.append(1 - (residual**2).sum(axis) / (total**2).sum(axis))
-    return float(np.clip(values, 0, None).mean())
+def _r2(known: np.ndarray, targets: np.ndarray) -> float:
+    """Fit a linear regression to the first half of the mugs, and return its R^2 on the second half, clipped at 0."""
+    half = len(known) // 2
+    x = np.column_stack([known, np.ones(len(known))])
+    coefficients, *_ = np.linalg.lstsq(x[:half], targets[:half], rcond=None)
+    residual = targets[half:] - x[half:] @ coefficients
+    total = targets[half:] - targets[:half].mean(axis=0)
+    return max(0.0, float(1 - (residual**2).sum() / (total**2).sum()))
 
 
 def knowledge_table(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[Scenario]) -> pd.DataFrame:
     """Measure what the TRVs of each model (by label and seed) encode about mugs, and bound their information."""
     rows = []
     for row in scenarios:
-        mugs = draw_mugs(row.env_kwargs, n_mugs=N_MUGS)
+        mugs = draw_mugs(row.env_kwargs, N_MUGS)
         for (label, seed), model in models.items():
             batch = encode_mugs(model, mugs)
             few = batch.select(th.arange(min(N_MUGS, N_BOUND)))
@@ -191,27 +121,6 @@ def bounds(batch: InformationBatch) -> dict[str, float]:
     sizes = (batch.states.shape[2], batch.trvs.shape[2])
     upper = min(cls(1, *sizes)(batch).item() for cls in (LeaveOneOut, LogDet))
     return {"lower bound": own_sample_bound(batch).item(), "upper bound": upper}
-
-
-def estimates_table(models: Mapping[str, TDPG]) -> pd.DataFrame:
-    """Compare MINE's estimates of the information with the bounds; critics are fitted to one policy after another."""
-    mugs = {f"{FITTED_MUGS} mugs of the fit": draw_mugs(n_mugs=FITTED_MUGS, seed=1)}
-    mugs["fresh mugs"] = draw_mugs(n_mugs=min(N_MUGS, N_BOUND), seed=2)
-    columns = {}
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        critics: dict[str, Mine] = {}
-        for label, model in models.items():
-            fitted, fresh = (encode_mugs(model, each) for each in mugs.values())
-            for name, settings in CRITICS.items():
-                if name not in critics:
-                    critics[name] = Mine(1, fitted.states.shape[2], fitted.trvs.shape[2], **settings)
-                critics[name].fit(fitted)
-            for kind, batch in zip(mugs, (fitted, fresh), strict=True):
-                with th.no_grad():
-                    estimates = {name: critic(batch).item() for name, critic in critics.items()}
-                columns[f"{label}, {kind}"] = {**bounds(batch), **estimates}
-    return pd.DataFrame(columns).rename_axis("estimate").reset_index()
 
 
 def penalty_table(progress: Mapping[int, pd.DataFrame]) -> list[dict[str, Any]]:

@@ -38,20 +38,13 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Fig
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
     :param scenarios: The panels from left to right. The bins have equal widths on a logarithmic axis, because costs
-        range over two decades. If a cost is zero or negative, the axis is linear.
+        range over two decades.
     """
-    names = [scenario.name for scenario in scenarios]
-    shown = records[records["scenario"].isin(names)]
-    if missing := sorted(set(names) - set(shown["scenario"])):
-        raise ValueError(f"the records have no episodes of the scenarios {missing}")
+    shown = records[records["scenario"].isin([scenario.name for scenario in scenarios])]
     figure, (panels,) = new_panels(WIDTH, 2.9, 1, len(scenarios), sharex=True, sharey=True)
-    low, high = shown["cost"].min(), shown["cost"].max()
-    is_positive = low > 0
-    if is_positive:
-        low = max(low, high / 1e3)  # a few costs near 0 are in the first bin, so that they do not stretch the axis
-        bins = np.geomspace(low, high * 1.001, N_BINS + 1)
-    else:
-        bins = np.histogram_bin_edges(shown["cost"], N_BINS)
+    high = shown["cost"].max()
+    low = max(shown["cost"].min(), high / 1e3)  # a few costs near 0 are in the first bin: they would stretch the axis
+    bins = np.geomspace(low, high * 1.001, N_BINS + 1)
     for axes, scenario in zip(panels, scenarios, strict=True):
         for color, (label, group) in zip(cycle(PALETTE), shown.groupby("model", sort=False), strict=False):
             costs = group.loc[group["scenario"] == scenario.name, "cost"].clip(lower=low)
@@ -59,11 +52,11 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Fig
             axes.hist(costs, bins, weights=weights, color=color, alpha=0.45, label=str(label))
             axes.hist(costs, bins, weights=weights, color=color, histtype="step", linewidth=1.2)
             axes.axvline(costs.mean(), color=color, linestyle=(0, (3, 2)), linewidth=1.2)
-        axes.set_title(_title(scenario), fontsize=9)
-    if is_positive:
-        log_axis(panels[0], "x", subs=(1, 3))
+        start = "training: " if scenario.name == "Training" else ""
+        axes.set_title(start + _noise(scenario.env_kwargs["sensor_noise_std"] ** 2), fontsize=9)
+    log_axis(panels[0], "x", subs=(1, 3))
     panels[0].set_ylabel("share of episodes", fontsize=9)
-    figure.supxlabel(f"episode cost{' (logarithmic axis)' if is_positive else ''}; dashed: mean", fontsize=9)
+    figure.supxlabel("episode cost (logarithmic axis); dashed: mean", fontsize=9)
     legend_above(figure, panels[0])
     return figure
 
@@ -142,24 +135,6 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
     return figure
 
 
-def sorted_walls(seed_means: pd.DataFrame) -> Figure:
-    """
-    Draw the mean cost in front of each wall, from the lowest to the highest cost.
-
-    :param seed_means: ``model``, ``train_seed``, ``scenario`` (a wall) and ``cost``. The walls are sorted for each
-        policy separately; a line is the median over seeds.
-    """
-    figure, ((axes,),) = new_panels(WIDTH, 3.4)
-    for color, (model, group) in zip(cycle(PALETTE), seed_means.groupby("model", sort=False), strict=False):
-        costs = np.sort(group.pivot(index="train_seed", columns="scenario", values="cost"), axis=1)
-        axes.plot(np.arange(1, costs.shape[1] + 1), np.median(costs, axis=0), color=color, label=str(model))
-    log_axis(axes, "y", subs=(1, 2, 5))
-    axes.set_xlabel("walls, in the order of their cost", fontsize=9)
-    axes.set_ylabel("mean episode cost", fontsize=9)
-    legend_above(figure, axes)
-    return figure
-
-
 def _seed_means(
     records: pd.DataFrame, column: str, rows: list[str], spacing: float
 ) -> Iterator[tuple[str, str, np.ndarray, pd.DataFrame]]:
@@ -218,15 +193,6 @@ def _draw_corridor(axes: Axes, horizon: int) -> None:
     axes.set_xticks(range(horizon + 1))
 
 
-def _title(scenario: Scenario) -> str:
-    std = scenario.env_kwargs.get("sensor_noise_std")
-    if std is None:
-        return scenario.name
-    return f"training: {_noise(std**2)}" if scenario.name == "Training" else _noise(std**2)
-
-
 def _noise(variance: float) -> str:
     """Return a label such as sigma^2 = 10^-3 in Matplotlib's notation for formulas."""
-    exponent = round(np.log10(variance or 1.0))
-    is_power = exponent != 0 and np.isclose(variance / 10.0**exponent, 1.0)
-    return rf"$\sigma^2 = 10^{{{exponent}}}$" if is_power else rf"$\sigma^2 = {variance:.3g}$"
+    return r"$\sigma^2 = 1$" if variance == 1 else rf"$\sigma^2 = 10^{{{round(np.log10(variance))}}}$"

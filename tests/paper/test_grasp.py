@@ -16,7 +16,6 @@ from sb3_tdpg.envs.scenarios import PANDA_CAMERA, PANDA_GRASP
 from sb3_tdpg.experiments.runs import Run, complete_run
 from sb3_tdpg.hyperparams import load_hyperparams
 from sb3_tdpg.information import InformationBatch
-from sb3_tdpg.information.mine import Mine
 from sb3_tdpg.paper import common, grasp, knowledge
 from sb3_tdpg.paper.knowledge import draw_mugs, encode_mugs, grasp_knowledge
 from sb3_tdpg.paper.plots import failures_by_yaw
@@ -27,9 +26,6 @@ def tiny(monkeypatch):
     """Small epochs, in this process."""
     give_settings(monkeypatch, dict(n_episodes=8, batch_size=8))
     monkeypatch.setattr(knowledge, "N_MUGS", 100)
-    monkeypatch.setattr(knowledge, "FITTED_MUGS", 60)
-    short = {name: dict(v, warmup_gradient_steps=5, gradient_steps=2) for name, v in knowledge.CRITICS.items()}
-    monkeypatch.setattr(knowledge, "CRITICS", short)
     monkeypatch.setattr(grasp, "complete_runs", complete_runs_here)
 
 
@@ -39,13 +35,9 @@ def test_from_nothing_to_tables_figures_and_records(tmp_path, tiny, capsys):
     assert main(["reproduce", "grasp", "--out", str(out), "--publish", str(published), *arguments]) == 0
     summary = (out / "summary.md").read_text()
     assert summary in capsys.readouterr().out
-    for heading in ("Goals", "Effect of the penalty", "What the TRVs know", "How much information is it?"):
+    for heading in ("Goals", "Effect of the penalty", "What the TRVs know"):
         assert f"## {heading}" in summary
     assert "0.107" in summary, "the paper's"
-    assert (
-        "| estimate | PG, 60 mugs of the fit | PG, fresh mugs | TDPG, 60 mugs of the fit | TDPG, fresh mugs |"
-        in summary
-    )
     files = {"summary.md", "seeds.csv", "episodes.csv.xz", "knowledge.csv", "config.json", "yaw.png", "training.png"}
     assert {path.name for path in published.iterdir()} == files
     records = pd.read_csv(out / "episodes.csv.xz")
@@ -71,12 +63,6 @@ def test_a_varying_camera_from_nothing_to_tables_figures_and_records(tmp_path, t
     known = pd.read_csv(tmp_path / "knowledge.csv")
     assert set(known["mugs"]) == {"training", "twice the range"}
     assert known["camera"].between(0, 1).all()
-
-
-def test_a_camera_that_is_none_is_refused_before_anything_is_run(tmp_path):
-    with pytest.raises(ValueError, match=r"camera='film' must be one of \['fixed', 'varying'\]"):
-        grasp.reproduce_grasp(tmp_path / "out", camera="film")
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_record_is_enough_to_carry_out_its_grasp_once_more(tmp_path, tiny):
@@ -131,29 +117,6 @@ def test_the_bounds_enclose_an_information_that_is_known():
     assert truth - 0.1 < found["lower bound"] <= found["upper bound"] < truth + 0.1
 
 
-def test_the_critics_are_fitted_to_one_policy_after_the_other_and_read_on_fresh_mugs(monkeypatch, tiny):
-    fits = []
-    fit = Mine.fit
-
-    def note(critic, batch):
-        fits.append((id(critic), bool(critic.is_warm), batch.states.shape[1]))
-        return fit(critic, batch)
-
-    monkeypatch.setattr(Mine, "fit", note)
-    models = {
-        label: TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), beta=math.inf, n_episodes=4, seed=seed)
-        for seed, label in enumerate(("PG", "TDPG"))
-    }
-    before = th.get_rng_state()
-    table = knowledge.estimates_table(models).set_index("estimate")
-    assert th.equal(th.get_rng_state(), before)
-    n_critics = len(knowledge.CRITICS)
-    assert [fit[1:] for fit in fits] == [(False, 60)] * n_critics + [(True, 60)] * n_critics
-    assert [fit[0] for fit in fits[:n_critics]] == [fit[0] for fit in fits[n_critics:]]
-    assert (table.loc["lower bound"] <= table.loc["upper bound"] + 0.1).all()
-    assert table.notna().all(axis=None)
-
-
 def test_the_penalty_is_told_from_where_it_began_and_where_there_was_none():
     log = pd.DataFrame({
         "train/mi_coef": [np.nan, 0.0, 0.01, 0.02, 0.03, 0.04],
@@ -190,11 +153,11 @@ def test_the_regression_finds_the_pose_that_the_trvs_tell_and_no_other(half_widt
 def test_the_mugs_that_a_policy_is_shown_are_those_of_the_environment(monkeypatch):
     monkeypatch.setattr(knowledge, "MUGS_AT_A_TIME", 8)
     model = TDPG("TRVPolicy", BatchedVecEnv(PandaGraspEnv(), 4), beta=math.inf, n_episodes=4, device="cpu")
-    mugs = draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20)
+    mugs = draw_mugs(dict(yaw_range=(2.0, 2.5)), 20)
     assert ((mugs.states[:, 3] >= 2.0) & (mugs.states[:, 3] <= 2.5)).all()
     batch = encode_mugs(model, mugs)
     np.testing.assert_allclose(batch.states[0].numpy(), mugs.states, rtol=1e-6)
     assert batch.trvs.shape == batch.means.shape == batch.stds.shape == (1, 20, 16)
     assert (batch.trvs != batch.means).all()
-    again = encode_mugs(model, draw_mugs(dict(yaw_range=(2.0, 2.5)), n_mugs=20))
+    again = encode_mugs(model, draw_mugs(dict(yaw_range=(2.0, 2.5)), 20))
     assert all(th.equal(a, b) for a, b in zip(batch[:4], again[:4], strict=True))
