@@ -6,7 +6,6 @@ try:
 except ImportError as e:
     raise ImportError(f"sb3_tdpg.hub needs {e.name}: pip install 'sb3_tdpg[hub]'") from e
 
-from sb3_tdpg.hub.publication import Publication
 from sb3_tdpg.hub.transfer import load_from_hub, pull_from_hub, push_to_hub, write_model_card
 
-__all__ = ["Publication", "load_from_hub", "pull_from_hub", "push_to_hub", "write_model_card"]
+__all__ = ["load_from_hub", "pull_from_hub", "push_to_hub", "write_model_card"]

@@ -34,14 +34,8 @@ def results_with_intervals(records: pd.DataFrame) -> pd.DataFrame:
         :func:`~sb3_tdpg.evaluation.summary_table` it adds the interval of the mean cost, ``low`` and ``high``
         (Student's t). If the records have failures, it also adds the interval of the failure rate, ``failure_low`` and
         ``failure_high`` (Wilson)
-    :raises ValueError: if the records are from several policies, or a scenario has fewer than two episodes.
+    :raises ValueError: if a scenario has fewer than two episodes.
     """
-    for column in ("model", "train_seed", "deterministic"):
-        if column in records and records[column].nunique() > 1:
-            raise ValueError(
-                f"a model card describes one policy, but the records are of {column} "
-                f"{records[column].unique().tolist()}: select the rows of one"
-            )
     if records.empty or (records.groupby("scenario").size() < 2).any():
         raise ValueError("an interval needs at least 2 episodes of each scenario: evaluate more")
     table = summary_table(records)

@@ -1,10 +1,9 @@
-"""Read the content of a model card from the folder of a run or of rl-zoo3, or take it from a ``Publication``."""
+"""Read the content of a model card from the folder of a run or of rl-zoo3."""
 
 import json
 import shlex
-import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -12,60 +11,37 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
-from pandas.errors import EmptyDataError
 from stable_baselines3.common.monitor import get_monitor_files, load_results
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
 from sb3_tdpg.callbacks import Candidate
 from sb3_tdpg.common.provenance import as_typed, jsonable, with_numbers
 from sb3_tdpg.common.trust import PlainLoader, plain_name, refuse_links, say_what_is_trusted
 from sb3_tdpg.envs.scenarios import PAPER_ROWS, Scenario
 from sb3_tdpg.evaluation import evaluate_scenarios
-from sb3_tdpg.evaluation.environments import load_statistics
+from sb3_tdpg.evaluation.loading import load_model
 from sb3_tdpg.experiments.rerun import scenarios_of
 from sb3_tdpg.experiments.runs import read_progress
-from sb3_tdpg.tdpg import TDPG
-from sb3_tdpg.vec_env import make_episodes_env
 
 
 @dataclass(frozen=True, kw_only=True)
 class Publication:
-    """
-    A trained policy, its evaluation, and how it was made.
+    """A trained policy, its evaluation, and how it was made."""
 
-    :param model: The model, or the file that ``model.save`` wrote.
-    :param env_id: The training environment.
-    :param records: Episodes of this policy alone, from :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :param scenarios: The scenarios of the records; the card shows their keywords.
-    :param method: Name of the method ("PG", "TDPG").
-    :param settings: Hyperparameters in the form of a block of ``hyperparams/tdpg.yml``. ``env_kwargs`` are the keywords
-        of the training environment.
-    :param seed: Training seed.
-    :param progress: Training log, see :func:`~sb3_tdpg.evaluation.training_curves`.
-    :param notes: Sentences about the training.
-    :param command: The command that made the model.
-    :param again: The command that repeats the training in the published folder.
-    :param how: Result of :func:`~sb3_tdpg.common.provenance.provenance` at the time of the training.
-    :param evaluated: When the records were made.
-    :param files: Additional files; the keys are their paths in the published folder.
-    :param metrics: Files for ``train_eval_metrics.zip``, which rl-zoo3 reads.
-    """
-
-    model: TDPG | Path
+    model: Path  # the file that ``model.save`` wrote
     env_id: str
-    records: pd.DataFrame
-    scenarios: Sequence[Scenario] = ()
-    method: str = "TDPG"
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    seed: int | None = None
-    progress: pd.DataFrame | None = None
-    notes: Sequence[str] = ()
-    command: str | None = None
-    again: str | None = None
-    how: Mapping[str, Any] | None = None
-    evaluated: datetime = field(default_factory=lambda: datetime.now(timezone.utc))
-    files: Mapping[str, Path] = field(default_factory=dict)
-    metrics: Sequence[Path] = ()
+    method: str  # its name ("PG", "TDPG")
+    seed: int  # of the training
+    settings: Mapping[str, Any]  # hyperparameters in the form of a block of hyperparams/tdpg.yml
+    records: pd.DataFrame  # episodes of this policy alone, from evaluate_scenarios
+    scenarios: Sequence[Scenario]  # of the records
+    evaluated: datetime  # when the records were made
+    progress: pd.DataFrame | None  # training log, see training_curves
+    notes: Sequence[str]  # sentences about the training
+    command: str | None  # made the model
+    again: str | None = None  # repeats the training in the published folder
+    how: Mapping[str, Any] | None  # provenance() at the time of the training
+    files: Mapping[str, Path]  # additional files by their paths in the published folder
+    metrics: Sequence[Path]  # files for train_eval_metrics.zip, which rl-zoo3 reads
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
@@ -78,7 +54,7 @@ def plain(value: Any) -> Any:
     return with_numbers(jsonable(value))
 
 
-def read_publication(folder: Path, **evaluation: Any) -> Publication:
+def read_publication(folder: Path, n_eval_episodes: int) -> Publication:
     """Read the folder of a run with :func:`read_run`, or evaluate a folder of rl-zoo3 with :func:`read_zoo_folder`."""
     refuse_links(folder)
     if (folder / "config.json").exists():
@@ -87,7 +63,7 @@ def read_publication(folder: Path, **evaluation: Any) -> Publication:
         except (AttributeError, KeyError, TypeError, json.JSONDecodeError) as e:
             raise ValueError(f"{folder / 'config.json'} does not describe a run ({e!r}): give a run's folder") from e
     if next(folder.glob("*/args.yml"), None) is not None:
-        return read_zoo_folder(folder, **evaluation)
+        return read_zoo_folder(folder, n_eval_episodes)
     raise ValueError(
         f"{folder} holds no training: give the folder of one run, with config.json in it, or a folder that rl-zoo3 "
         "wrote, such as logs/tdpg/Lava-v0_1"
@@ -102,7 +78,7 @@ def read_run(folder: Path) -> Publication:
             "started it, or give the folder of one run"
         )
     config = json.loads((folder / "config.json").read_text())
-    settings, records = dict(with_numbers(config["settings"])), _whole_records(folder / "episodes.csv", config)
+    settings, records = dict(with_numbers(config["settings"])), pd.read_csv(folder / "episodes.csv")
     files = {name: folder / name for name in ("config.json", "episodes.csv", "selected.json")}
     notes = [_selection_note(folder, settings)]
     if (attempts := int(records["attempts"].iloc[0])) > 1:
@@ -134,60 +110,34 @@ def read_run(folder: Path) -> Publication:
     )
 
 
-def _whole_records(path: Path, config: dict[str, Any]) -> pd.DataFrame:
-    """Read the episodes of a run; raise an error if the file is truncated."""
-    expected = sum(row.get("n_episodes") or config["n_eval_episodes"] for row in config["scenarios"])
-    try:
-        records = pd.read_csv(path)
-    except EmptyDataError:
-        records = pd.DataFrame()
-    columns = ["attempts", "scenario", "cost"]
-    if len(records) < max(expected, 1) or records.reindex(columns=columns).isna().any(axis=None):
-        raise ValueError(
-            f"{path} is not whole: it has {len(records)} of {expected} episodes, with the columns "
-            f"{', '.join(records) or 'none'}; needed are {', '.join(columns)}. Delete it and run the command again"
-        )
-    return records
-
-
-def read_zoo_folder(
-    folder: Path, *, scenarios: Sequence[Scenario] | None = None, n_eval_episodes: int = 1000, seed: int = 0
-) -> Publication:
+def read_zoo_folder(folder: Path, n_eval_episodes: int) -> Publication:
     """
     Read a folder that rl-zoo3's ``train`` wrote (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
 
-    The policy is the one from the end of the training or, if that is missing, ``best_model.zip``.
+    The scenarios are the training environment and the test rows of the paper's table. A test row has the keywords of
+    the training unless it replaces them.
 
-    :param scenarios: Scenarios of the evaluation; default: the training environment and the test rows of the paper's
-        table. A scenario has the keywords of the training unless it replaces them.
     :param n_eval_episodes: Number of episodes of each scenario.
-    :param seed: Seed of the evaluation.
     """
     inner = next(folder.glob("*/args.yml")).parent
     model_path = folder / f"{inner.name}.zip"
-    if not (is_last := model_path.exists()) and not (model_path := folder / "best_model.zip").exists():
-        raise ValueError(f"{folder} has neither {inner.name}.zip nor best_model.zip: let the training end first")
+    if not model_path.exists():
+        raise ValueError(f"{folder} has no {inner.name}.zip: let the training end first")
     args, settings = (_read_plain(inner / name) for name in ("args.yml", "config.yml"))
     if missing := {"env", "seed"} - set(args):
         raise ValueError(f"{inner / 'args.yml'} lacks {', '.join(sorted(missing))}: give a folder that rl-zoo3 wrote")
     if wrapped := [name for name in ("env_wrapper", "vec_env_wrapper") if settings.get(name)]:
         raise ValueError(
             f"{folder} was trained with {' and '.join(wrapped)}, and the evaluation for the card knows no wrappers: "
-            "evaluate it yourself, and give write_model_card a Publication"
+            "publish the model's file with huggingface_sb3.push_to_hub"
         )
     env_kwargs = settings["env_kwargs"] = args.get("env_kwargs") or settings.get("env_kwargs") or {}
     say_what_is_trusted(folder)
     env_id = str(args["env"])
-    env: VecEnv | None = None
-    if (inner / "vecnormalize.pkl").exists():
-        env = load_statistics(inner / "vecnormalize.pkl", make_episodes_env(env_id, 1, env_kwargs=env_kwargs))
-        if settings.get("frame_stack"):
-            env = VecFrameStack(env, settings["frame_stack"])
-    model = TDPG.load(model_path, env=env, device="cpu")
+    model = load_model(model_path, env_id, env_kwargs)
     # The table's first row is left out, because its keywords would replace those of the training.
-    default = [Scenario("Training", env_id), *PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:]]
-    rows = default if scenarios is None else scenarios
-    options: Any = dict(seed=seed, env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))
+    rows = [Scenario("Training", env_id), *PAPER_ROWS.get(env_id.rpartition(":")[2], ())[1:]]
+    options: Any = dict(env_kwargs=env_kwargs, labels=dict(train_seed=args["seed"]))
     records = evaluate_scenarios({"TDPG": model}, rows, n_eval_episodes, **options)
     progress = None
     if get_monitor_files(str(folder)):  # compute the mean cost of each epoch from the log of episodes
@@ -199,24 +149,22 @@ def read_zoo_folder(
         progress = pd.DataFrame({"time/iterations": np.arange(1, len(means) + 1), "rollout/ep_cost_mean": means})
     # A finished training of our `train` saves the selected policy; rl-zoo3's `train` saves the last policy.
     is_ours = (folder / "run.json").exists()
-    if is_ours and is_last and not (folder / "checkpoint.zip").exists():
-        note = _selection_note(folder, settings)
-    else:
-        note = "The policy is the last one." if is_last else "The policy is the one with the best evaluation."
-    files = {name: inner / name for name in ("args.yml", "config.yml", "command.txt")}
-    files["vec_normalize.pkl"] = inner / "vecnormalize.pkl"
-    files = {name: path for name, path in files.items() if path.exists()}
+    is_selected = is_ours and not (folder / "checkpoint.zip").exists()
+    note = _selection_note(folder, settings) if is_selected else "The policy is the last one."
+    files = {name: inner / name for name in ("args.yml", "config.yml", "command.txt") if (inner / name).exists()}
     return Publication(
         model=model_path,
         env_id=env_id,
+        method="TDPG",
+        seed=args["seed"],
+        settings=settings,
         records=records,
         scenarios=rows,
-        settings=settings,
-        seed=args["seed"],
+        evaluated=datetime.now(timezone.utc),
         progress=progress,
         notes=["Trained with rl-zoo3.", note],
         command=_typed_command(files["command.txt"].read_text()) if "command.txt" in files else None,
-        how=json.loads((folder / "run.json").read_text())["provenance"] if is_ours else _saved_versions(model_path),
+        how=json.loads((folder / "run.json").read_text())["provenance"] if is_ours else None,
         files=files,
         metrics=sorted([*folder.glob("*.csv"), *folder.glob("evaluations.npz")]),
     )
@@ -233,14 +181,6 @@ def _typed_command(command: str) -> str | None:
     if "multiprocessing" in command or not command.strip():
         return None
     return shlex.join(as_typed(shlex.split(command)))
-
-
-def _saved_versions(model_path: Path) -> dict[str, Any]:
-    """Return the versions and the platform that SB3 saves with a model."""
-    with zipfile.ZipFile(model_path) as archive:
-        lines = archive.read("system_info.txt").decode().splitlines()
-    versions = dict(line.removeprefix("- ").split(": ", 1) for line in lines if line.startswith("- ") and ": " in line)
-    return dict(versions=versions, platform=versions.pop("OS", "unknown"), git=None)
 
 
 def _selection_note(folder: Path, settings: Mapping[str, Any]) -> str:

@@ -14,11 +14,10 @@ import huggingface_hub
 import pandas as pd
 import yaml
 from huggingface_hub.errors import HTTPError, LocalTokenNotFoundError
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_tdpg.common.files import replaced_atomically
-from sb3_tdpg.common.provenance import write_frame_atomically, write_run_config
+from sb3_tdpg.common.provenance import write_frame_atomically
 from sb3_tdpg.common.trust import refuse_links, say_what_is_trusted
 from sb3_tdpg.evaluation import save_figure, training_curves
 from sb3_tdpg.evaluation.enjoy import enjoy
@@ -33,46 +32,38 @@ OPTIONAL_FILES = ["command.txt", "replay.mp4", "selected.json", "training.png", 
 
 
 def write_model_card(
-    source: str | os.PathLike[str] | Publication,
+    source: str | os.PathLike[str],
     out: str | os.PathLike[str],
     repo_id: str,
     *,
     film_episodes: int = 0,
-    **evaluation: Any,
+    n_eval_episodes: int = 1000,
 ) -> Path:
     """
     Write a folder with a model, its card and its records, ready for :func:`push_to_hub`.
 
     The folder has the files of a Stable-Baselines3 model on the Hub, ``results.json`` for the training environment, and
-    also ``episodes.csv``, ``config.json`` and ``training.png``. It is created only when it is complete.
+    also ``episodes.csv`` and ``training.png``. It is created only when it is complete.
 
-    :param source: The folder of a run, a folder of rl-zoo3 (whose policy is evaluated now), or a publication.
-    :param out: The folder. It must not exist, or it must be empty.
+    :param source: The folder of a run, or a folder of rl-zoo3 (whose policy is evaluated now).
+    :param out: The folder, which must not exist.
     :param repo_id: The repository for which the folder is made: ``organization/name``.
     :param film_episodes: Number of episodes in ``replay.mp4``, which the Hub plays beside the card. 0 means no video.
-    :param evaluation: For a folder of rl-zoo3: the arguments of ``sb3_tdpg.hub.publication.read_zoo_folder``.
+    :param n_eval_episodes: Number of evaluation episodes of each scenario, for a folder of rl-zoo3.
     :return: ``out``
-    :raises ValueError: if ``out`` is not empty, the source is not finished, the records are from several policies, or a
-        scenario has fewer than two episodes.
+    :raises ValueError: if ``out`` exists, the source is not finished, or a scenario has fewer than two episodes.
     """
     if film_episodes < 0:
         raise ValueError(f"film_episodes={film_episodes} must be at least 0: the episodes in replay.mp4")
-    out = _empty(out)
-    publication = source if isinstance(source, Publication) else read_publication(Path(source), **evaluation)
+    out = _new(out)
+    publication = read_publication(Path(source), n_eval_episodes)
     results = results_with_intervals(publication.records)
     with replaced_atomically(out) as folder:
         folder.mkdir()
         model_path = folder / f"{model_name(publication.env_id)}.zip"
-        if isinstance(publication.model, TDPG):
-            publication.model.save(model_path)
-            statistics = publication.model.get_vec_normalize_env()
-            if statistics is not None and statistics.norm_obs:
-                statistics.save(str(folder / "vec_normalize.pkl"))
-        else:
-            _check_model(publication.model)
-            shutil.copyfile(publication.model, model_path)
-            if (beside := statistics_beside(Path(publication.model))) is not None:
-                shutil.copyfile(beside, folder / "vec_normalize.pkl")
+        shutil.copyfile(publication.model, model_path)
+        if (beside := statistics_beside(publication.model)) is not None:
+            shutil.copyfile(beside, folder / "vec_normalize.pkl")
         _write_records(publication, results, folder)
         if publication.progress is not None:
             figure = training_curves({publication.method: publication.progress})
@@ -80,14 +71,11 @@ def write_model_card(
                 figure.axes[1].set_axis_off()  # this panel has no curve
             save_figure(figure, folder / "training.png")
         if film_episodes:
-            if isinstance(publication.model, Path):
-                say_what_is_trusted(publication.model)
+            say_what_is_trusted(publication.model)
             video = folder / "replay.mp4"
             enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=video)
         pictures = [path.name for path in folder.iterdir()]
         model_card(publication, results, repo_id, pictures).save(folder / "README.md")
-        if out.exists():
-            out.rmdir()
     return out
 
 
@@ -173,41 +161,23 @@ def pull_from_hub(
     Download a repository without running or unpickling any file. A download that fails leaves nothing behind.
 
     :param repo_id: ``organization/name``.
-    :param out: The folder. It must not exist, or it must be empty.
+    :param out: The folder, which must not exist.
     :param revision: A branch, tag or commit; default: the newest commit.
     :param token: Access token for a private repository; default: see :func:`push_to_hub`.
     :return: ``out``
-    :raises ValueError: if ``out`` is not empty, or the download fails.
+    :raises ValueError: if ``out`` exists, or the download fails.
     """
-    out = _empty(out)
-    is_new = not out.exists()
-    try:
-        with _one_line_errors(repo_id, "read"):
-            huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=out, token=token, **LIBRARY)
-    except BaseException:
-        # A folder that was there stays: it may be the working directory, a link or a mounted disk.
-        for each in out.iterdir() if out.exists() else ():
-            shutil.rmtree(each) if each.is_dir() else each.unlink()
-        if is_new and out.exists():
-            out.rmdir()
-        raise
+    out = _new(out)
+    with _one_line_errors(repo_id, "read"), replaced_atomically(out) as folder:
+        huggingface_hub.snapshot_download(repo_id, revision=revision, local_dir=folder, token=token, **LIBRARY)
     return out
 
 
-def _empty(out: str | os.PathLike[str]) -> Path:
+def _new(out: str | os.PathLike[str]) -> Path:
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists():
         raise ValueError(f"{out} exists already: choose another folder, or remove it")
     return out
-
-
-def _check_model(path: Path) -> None:
-    """Raise an error if a model file is damaged; do not unpickle it."""
-    try:
-        load_from_zip_file(path, device="cpu", load_data=False)[1]["policy"]
-    except Exception as e:  # damaged bytes can cause any error
-        reason = " ".join(str(e).split())[:200]
-        raise ValueError(f"{path} is not a model: the file is damaged, or another program made it ({reason})") from e
 
 
 def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -> None:
@@ -217,11 +187,6 @@ def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -
     for name, content in (("config.yml", settings), ("args.yml", args), ("env_kwargs.yml", env_kwargs)):
         (out / name).write_text(yaml.safe_dump(content, sort_keys=False))
     training = results.iloc[0]
-    if training["scenario"] != "Training" and len(results) > 1:
-        raise ValueError(
-            f"no row of the records is called 'Training' (there are {', '.join(results['scenario'])}), and "
-            "results.json is for the training environment: evaluate it, too"
-        )
     zoo_results = dict(
         mean_reward=-float(training["mean"]),
         std_reward=float(training["std"]),
@@ -234,11 +199,6 @@ def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -
         for path in publication.metrics:
             archive.write(path, path.name)
     write_frame_atomically(publication.records, out / "episodes.csv")
-    if "config.json" not in publication.files:
-        config: dict[str, Any] = dict(method=publication.method, env_id=publication.env_id, seed=publication.seed)
-        rows = [dict(name=row.name, env_id=row.env_id, env_kwargs=row.env_kwargs) for row in publication.scenarios]
-        config.update(settings=publication.settings, n_eval_episodes=int(training["n"]), scenarios=rows)
-        write_run_config(out / "config.json", config)
     for name, path in publication.files.items():
         (out / name).parent.mkdir(exist_ok=True)
         shutil.copyfile(path, out / name)
