@@ -7,7 +7,6 @@ Dimension key: N robots, Z task-relevant variables (TRVs), U action components, 
 from __future__ import annotations
 
 import json
-import logging
 import os
 import warnings
 from pathlib import Path
@@ -164,9 +163,6 @@ def metadata_of(step: ExportedStep) -> dict[str, Any]:
         action_space=str(space),
         horizon=policy.horizon,
         action_noise=noise,
-        trained="stochastic",
-        evaluated="stochastic",
-        certified="stochastic",
         versions=dict(
             sb3_tdpg=sb3_tdpg.__version__, stable_baselines3=stable_baselines3.__version__, torch=th.__version__
         ),
@@ -258,11 +254,6 @@ def export_trained(model: Any, path: str | os.PathLike[str], format: str | None,
     return export_policy(model.policy, path, format=format, normalization=normalization)
 
 
-def _is_not_of_torchvision(record: logging.LogRecord) -> bool:
-    """Return whether to keep a log record. Warnings about torchvision are dropped, because no policy needs it."""
-    return not record.getMessage().startswith("torchvision is not installed")
-
-
 def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
     try:
         from onnxscript import opset18 as op  # torch.onnx also needs onnxscript
@@ -274,22 +265,17 @@ def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
         return op.Reciprocal(op.Add(op.Exp(op.Neg(x)), op.Constant(value_float=1.0)))
 
     names = step.input_names
-    registration = logging.getLogger("torch.onnx._internal.exporter._registration")
-    registration.addFilter(_is_not_of_torchvision)
-    try:
-        program = th.onnx.export(
-            step,
-            step.example(),
-            input_names=names,
-            output_names=["action", "next_memory"],
-            dynamic_shapes=(tuple({0: th.export.Dim.DYNAMIC} for _ in names),),
-            custom_translation_table={th.ops.aten.sigmoid.default: sigmoid},
-            opset_version=OPSET,
-            dynamo=True,
-            verbose=False,
-        )
-    finally:
-        registration.removeFilter(_is_not_of_torchvision)
+    program = th.onnx.export(
+        step,
+        step.example(),
+        input_names=names,
+        output_names=["action", "next_memory"],
+        dynamic_shapes=(tuple({0: th.export.Dim.DYNAMIC} for _ in names),),
+        custom_translation_table={th.ops.aten.sigmoid.default: sigmoid},
+        opset_version=OPSET,
+        dynamo=True,
+        verbose=False,
+    )
     assert program is not None
     program.model.metadata_props[METADATA] = metadata
     program.save(str(path))

@@ -5,12 +5,11 @@ Dimension key: N environments in the order of ``env_fns``; each actor runs B suc
 """
 
 import itertools
-import math
 import os
 import pickle
 import uuid
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +25,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from sb3_tdpg.common.threads import set_threads, usable_cores
 from sb3_tdpg.envs.checks import count as check_count
 
+START_TIMEOUT = 120.0  # s; maximum time until all actors have made their environments
 CLOSE_TIMEOUT = 10.0  # s; after this time an actor is killed even if its environments are not closed
 
 
@@ -99,7 +99,7 @@ class RayVecEnv(VecEnv):
 
     If Ray is not initialised (``ray.init``), this class joins the cluster that the environment variable ``RAY_ADDRESS``
     names. Without this variable, it starts Ray on this machine, and ends Ray when the last ``RayVecEnv`` is closed.
-    Every machine of a cluster needs this package.
+    Every machine of a cluster needs this package. In a cluster, each actor reserves one CPU.
 
     An exception of an environment is raised unchanged. If an actor dies (killed, crashed, machine lost), the next call
     raises :class:`DeadActorError`. With ``max_restarts`` above 0, Ray restarts the actor instead, and the actor makes
@@ -109,12 +109,10 @@ class RayVecEnv(VecEnv):
     :param env_fns: Functions that make one environment each.
     :param n_actors: Number of actors. By default, one for each CPU of the cluster, but at most one per environment.
     :param max_restarts: Largest number of times that Ray restarts each actor.
-    :param actor_options: Ray's options for an actor, such as ``dict(num_gpus=0.1)``. By default an actor reserves one
-        CPU, or none if this class has started Ray on this machine.
-    :param start_timeout: Seconds to wait until all actors have made their environments.
     :param step_timeout: Seconds after which an actor that does not answer is killed. This time must be longer than a
         restart takes. ``None`` means no limit.
-    :raises TimeoutError: if the actors do not start in time, for instance because the cluster has too few CPUs.
+    :raises TimeoutError: if the actors do not start within two minutes, for instance because the cluster has too few
+        CPUs.
     """
 
     # All objects share the connection to Ray. These attributes are the number of objects that use the connection,
@@ -127,12 +125,9 @@ class RayVecEnv(VecEnv):
         n_actors: int | None = None,
         *,
         max_restarts: int = 0,
-        actor_options: Mapping[str, Any] | None = None,
-        start_timeout: float = 120.0,
         step_timeout: float | None = None,
     ) -> None:
         env_fns = list(env_fns)
-        options = dict(actor_options or {})
         if not env_fns:
             raise ValueError("env_fns is empty: give one function for each environment")
         if n_actors is not None:
@@ -141,24 +136,23 @@ class RayVecEnv(VecEnv):
                 raise ValueError(f"n_actors={n_actors} must be at most the number of environments: {len(env_fns)}")
         if not (isinstance(max_restarts, (int, np.integer)) and max_restarts >= 0):
             raise ValueError(f"max_restarts={max_restarts!r} must be an integer of at least 0")
-        if taken := {"max_restarts", "max_task_retries"} & set(options):
-            raise ValueError(f"actor_options has {sorted(taken)}: give max_restarts to RayVecEnv itself")
-        for name, timeout in dict(start_timeout=start_timeout, step_timeout=step_timeout).items():
-            if timeout is not None and not timeout > 0:
-                raise ValueError(f"{name}={timeout!r} must be a positive number of seconds")
-        self._max_restarts, self._start_timeout, self._step_timeout = max_restarts, start_timeout, step_timeout
+        if step_timeout is not None and not step_timeout > 0:
+            raise ValueError(f"step_timeout={step_timeout!r} must be a positive number of seconds")
+        self._max_restarts, self._step_timeout = max_restarts, step_timeout
         self._actors: list[Any] = []
         self._is_closed = False
-        self._connect(n_actors or min(len(env_fns), usable_cores()), options.get("num_cpus", 1))
+        self._connect(n_actors or min(len(env_fns), usable_cores()))
         try:
             n_actors = n_actors or min(len(env_fns), max(1, int(self._ray.cluster_resources().get("CPU", 1))))
             bounds = [len(env_fns) * i // n_actors for i in range(n_actors + 1)]
             self._shares = list(itertools.starmap(slice, itertools.pairwise(bounds)))
             # Actors need no CPU if this class has started Ray: otherwise a second RayVecEnv would wait for free CPUs
             # for ever. Task events cost 0.1 ms per step.
-            self._actor_options = {"num_cpus": 0 if self._is_local else 1, "enable_task_events": False, **options}
             actor_class = self._ray.remote(EnvActor).options(
-                max_restarts=max_restarts, max_task_retries=-1 if max_restarts else 0, **self._actor_options
+                num_cpus=0 if self._is_local else 1,
+                max_restarts=max_restarts,
+                max_task_retries=-1 if max_restarts else 0,
+                enable_task_events=False,
             )
             self._actors = [actor_class.remote(env_fns[share]) for share in self._shares]
             self._lives: list[str | None] = [None] * n_actors
@@ -167,7 +161,7 @@ class RayVecEnv(VecEnv):
             self.close()
             raise
 
-    def _connect(self, n_actors: int, num_cpus: float) -> None:
+    def _connect(self, n_cpus: int) -> None:
         """Connect to Ray, or start it on this machine if there is no cluster."""
         try:
             import ray
@@ -179,7 +173,6 @@ class RayVecEnv(VecEnv):
             RayVecEnv._n_users, RayVecEnv._is_ours, RayVecEnv._is_local = 0, True, is_local
             # By default Ray's processes have a low priority (nice 15).
             config = {} if "RAY_worker_niceness" in os.environ else {"worker_niceness": 0}
-            n_cpus = max(1, math.ceil(n_actors * num_cpus))
             local = dict(address="local", num_cpus=n_cpus, include_dashboard=False, _system_config=config)
             self._ray.init(**(local if is_local else {}))
         RayVecEnv._n_users += 1
@@ -187,12 +180,11 @@ class RayVecEnv(VecEnv):
     def _wait_for_start(self) -> tuple[gym.Space, gym.Space]:
         replies = [self._send(i, "spaces", self._max_restarts > 0) for i in range(len(self._actors))]
         made = [rest for _, rest in replies]
-        _, late = self._ray.wait(made, num_returns=len(made), timeout=self._start_timeout)
+        _, late = self._ray.wait(made, num_returns=len(made), timeout=START_TIMEOUT)
         if late:
             raise TimeoutError(
-                f"{len(late)} of {len(made)} actors did not start within start_timeout={self._start_timeout:g} s. Each "
-                f"asks for {self._actor_options}; free are {self._ray.available_resources()}: use fewer actors "
-                "(n_actors), ask for less (actor_options), add machines, or wait longer (start_timeout)"
+                f"{len(late)} of {len(made)} actors did not start within {START_TIMEOUT:g} s; free are "
+                f"{self._ray.available_resources()}: use fewer actors (n_actors), or add machines"
             )
         return self._receive_all(replies)[1][0]
 
@@ -217,7 +209,7 @@ class RayVecEnv(VecEnv):
                 raise (error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))) from error
             except self._ray.exceptions.GetTimeoutError:
                 self._ray.kill(self._actors[actor], no_restart=False)
-                timeout = self._start_timeout + (timeout or 0.0)
+                timeout = START_TIMEOUT + (timeout or 0.0)
             except self._ray.exceptions.RayError as error:
                 raise DeadActorError(
                     f"{name} has died, or did not answer within step_timeout={self._step_timeout}: "

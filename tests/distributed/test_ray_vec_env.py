@@ -380,9 +380,10 @@ def test_files_of_monitor_are_not_overwritten_by_a_restarted_actor(make, tmp_pat
         make(env_fns, 1, max_restarts=1)
 
 
-def test_more_cpus_than_the_cluster_has_are_refused_after_a_while(make):
-    with pytest.raises(TimeoutError, match=r"1 of 1 actors did not start .*'num_cpus': 3.*'CPU': 2\.0.*n_actors"):
-        make(wanderers(), 1, actor_options=dict(num_cpus=3), start_timeout=1.0)
+def test_more_actors_than_the_cluster_has_cpus_are_refused_after_a_while(make, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(TimeoutError, match=r"\d of 3 actors did not start .*n_actors"):
+        patch.setattr("sb3_tdpg.distributed.ray_vec_env.START_TIMEOUT", 2.0)
+        make(wanderers(), 3)
     assert make(wanderers(), 1).num_envs == N  # what was asked for is not still waited for
 
 
@@ -396,8 +397,6 @@ def test_an_error_while_the_environments_are_made_is_raised_as_it_is(make):
     (dict(n_actors=0), "n_actors=0 must be an integer of at least 1"),
     (dict(n_actors=N + 1), "n_actors=4 must be at most the number of environments: 3"),
     (dict(max_restarts=-1), "max_restarts=-1"),
-    (dict(actor_options=dict(max_restarts=1)), "give max_restarts to RayVecEnv itself"),
-    (dict(start_timeout=0), "start_timeout=0"),
     (dict(step_timeout=-1.0), r"step_timeout=-1\.0"),
 ])  # fmt: skip
 def test_bad_arguments_are_refused(kwargs, message):
