@@ -151,16 +151,16 @@ def _report(models: Sequence[str], env: str, env_kwargs: Sequence[str], out: Pat
     print(f"the report is {out / 'report.html'} (Markdown: {out / 'report.md'})")
 
 
-def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool, film_episodes: int) -> None:
+def _push(folder: Path, repo_id: str, card: Path | None, dry_run: bool) -> None:
     from sb3_tdpg.hub import push_to_hub, write_model_card
 
     refuse_links(folder)
     if not (folder / "README.md").exists():
         named = Path(os.path.abspath(folder))  # "." has no name
         card = card or named.with_name(f"{named.name}-hub")
-        folder = write_model_card(folder, card, repo_id, film_episodes=film_episodes)
-    elif card is not None or film_episodes:
-        raise ValueError(f"{folder} has a card already (README.md): leave out --card and --film-episodes")
+        folder = write_model_card(folder, card, repo_id)
+    elif card is not None:
+        raise ValueError(f"{folder} has a card already (README.md): leave out --card")
     else:
         named_in_card = re.findall(r'load_from_hub\("([^"]+)"', (folder / "README.md").read_text())
         if named_in_card and repo_id not in named_in_card:
@@ -346,7 +346,6 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--repo-id", required=True, metavar="ORG/NAME", help="by convention ORG/tdpg-<environment>")
     add("--card", type=Path, help="folder for the card (default: FOLDER-hub)")
     add("--dry-run", action="store_true", help="write the card but upload nothing")
-    add("--film-episodes", type=int, default=0, help="episodes in replay.mp4")
 
     add = command(_pull, "download a model and its card from the Hugging Face Hub")
     add("repo_id", metavar="ORG/NAME")

@@ -1,4 +1,4 @@
-"""Write the model card: results with intervals, use, how the model was made, and metadata for the Hub."""
+"""Write the model card: the results with intervals, how to use the model, how it was made, and metadata for the Hub."""
 
 import math
 import re
@@ -21,7 +21,7 @@ LEVEL = 0.95  # confidence level of the intervals
 
 
 def model_name(env_id: str) -> str:
-    """Return the conventional name of the model and the repository for an environment id: ``tdpg-Lava-v0``."""
+    """Return the usual name of a model file and its repository, such as ``tdpg-Lava-v0`` for the id ``Lava-v0``."""
     return f"{ALGORITHM}-{env_id.rpartition(':')[2].replace('/', '-')}"
 
 
@@ -31,9 +31,9 @@ def results_with_intervals(records: pd.DataFrame) -> pd.DataFrame:
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
     :return: a row for each scenario, the training environment first. To the columns of
-        :func:`~sb3_tdpg.evaluation.summary_table` it adds the interval of the mean cost, ``low`` and ``high``
-        (Student's t). If the records have failures, it also adds the interval of the failure rate, ``failure_low`` and
-        ``failure_high`` (Wilson)
+        :func:`~sb3_tdpg.evaluation.summary_table` it adds the limits of the interval of the mean cost, ``low`` and
+        ``high`` (Student's t). If the records have failures, it also adds the limits of the interval of the failure
+        rate, ``failure_low`` and ``failure_high`` (Wilson)
     :raises ValueError: if a scenario has fewer than two episodes.
     """
     if records.empty or (records.groupby("scenario").size() < 2).any():
@@ -49,14 +49,12 @@ def results_with_intervals(records: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def model_card(
-    publication: Publication, results: pd.DataFrame, repo_id: str, pictures: Collection[str] = ()
-) -> ModelCard:
+def model_card(publication: Publication, results: pd.DataFrame, repo_id: str, names: Collection[str] = ()) -> ModelCard:
     """
     Make the model card of a repository, with the results of :func:`results_with_intervals`.
 
-    As for any Stable-Baselines3 model, the metric is the mean reward, here the negative cost. The card shows
-    ``training.png`` and ``replay.mp4`` if they are among the ``pictures`` in the folder.
+    As for any Stable-Baselines3 model, the metric is the mean reward, here the negative mean cost of an episode. The
+    card mentions ``training.png`` and ``vec_normalize.pkl`` if ``names``, the files of the folder, contain them.
     """
     changes = {row.name: _changes(publication, row.env_kwargs) for row in publication.scenarios}
     task = "reinforcement-learning"
@@ -101,7 +99,7 @@ def model_card(
         failures="failure_share" in results,
         deterministic=bool(results["deterministic"].all()),
         evaluation_seed=one_or_all(results["seed"]),
-        pictures=pictures,
+        names=names,
         repo_id=repo_id,
         file_name=f"{model_name(publication.env_id)}.zip",
         make_arguments=", ".join([repr(publication.env_id), *make_keywords]),

@@ -29,16 +29,16 @@ class Publication:
 
     model: Path  # the file that ``model.save`` wrote
     env_id: str
-    method: str  # its name ("PG", "TDPG")
-    seed: int  # of the training
+    method: str  # name of the method ("PG", "TDPG")
+    seed: int  # training seed
     settings: Mapping[str, Any]  # hyperparameters in the form of a block of hyperparams/tdpg.yml
-    records: pd.DataFrame  # episodes of this policy alone, from evaluate_scenarios
-    scenarios: Sequence[Scenario]  # of the records
+    records: pd.DataFrame  # evaluation episodes of this policy, from evaluate_scenarios
+    scenarios: Sequence[Scenario]  # the scenarios of the records
     evaluated: datetime  # when the records were made
     progress: pd.DataFrame | None  # training log, see training_curves
     notes: Sequence[str]  # sentences about the training
-    command: str | None  # made the model
-    again: str | None = None  # repeats the training in the published folder
+    command: str | None  # the command that made the model
+    again: str | None = None  # the command that repeats the training in the published folder
     how: Mapping[str, Any] | None  # provenance() at the time of the training
     files: Mapping[str, Path]  # additional files by their paths in the published folder
     metrics: Sequence[Path]  # files for train_eval_metrics.zip, which rl-zoo3 reads
@@ -89,8 +89,8 @@ def read_run(folder: Path) -> Publication:
         refuse_links(folder.parent / start)
         notes.append(f"The training started from the policy of another run, {start}.")
         files[f"{start}/model.zip"] = folder.parent / start / "model.zip"
-    # A run is not repeatable if the policy that it started from is missing, or if a setting was a class (the file
-    # contains only its name).
+    # A run cannot be repeated if its initial policy is missing, or if one of its settings is a class (the file
+    # contains only the name of the class).
     has_class = "<class '" in json.dumps(config["settings"])
     is_repeatable = (start is None or files[f"{start}/model.zip"].exists()) and not has_class
     return Publication(
@@ -114,8 +114,8 @@ def read_zoo_folder(folder: Path, n_eval_episodes: int) -> Publication:
     """
     Read a folder that rl-zoo3's ``train`` wrote (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
 
-    The scenarios are the training environment and the test rows of the paper's table. A test row has the keywords of
-    the training unless it replaces them.
+    The scenarios are the training environment and, if the paper has a table for it, the test rows of this table. The
+    test rows keep the keywords of the training environment that they do not replace.
 
     :param n_eval_episodes: Number of episodes of each scenario.
     """
@@ -171,20 +171,20 @@ def read_zoo_folder(folder: Path, n_eval_episodes: int) -> Publication:
 
 
 def _read_plain(path: Path) -> dict[str, Any]:
-    """Read a file of rl-zoo3 as plain data."""
+    """Read a YAML file of rl-zoo3 without running code that it may contain."""
     with path.open() as file:
         return dict(yaml.load(file, PlainLoader))
 
 
 def _typed_command(command: str) -> str | None:
-    """Return a command as a user would type it, or ``None`` for the command of a worker process."""
+    """Return a command as a user would type it, or ``None`` if it is empty or started a worker process."""
     if "multiprocessing" in command or not command.strip():
         return None
     return shlex.join(as_typed(shlex.split(command)))
 
 
 def _selection_note(folder: Path, settings: Mapping[str, Any]) -> str:
-    """Return a sentence that says which epoch the policy is from."""
+    """Return a sentence that says which training epoch the policy comes from."""
     if (folder / "selected.json").exists():
         best = Candidate.from_json((folder / "selected.json").read_text())
         return f"The selection chose the policy of {best}, measured on the episodes of that epoch."

@@ -1,4 +1,4 @@
-"""Write a model's folder with the files that rl-zoo3 needs, and exchange it with the Hugging Face Hub."""
+"""Write a folder with a model and the files that rl-zoo3 needs; upload it to the Hugging Face Hub and download it."""
 
 import json
 import os
@@ -18,9 +18,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_tdpg.common.files import replaced_atomically
 from sb3_tdpg.common.provenance import write_frame_atomically
-from sb3_tdpg.common.trust import refuse_links, say_what_is_trusted
+from sb3_tdpg.common.trust import refuse_links
 from sb3_tdpg.evaluation import save_figure, training_curves
-from sb3_tdpg.evaluation.enjoy import enjoy
 from sb3_tdpg.evaluation.loading import statistics_beside
 from sb3_tdpg.hub.model_card import ALGORITHM, model_card, model_name, results_with_intervals
 from sb3_tdpg.hub.publication import Publication, plain, read_publication
@@ -36,25 +35,22 @@ def write_model_card(
     out: str | os.PathLike[str],
     repo_id: str,
     *,
-    film_episodes: int = 0,
     n_eval_episodes: int = 1000,
 ) -> Path:
     """
     Write a folder with a model, its card and its records, ready for :func:`push_to_hub`.
 
-    The folder has the files of a Stable-Baselines3 model on the Hub, ``results.json`` for the training environment, and
-    also ``episodes.csv`` and ``training.png``. It is created only when it is complete.
+    The folder has the files of a Stable-Baselines3 model on the Hub (``results.json`` is for the training environment),
+    and also ``episodes.csv`` and ``training.png``. It appears only when all its files are complete.
+    If you add a video ``replay.mp4`` (``sb3-tdpg enjoy --record``), the Hub plays it beside the card.
 
     :param source: The folder of a run, or a folder of rl-zoo3 (whose policy is evaluated now).
-    :param out: The folder, which must not exist.
+    :param out: The folder to write, which must not exist yet.
     :param repo_id: The repository for which the folder is made: ``organization/name``.
-    :param film_episodes: Number of episodes in ``replay.mp4``, which the Hub plays beside the card. 0 means no video.
     :param n_eval_episodes: Number of evaluation episodes of each scenario, for a folder of rl-zoo3.
     :return: ``out``
     :raises ValueError: if ``out`` exists, the source is not finished, or a scenario has fewer than two episodes.
     """
-    if film_episodes < 0:
-        raise ValueError(f"film_episodes={film_episodes} must be at least 0: the episodes in replay.mp4")
     out = _new(out)
     publication = read_publication(Path(source), n_eval_episodes)
     results = results_with_intervals(publication.records)
@@ -70,12 +66,8 @@ def write_model_card(
             if "mi/total" not in publication.progress:
                 figure.axes[1].set_axis_off()  # this panel has no curve
             save_figure(figure, folder / "training.png")
-        if film_episodes:
-            say_what_is_trusted(publication.model)
-            video = folder / "replay.mp4"
-            enjoy(model_path, publication.env_id, publication.env_kwargs, n_episodes=film_episodes, record=video)
-        pictures = [path.name for path in folder.iterdir()]
-        model_card(publication, results, repo_id, pictures).save(folder / "README.md")
+        names = [path.name for path in folder.iterdir()]
+        model_card(publication, results, repo_id, names).save(folder / "README.md")
     return out
 
 
@@ -90,7 +82,7 @@ def push_to_hub(
     """
     Upload a folder that :func:`write_model_card` wrote. The repository is created if it does not exist.
 
-    :param folder: The folder.
+    :param folder: The folder to upload.
     :param repo_id: ``organization/name``.
     :param private: Whether a new repository is private; default: the default of the organization.
     :param commit_message: Commit message for the history of the repository.
@@ -129,8 +121,8 @@ def load_from_hub(
     :param env: See :meth:`TDPG.load <sb3_tdpg.TDPG.load>`.
     :param revision: A branch, tag or commit; default: the newest commit.
     :param token: Access token for a private repository; default: see :func:`push_to_hub`.
-    :param trust_remote_code: Whether to unpickle the download, which can run any code. Default: whether the variable
-        ``TRUST_REMOTE_CODE`` is set, as in ``huggingface_sb3``.
+    :param trust_remote_code: Whether to unpickle the download, which can run any code. Default: whether the
+        environment variable ``TRUST_REMOTE_CODE`` is set, as in ``huggingface_sb3``.
     :param kwargs: See :meth:`TDPG.load <sb3_tdpg.TDPG.load>`.
     :raises ValueError: if ``trust_remote_code`` is not true, or if the repository has no such TDPG model.
     """
@@ -144,7 +136,7 @@ def load_from_hub(
     with _one_line_errors(repo_id, "read"):
         if filename is None:
             files = huggingface_hub.HfApi(token=token).list_repo_files(repo_id, revision=revision)
-            # Models in folders are skipped: a folder contains the policy that the training started from.
+            # Skip models in subfolders: a subfolder contains the policy from which the training started.
             models = [name for name in files if "/" not in name and fnmatch(name, f"{ALGORITHM}-*.zip")]
             if len(models) != 1:
                 found = f"several models ({', '.join(models)})" if models else f"no {ALGORITHM}-*.zip"
@@ -161,7 +153,7 @@ def pull_from_hub(
     Download a repository without running or unpickling any file. A download that fails leaves nothing behind.
 
     :param repo_id: ``organization/name``.
-    :param out: The folder, which must not exist.
+    :param out: The folder for the download, which must not exist yet.
     :param revision: A branch, tag or commit; default: the newest commit.
     :param token: Access token for a private repository; default: see :func:`push_to_hub`.
     :return: ``out``
@@ -181,7 +173,7 @@ def _new(out: str | os.PathLike[str]) -> Path:
 
 
 def _write_records(publication: Publication, results: pd.DataFrame, out: Path) -> None:
-    """Write the files for other programs, and copy the files of the publication."""
+    """Write the files that rl-zoo3 and other programs read, and copy the files of the publication."""
     env_kwargs, settings = plain(publication.env_kwargs), plain(publication.settings)
     args = dict(algo=ALGORITHM, env=publication.env_id, env_kwargs=env_kwargs, seed=publication.seed)
     for name, content in (("config.yml", settings), ("args.yml", args), ("env_kwargs.yml", env_kwargs)):

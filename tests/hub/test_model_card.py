@@ -99,7 +99,7 @@ def test_the_card_of_stacked_observations_says_how_to_stack(runs):
 
 
 def test_a_card_that_is_written_is_not_given_other_settings_or_another_name(card, capsys):
-    line = error_line(capsys, "push", card, "--repo-id", REPO_ID, "--dry-run", "--film-episodes", "2")
+    line = error_line(capsys, "push", card, "--repo-id", REPO_ID, "--dry-run", "--card", "other")
     assert "has a card already" in line
     line = error_line(capsys, "push", card, "--repo-id", "other/name", "--dry-run")
     assert f"is for {REPO_ID}, not for other/name" in line
@@ -113,14 +113,6 @@ def test_shares_of_failures_have_wilsons_interval(n, low, high, runs):
     assert results.loc[0, ["failure_low", "failure_high"]].tolist() == pytest.approx([low, high], abs=1e-5)
     text = model_card(read_run(runs / "pg-seed0"), results, REPO_ID).text
     assert f"0.00 [0.00, 0.00] | 0.00 | {10 * n:.1f}% [{100 * low:.1f}%, {100 * high:.1f}%] |" in text
-
-
-def test_the_video_of_an_episode_is_in_the_folder_of_the_card(runs, tmp_path, capsys):
-    pytest.importorskip("imageio_ffmpeg")
-    card = write_model_card(runs / "pg-seed0", tmp_path / "card", REPO_ID, film_episodes=1)
-    assert b"ftyp" in (card / "replay.mp4").read_bytes()[:12]
-    assert "[replay.mp4](replay.mp4)" in text_of(card)
-    assert "replay.mp4" not in capsys.readouterr().out, "it was written elsewhere and moved"
 
 
 @pytest.mark.parametrize(("name", "damage", "message"), [
