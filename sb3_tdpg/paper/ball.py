@@ -84,7 +84,7 @@ EARLIER_ENCODER = dict(
 
 
 def methods(launch: str) -> tuple[Method, ...]:
-    """List TDPG with its defaults, variants with the change in their names, and baselines; all take as many steps."""
+    """List TDPG with its defaults, its variants (a label names the change), and baselines; all take the same steps."""
     env_kwargs = dict(LAUNCHES[launch])  # a mapping proxy cannot be sent to another process
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:
@@ -129,7 +129,7 @@ SHIFTS: tuple[Scenario, ...] = (
     Scenario(REDRAWN, BLOCK, sensor=partial(PerturbedVecEnv, perturbation="images")),
     Scenario(GAMMA, BLOCK, sensor=partial(PerturbedVecEnv, perturbation=gamma)),
 )
-"""Rows that the paper does not have: unseen walls, the image changes of the training, and a change not in training."""
+"""Rows that the paper lacks: unseen walls, the image changes of the training, and a change that is not in training."""
 
 
 def reproduce_ball(
@@ -139,9 +139,10 @@ def reproduce_ball(
     Train every method with several seeds, evaluate it on the rows of Table II, and write tables, figures and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz`` (the paper's rows), ``shifts.csv.xz``
-        (the rows ``SHIFTS``), figures, ``config.json`` and ``runs/``.
-    :param launch: ``"fixed"`` as in the paper, or ``"varying"``, which the paper does not have.
-    :param controls: Also train the ablations, PPO, and RecurrentPPO with our encoder. A later call can add them.
+        (the rows of ``SHIFTS``), figures, ``config.json`` and ``runs/``.
+    :param launch: Launch of the ball: ``"fixed"`` as in the paper, or ``"varying"``, which the paper does not have.
+    :param controls: Whether to train also the ablations, PPO, and RecurrentPPO with our encoder. A later call can add
+        these trainings.
     :param n_seeds: Number of training seeds of each method, but at most five for the ablations and for the baselines
         of ``controls``.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`. By default each row has 200 episodes and each wall 20.
@@ -218,9 +219,10 @@ def reproduce_ball(
 
 def with_groups(records: pd.DataFrame) -> pd.DataFrame:
     """
-    Append the records of :data:`GROUPS` and of the walls. All rows of a group have the same number of episodes.
+    Append a copy of the records of each group of rows: :data:`GROUPS`, all walls, and the worst tenth of the walls.
 
-    The worst tenth of the walls is determined for each policy separately.
+    The worst tenth of the walls is determined for each policy separately. All rows of a group have the same number of
+    episodes.
     """
     groups = [records[records["scenario"].isin(rows)].assign(scenario=name) for name, rows in GROUPS.items()]
     walls = records[records["scenario"].isin(WALL_ROWS)]
@@ -232,7 +234,7 @@ def with_groups(records: pd.DataFrame) -> pd.DataFrame:
 
 
 def group_rows(rows: Sequence[Scenario]) -> list[Scenario]:
-    """Return :data:`GROUPS` as rows of the table, with the mean of the paper's numbers."""
+    """Return a row of the table for each group in :data:`GROUPS`, with the mean of the paper's numbers."""
     result = []
     for name, members in GROUPS.items():
         papers = pd.DataFrame([row.paper for row in rows if row.name in members]).map(lambda p: (p.mean, p.distance))

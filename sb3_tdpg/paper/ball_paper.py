@@ -1,4 +1,4 @@
-"""Reproduce Table II with the paper's own algorithm, and compare TDPG with PG that is trained longer."""
+"""Reproduce Table II with the paper's own algorithm, and compare TDPG with policy gradient that is trained longer."""
 
 import math
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ class StopAtCost(TDPGCallback):
     """
     Stop the training once the mean cost of five successive epochs is at most a limit.
 
-    :param cost: The limit.
+    :param cost: The limit of the mean episode cost.
     """
 
     WINDOW = 5
@@ -54,10 +54,10 @@ class StopAtCost(TDPGCallback):
 
 def methods() -> tuple[Method, ...]:
     """
-    List policy gradient at each level, and TDPG with each price.
+    List policy gradient for each level of the cost (:data:`LEVELS`), and TDPG for each price (:data:`PRICES`).
 
-    Policy gradient at a level starts from its policy at the level before. TDPG starts from the policies of policy
-    gradient that cost at least as much as the paper's.
+    Policy gradient starts from its own policy at the previous, higher level. TDPG starts from each policy of policy
+    gradient whose level is at least the paper's.
     """
     found: list[Method] = []
     start = None
@@ -76,7 +76,7 @@ def methods() -> tuple[Method, ...]:
 
 def select(runs: pd.DataFrame, records: pd.DataFrame) -> pd.DataFrame:
     """
-    Select policies by the paper's rule: for each seed and level, the price with the least information under the limit.
+    Select policies by the paper's rule: for each seed and level, the price whose selected epoch has least information.
 
     :param runs: ``model``, ``train_seed`` and ``information`` (NaN if no epoch met the limit) of each run of TDPG.
     :param records: Episodes of all runs.
@@ -94,7 +94,7 @@ def select(runs: pd.DataFrame, records: pd.DataFrame) -> pd.DataFrame:
 
 def reproduce_ball_paper(out: Path, *, n_seeds: int = 5, **options: Any) -> str:
     """
-    Train TDPG by the paper's algorithm from policies of policy gradient; write tables, a figure and records.
+    Train policy gradient, and TDPG from its policies, with the paper's algorithm; write tables, a figure and records.
 
     :param out: Folder for ``summary.md``, ``runs.csv``, ``seeds.csv``, ``robustness.png``, ``config.json``, ``runs/``.
     :param n_seeds: Number of training seeds of each method.
@@ -146,7 +146,7 @@ def _progress(folder: Path) -> Mapping[str, float]:
 
 
 def _runs_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Average the runs over seeds, and count the runs in which an epoch met the limit."""
+    """Average the runs of each method over seeds, and count the runs in which an epoch met the limit on the cost."""
     groups = runs.groupby("model", sort=False)
     table = groups[["epochs", "cost", "information"]].mean().round(1).assign(selected=groups["information"].count())
     return table.astype(str).reset_index().rename(columns=dict(model="method"))

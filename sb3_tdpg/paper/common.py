@@ -1,4 +1,4 @@
-"""Functions for all reproductions: make the runs of several methods, and write tables and the files of a result."""
+"""Define the runs of a reproduction, and write the tables and files of its results."""
 
 import json
 import math
@@ -24,10 +24,10 @@ NO_PENALTY = "TDPG without the penalty"
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """
-    The options of every reproduction. Finished runs are kept: the same call continues an interrupted reproduction.
+    The options of every reproduction. The same call continues an interrupted reproduction, and keeps finished runs.
 
-    :param n_eval_episodes: Number of episodes of each row.
-    :param n_timesteps: Environment steps of each training; default: as in the blocks.
+    :param n_eval_episodes: Number of evaluation episodes of each scenario.
+    :param n_timesteps: Environment steps of each training; default: the number in the method's block of settings.
     :param jobs: Number of parallel runs; default: the number of cores.
     :param publish: Folder for a copy of all files except ``runs/``.
     """
@@ -39,18 +39,18 @@ class Options:
 
     @property
     def overrides(self) -> dict[str, Any]:
-        """The settings that replace those of every block."""
+        """The settings that replace the settings of the blocks."""
         return {} if self.n_timesteps is None else {"n_timesteps": self.n_timesteps}
 
     @property
     def of_runs(self) -> dict[str, Any]:
-        """The arguments of :func:`~sb3_tdpg.experiments.runs.complete_runs`."""
+        """The options that are arguments of :func:`~sb3_tdpg.experiments.runs.complete_runs`."""
         return dict(n_eval_episodes=self.n_eval_episodes, jobs=self.jobs)
 
 
 @dataclass(frozen=True)
 class Method:
-    """How a method with the title ``label`` is trained (see ``Run``) and evaluated."""
+    """A method with the name ``label``: how it is trained (see ``Run``) and evaluated."""
 
     label: str
     block: str
@@ -68,7 +68,7 @@ class Method:
 
 
 def seed_by_seed(methods: Sequence[Method], first_seed: int, n_seeds: int) -> list[tuple[Method, int]]:
-    """List methods seed by seed, so that after an interrupt all methods have the same seeds."""
+    """List all methods for the first seed, then for the next, so that an interrupted run has the same seeds of each."""
     return [(method, first_seed + i) for i in range(n_seeds) for method in methods if i < method.max_seeds]
 
 
@@ -80,7 +80,7 @@ def make_tasks(
     overrides: Mapping[str, Any],
 ) -> list[Task]:
     """
-    Make the runs of several methods with their seeds, and list the rows for the evaluation of each run.
+    Return a task for each method and seed: its run, its folder, and the scenarios for its evaluation.
 
     A method that starts from the policy of another method must come after that method.
     """
@@ -103,7 +103,7 @@ def read_records(tasks: Iterable[Task]) -> pd.DataFrame:
 
 
 def means_by_seed(records: pd.DataFrame, *columns: str) -> pd.DataFrame:
-    """Return the means of columns (default: the cost) over the episodes of each method, seed and row."""
+    """Return the means of columns (default: the cost) over the episodes of each method, seed and scenario."""
     groups = records.groupby(["model", "train_seed", "scenario"], sort=False)
     return groups[list(columns or ["cost"])].mean().reset_index()
 
@@ -147,7 +147,7 @@ def met(condition: bool) -> str:
 
 
 def goals_table(aggregated: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
-    """Compare the interquartile means of ``aggregate_seeds`` with the upper limits for each method and row."""
+    """Compare the interquartile means of ``aggregate_seeds`` with their upper limits, given for each method and row."""
     cells = aggregated.set_index(["model", "scenario"])["iqm"]
     rows = [
         [method, row, f"<= {goal:g}", f"{cells[method, row]:.3g}", met(cells[method, row] <= goal)]
@@ -164,10 +164,10 @@ def comparisons_table(
     quantity: str = "mean cost",
 ) -> str:
     """
-    Make a table of the probability that one method is better than another, and of the paired difference of their means.
+    Make a table with the probability that one method is better than another, and the paired difference of their means.
 
-    The probability is for one seed of each method. Each mean is over the rows of one of ``kinds``, and over the seeds
-    that both methods have. Comparisons with a method that has no records are left out.
+    The probability compares one random seed of each method. Each mean is over the rows of one of ``kinds``, and over
+    the seeds that both methods have. A pair is left out if one of its methods has no records.
     """
     columns = ["method", "compared with", "rows", "seeds", "probability of being better [95 %]"]
     columns += [f"{quantity} of the method", f"{quantity} of the other", "difference [95 %]"]
@@ -185,7 +185,7 @@ def comparisons_table(
 
 
 def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> str:
-    """Write ``knowledge.csv`` with a row for each policy, and return a table of the means over seeds."""
+    """Write ``knowledge.csv``, and return a table of its means over seeds; ``by`` are the columns that define a row."""
     write_frame_atomically(knowledge, out / "knowledge.csv")
     means = knowledge.drop(columns="train_seed").groupby(list(by), sort=False).mean().reset_index()
     return markdown_table(means.rename(columns=dict(model="method")), digits=2)
@@ -194,7 +194,7 @@ def write_knowledge(knowledge: pd.DataFrame, by: Sequence[str], out: Path) -> st
 def write_results(
     out: Path, template: str, tasks: Sequence[Task], command: str, publish: Path | None, **values: Any
 ) -> str:
-    """Write ``summary.md`` and ``config.json``, copy all but the runs to ``publish``, and return the summary."""
+    """Write ``summary.md`` and ``config.json``, copy all files but not ``runs/`` to ``publish``; return the summary."""
     how = provenance()
     write_run_config(out / "config.json", dict(runs=[run.config for run, *_ in tasks], provenance=how))
     # There are several commits if the reproduction was resumed after a change.

@@ -1,4 +1,4 @@
-"""Reproduce Table III, grasping: policy gradient, TDPG, and the ablation without the penalty."""
+"""Reproduce Table III (grasping) with policy gradient, TDPG and the ablation without the penalty."""
 
 import math
 from collections.abc import Mapping
@@ -22,17 +22,17 @@ FIRST_SEEDS = dict(fixed=110, varying=100)
 
 TRAINING, ROTATION, TRANSLATION = (row.name for row in PANDA_GRASP)
 
-# Upper limits of the interquartile mean over seeds of the failure rate, for each method and row.
+# Upper limits of the failure rate (interquartile mean over seeds), for each method and row.
 GOALS: Mapping[str, Mapping[str, float]] = {
     "PG": {TRAINING: 0.02, ROTATION: 0.04, TRANSLATION: 0.08},
     "TDPG": {TRAINING: 0.02, ROTATION: 0.04, TRANSLATION: 0.08},
 }
 
 COMPARISONS = (("TDPG", NO_PENALTY), ("TDPG", "PG"), ("PG", "PG without the nuisance"))
-# The second stage has a lower learning rate than a training from scratch. At that rate its first epoch would destroy
-# the result of the first stage, with and without the penalty: if few grasps fail, the gradient is mostly noise.
+# The second stage has a lower learning rate than the first stage. At the rate of the first stage, one epoch would
+# destroy the policy, with and without the penalty: if few grasps fail, the gradient is mostly noise.
 SECOND_STAGE = dict(n_timesteps=8_000, learning_rate=2e-4)
-# About the cost of PG on tuning seeds. With a higher limit TDPG could become worse than its initial policy.
+# Cost limits of TDPG: about the cost of PG on tuning seeds. With a higher limit TDPG could become worse than PG.
 LIMITS = dict(fixed=0.005, varying=0.01)
 
 
@@ -54,7 +54,7 @@ METHODS = dict(
 
 def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **options: Any) -> str:
     """
-    Train every method with several seeds, evaluate it on every row, and write tables, figures and records.
+    Train every method with several seeds, evaluate it in every scenario, and write tables, figures and records.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
     :param camera: Height of the camera: ``"fixed"`` as in Table III, or ``"varying"``, which the paper does not have.

@@ -23,18 +23,18 @@ from sb3_tdpg.robustness import PerturbedVecEnv
 from sb3_tdpg.tdpg import TDPG
 from sb3_tdpg.vec_env import make_episodes_env
 
-MUGS_AT_A_TIME = 1000  # limits the memory
-N_MUGS = 10_000  # for the regression
-N_BOUND = 2_000  # for the bounds, which compare all pairs of mugs
+MUGS_AT_A_TIME = 1000  # number of images that are encoded at once; limits the memory
+N_MUGS = 10_000  # number of mugs for the regression
+N_BOUND = 2_000  # number of mugs for the bounds, which compare all pairs of mugs
 LAST_EPOCHS = 5
 
 
 def pooled_information(model: Any, env_kwargs: Mapping[str, Any], n_episodes: int = 160) -> float:
     """
-    Bound the information of a ball-catching policy on its training images, in nats, as the penalty does.
+    Return the bound on a ball-catching policy's information that the penalty uses, in nats.
 
-    The result is the log-det bound for the steps of all times together, times the horizon. Each image has the changes
-    that are declared for training.
+    This is the log-det bound for the steps of all times together, times the horizon. As in training, each image has
+    the declared changes.
     """
     sensor = partial(PerturbedVecEnv, perturbation="images")
     scenario = Scenario("training", "BallCatch-v0", {**env_kwargs, "renderer": "fast"}, sensor=sensor)
@@ -52,7 +52,7 @@ class Mugs(NamedTuple):
 
 
 def draw_mugs(env_kwargs: Mapping[str, Any], n_mugs: int) -> Mugs:
-    """Sample mugs and their images from ``PandaGrasp-v0`` with these keywords, without simulating a grasp."""
+    """Sample mugs and their images from ``PandaGrasp-v0`` (with ``env_kwargs``), without simulating a grasp."""
     env = make_episodes_env("PandaGrasp-v0", n_episodes=n_mugs, env_kwargs=env_kwargs, use_processes=False)
     env.seed(evaluation_seeds(0).env)
     images = cast(np.ndarray, env.reset())
@@ -76,12 +76,13 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     """
     Regress the mug's pose on the TRVs of a grasping policy.
 
-    Each quantity is regressed on the TRVs and their squares and products for half of the mugs. R^2 is computed on the
-    other half. R^2 is too low by about the number of regressors (152 for 16 TRVs) divided by half the number of mugs.
+    For half of the mugs, each quantity is regressed on the TRVs, their squares and their products. R^2 is computed on
+    the other half. R^2 is too low by about the number of regressors (152 for 16 TRVs) divided by half the number of
+    mugs.
 
     :param batch: From :func:`encode_mugs`, with an even number of mugs.
-    :return: R^2, clipped at 0, of ``"x"``, ``"y"`` and ``"yaw"`` (its sine and cosine together), and of the height of
-        the ``"camera"`` if it varies
+    :return: R^2, clipped at 0, of ``"x"``, ``"y"`` and ``"yaw"`` (its sine and cosine together), and of ``"camera"``
+        (the height of the camera) if it varies
     """
     x, y, _, yaw, *camera = batch.states[0].numpy().astype(np.float64).T
     trvs = batch.trvs[0].numpy().astype(np.float64)
@@ -104,7 +105,7 @@ def _r2(known: np.ndarray, targets: np.ndarray) -> float:
 
 
 def knowledge_table(models: Mapping[tuple[str, int], TDPG], scenarios: Sequence[Scenario]) -> pd.DataFrame:
-    """Measure what the TRVs of each model (by label and seed) encode about mugs, and bound their information."""
+    """Regress the pose of mugs on the TRVs of each model (keys: label and seed), and bound their information."""
     rows = []
     for row in scenarios:
         mugs = draw_mugs(row.env_kwargs, N_MUGS)
@@ -124,10 +125,10 @@ def bounds(batch: InformationBatch) -> dict[str, float]:
 
 
 def penalty_table(progress: Mapping[int, pd.DataFrame]) -> list[dict[str, Any]]:
-    """Summarise the penalty and the information in training, with a row for each seed in ``progress``."""
+    """Summarise penalty and information in training, with a row for each training log in ``progress`` (keys: seeds)."""
     rows = []
     for seed, log in progress.items():
-        # The weight of an epoch is in the next row, so the first row has no weight.
+        # The log has the weight of an epoch in the row of the next epoch, so the first row has no weight.
         weights = log["train/mi_coef"].fillna(0.0).to_numpy() if "train/mi_coef" in log else np.zeros(1)
         with_penalty = np.flatnonzero(weights > 0)
         information = log["mi/total"].dropna()

@@ -1,4 +1,4 @@
-"""Reproduce Table I, the lava problem: a quick demonstration, and the full reproduction with many seeds."""
+"""Reproduce Table I (the lava problem) in a quick demonstration, or completely with many seeds."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,10 +28,11 @@ from sb3_tdpg.tdpg import TDPG
 READINGS = ("table", "text")
 """Cost definitions of the lava problem: the one that fits Table I, and the one in the text of the paper."""
 
-# The block of hyperparams/tdpg.yml for each method. The cost definition that fits the table has the suffix "-table".
+# The block of hyperparams/tdpg.yml for each method. With the cost definition of the table it has the suffix "-table".
 METHODS = {"PG": "Lava-v0-pg", "TDPG": "Lava-v0", "TDPG (log-det)": "Lava-v0-logdet"}
 
-# Upper limits of mean, standard deviation and ratio (cost at sigma^2 = 1 divided by cost in training).
+# Upper limits of the mean and standard deviation of the cost in training, and of the ratio (the mean cost at
+# sigma^2 = 1 divided by the mean cost in training).
 _TABLE_GOALS, _TEXT_GOALS = dict(mean=28.0, std=10.0, ratio=1.05), dict(mean=20.0, std=10.0, ratio=1.10)
 GOALS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "table": {"PG": dict(mean=14.0), "TDPG": _TABLE_GOALS, "TDPG (log-det)": _TABLE_GOALS},
@@ -57,7 +58,7 @@ COLUMNS = dict(mean="mean cost in training", std="standard deviation", ratio="ra
 
 
 def methods(reading: str) -> list[Method]:
-    """List PG and TDPG with each estimator for a cost definition; ``"paper"`` gives the paper's own settings."""
+    """List PG and TDPG with each estimator for a cost definition, or with the paper's settings for ``"paper"``."""
     if reading == "paper":
         tdpg = [
             Method(f"paper's TDPG, 1/beta = {inverse}", "Lava-v0-paper", overrides=dict(beta=1 / inverse))
@@ -74,7 +75,7 @@ def methods(reading: str) -> list[Method]:
 def _write_figures(
     out: Path, suffix: str, records: pd.DataFrame, folders: Mapping[str, Path], models: Mapping[str, TDPG], reading: str
 ) -> None:
-    """Draw the figures of one seed; the keys of ``folders`` and ``models`` are the methods."""
+    """Draw the figures of one seed; the keys of ``folders`` and ``models`` are the names of the methods."""
     env_kwargs = dict(LAVA_TABLE_READING) if reading == "table" else {}
     save_figure(cost_histograms(records, LAVA), out / f"histograms{suffix}.png")
     save_figure(lava_trajectories(models, env_kwargs), out / f"trajectories{suffix}.png")
@@ -85,12 +86,14 @@ def demo(
     out: Path, *, reading: str = "table", seed: int = 0, n_eval_episodes: int = 1000, n_timesteps: int | None = None
 ) -> str:
     """
-    Train PG and TDPG on the lava problem, compare them on the rows of Table I, and draw figures. See also ``Options``.
+    Train PG and TDPG on the lava problem, compare them on the rows of Table I, and draw figures.
+
+    The other parameters are those of :class:`~sb3_tdpg.paper.common.Options`.
 
     :param out: Folder for ``episodes.csv``, ``table.md``, ``histograms.png``, ``trajectories.png``, ``training.png``,
         ``config.json`` and the runs with their models.
     :param reading: The cost definition, ``"table"`` or ``"text"``.
-    :return: the table
+    :return: the table, as Markdown
     """
     overrides = common.Options(n_timesteps=n_timesteps).overrides
     pair = [(method, seed) for method in methods(reading)[:2]]
@@ -117,7 +120,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
     """
     Train all methods with many seeds on the lava problem, and write tables, figures and records.
 
-    Every method is trained with both cost definitions. The paper's own settings are trained, too.
+    Every method is trained with both cost definitions, and policies are also trained with the paper's own settings.
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes_*.csv.gz``, figures, ``config.json`` and ``runs/``.
     :param n_seeds: Number of training seeds of each method.
@@ -159,7 +162,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
-    """Return each method's and seed's mean and standard deviation in training, and the ratio of the noisiest row."""
+    """Return mean and standard deviation in training, and the ratio of the noisiest row, for each method and seed."""
     summary = add_ratio(summary_table(records))
     keys = ["model", "train_seed"]
     training = summary[summary["scenario"] == LAVA[0].name].set_index(keys)[["mean", "std"]]
@@ -168,7 +171,7 @@ def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
 
 
 def _goals_table(seeds: pd.DataFrame, goals: Mapping[str, Mapping[str, float]]) -> str:
-    """Summarise the seeds of each method, and compare them with its goals."""
+    """Summarise the seeds of each method, and compare them with the goals of the method."""
     rows = []
     for method, of_method in seeds.groupby("model", sort=False):
         spread = {

@@ -1,5 +1,5 @@
 """
-Compare TDPG under sensor faults with baselines on the funnels, a task with a cue, lava, and an arm.
+Compare TDPG with baselines under faults: on squeezing and peg, lava, squeezing with a cue, and a Panda arm.
 
 The baselines include methods that are trained with sensor noise of several ranges, or with the sensor faults themselves
 (label "told the faults").
@@ -43,7 +43,7 @@ NOISE_RANGES: Mapping[str, Any] = {
 }  # standard deviations
 _PERTURBED = "sb3_tdpg.robustness.PerturbedVecEnv"
 
-# Perturbation, severity, and a scale with which the perturbation's parameter is the number in the fault's name.
+# A perturbation, its severity, and the scale that makes the perturbation as strong as the name of the fault says.
 Fault = tuple[str, int, float]
 FAULTS: Mapping[str, Fault] = {
     "noise 1": ("vector_noise", 5, 1.25),
@@ -62,16 +62,17 @@ FAULTS: Mapping[str, Fault] = {
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """
-    A task with faults that are not declared in TDPG's training.
+    A task and its faults, which TDPG's training does not declare.
 
     :param block: Name of the task's block, which is the same in each algorithm's file in ``hyperparams/``.
-    :param scale: One unit of each component of the observation. With 0 the component never has a fault.
+    :param scale: The size of one unit of the faults for each component of the observation. A component with 0 never has
+        a fault.
     :param faults: Faults of the sensor and of the actuator.
-    :param plant: Keywords of the environment that change the plant, by name.
+    :param plant: Changes of the plant: keywords of the environment by the name of the change.
     :param goals: Upper limits of TDPG's interquartile mean over seeds, by row.
-    :param tested_in: Another environment, with its default keywords, in which the policies are tested.
-    :param n_episodes: Number of episodes of each row, if it differs from the other problems.
-    :param labels: Labels of the methods; default: all methods.
+    :param tested_in: Id of another environment, with its default keywords, in which the policies are tested.
+    :param n_episodes: Number of episodes of each row; default: ``n_eval_episodes`` of the call.
+    :param labels: Labels of the methods to train; default: all methods.
     :param first_seed: First seed of the trainings.
     """
 
@@ -103,7 +104,7 @@ class Problem:
         return rows
 
     def methods(self) -> list[Method]:
-        """List TDPG with the settings of the block, its variants, and the baselines."""
+        """List TDPG with the settings of the block, variants of TDPG, and the baselines."""
 
         def ours(label: str, wrapper: Mapping[str, Any] | str | None = None, **overrides: Any) -> Method:
             wrappers = {} if wrapper is None else dict(vec_env_wrapper=[wrapper])
@@ -139,7 +140,7 @@ class Problem:
 
 
 class _BlindFaulty(BlindVecEnv):
-    """The environment of an open-loop policy with a fault, which can be a fault of the actuator."""
+    """Apply a fault, which may be a fault of the actuator, to the environment of an open-loop policy."""
 
     def __init__(self, venv: VecEnv, **perturbation: Any) -> None:
         super().__init__(PerturbedVecEnv(venv, **perturbation))
@@ -214,7 +215,7 @@ def reproduce_pays(
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``pays.png``, ``config.json``, ``runs/``.
     :param n_seeds: Number of training seeds of each method.
     :param controls: Whether to train PPO and RecurrentPPO, which take most of the time.
-    :param problems: Names in :data:`PROBLEMS`.
+    :param problems: Names of the problems, which are keys of :data:`PROBLEMS`.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """
@@ -250,7 +251,7 @@ def reproduce_pays(
 
 
 def with_summary(records: pd.DataFrame) -> pd.DataFrame:
-    """Append the records of all faults as :data:`MEAN`, and of each policy's worst fault as :data:`WORST`."""
+    """Append copies of records: all faults as :data:`MEAN`, and each policy's worst fault as :data:`WORST`."""
     faults = records[records["scenario"] != TRAINING]
     policy = ["model", "train_seed"]
     worst = faults.groupby([*policy, "scenario"])["cost"].mean().groupby(policy).idxmax()
@@ -259,7 +260,7 @@ def with_summary(records: pd.DataFrame) -> pd.DataFrame:
 
 
 def _methods_table(by_seed: pd.DataFrame, times: pd.Series) -> pd.DataFrame:
-    """Show the cost in training, under all faults and under the worst fault: mean, best seed and worst seed."""
+    """Show the cost in training, over all faults and under the worst fault: the mean, best seed and worst seed."""
     rows = []
     for model, of_model in by_seed.groupby("model", sort=False):
         row = dict(method=model, seeds=str(of_model["train_seed"].nunique()))
@@ -278,7 +279,7 @@ def _faults_table(by_seed: pd.DataFrame) -> pd.DataFrame:
 
 
 def _successes_table(records: pd.DataFrame) -> pd.DataFrame:
-    """Show the success rate in % (means over seeds), and its largest decrease under a fault in percentage points."""
+    """Show the success rate in % in each row (mean over seeds), and its largest decrease in percentage points."""
     shares = 100 * (1 - records.groupby(["model", "train_seed", "scenario"], sort=False)["failure"].mean().unstack())
     falls = shares[TRAINING] - shares.drop(columns=TRAINING).min(axis=1)
     table = shares.groupby("model", sort=False).mean().map("{:.1f}".format)

@@ -1,4 +1,4 @@
-"""Draw the figures that only the reproduction of the paper needs."""
+"""Draw the figures of the reproductions."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def lava_trajectories(
     """
     Draw the position of the robot of the lava problem over time: one column per model, one row per noise level.
 
-    :param models: SB3 models by their label.
+    :param models: SB3 models; the keys are their labels.
     :param env_kwargs: Keywords of the environment other than its noise.
     :param n_episodes: Number of episodes in each panel; all panels have the same initial positions.
     """
@@ -95,11 +95,11 @@ def lava_trajectories(
 
 def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str]) -> Figure:
     """
-    Draw each method's mean cost in the rows of a table: a line for the median over seeds, and a dot for each seed.
+    Draw each method's mean cost in the scenarios of a table, with a line at the median over seeds and a dot per seed.
 
     :param records: Episodes, with a column ``train_seed``.
-    :param noise_rows: Ordered scenarios, which follow the training row in the left panel.
-    :param other_rows: Unordered scenarios for the right panel.
+    :param noise_rows: Scenarios of the left panel in the order of their noise; the training comes before them.
+    :param other_rows: Scenarios of the right panel.
     """
     widths = len(noise_rows) + 1, len(other_rows)
     figure, (panels,) = new_panels(WIDTH, 3.6, 1, 2, sharey=True, width_ratios=widths)
@@ -119,7 +119,8 @@ def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_ro
 
 def diagnosis_bars(records: pd.DataFrame) -> Figure:
     """
-    Draw each method's final distance in the scenarios of a diagnosis: a bar for the median, and a dot for each seed.
+    Draw each method's final distance from the ball in each scenario, with a bar at the median over seeds and a dot per
+    seed.
 
     :param records: Episodes, with the columns ``train_seed`` and ``distance`` (m).
     """
@@ -138,7 +139,7 @@ def diagnosis_bars(records: pd.DataFrame) -> Figure:
 def _seed_means(
     records: pd.DataFrame, column: str, rows: list[str], spacing: float
 ) -> Iterator[tuple[str, str, np.ndarray, pd.DataFrame]]:
-    """Yield the colour and the label of each method, its positions on the axis, and its means ``(seeds, rows)``."""
+    """Yield each method's colour, label, positions on the axis, and means of a column, with shape ``(seeds, rows)``."""
     means = records.groupby(["model", "train_seed", "scenario"], sort=False)[column].mean()
     models = records["model"].unique()
     for i, (color, model) in enumerate(zip(cycle(PALETTE), models, strict=False)):
@@ -147,7 +148,7 @@ def _seed_means(
 
 
 def failures_by_yaw(records: pd.DataFrame) -> Figure:
-    """Draw the failure rate against the mug's yaw (rad) in polar coordinates, which shows the effect of the handle."""
+    """Draw the failure rate over the mug's yaw (rad) in polar coordinates."""
     figure = new_figure(5.2, 5.2)
     axes = figure.add_subplot(projection="polar")
     _draw_failures(figure, axes, records, records["yaw"] % (2 * np.pi), np.linspace(0, 2 * np.pi, 25))
@@ -157,7 +158,7 @@ def failures_by_yaw(records: pd.DataFrame) -> Figure:
 
 
 def failures_by_camera(records: pd.DataFrame, *, n_bins: int = 12) -> Figure:
-    """Draw the failure rate against ``camera``, the height of the camera above its usual position (m)."""
+    """Draw the failure rate over the column ``camera``, the height of the camera above its usual position (m)."""
     figure, ((axes,),) = new_panels(WIDTH * 0.7, 3.2)
     centimetres = 100 * records["camera"]
     edges = np.linspace(centimetres.min(), centimetres.max() + 1e-9, n_bins + 1)
@@ -194,5 +195,5 @@ def _draw_corridor(axes: Axes, horizon: int) -> None:
 
 
 def _noise(variance: float) -> str:
-    """Return a label such as sigma^2 = 10^-3 in Matplotlib's notation for formulas."""
+    """Return the label of a variance that is a power of ten, such as sigma^2 = 10^-3, in Matplotlib's notation."""
     return r"$\sigma^2 = 1$" if variance == 1 else rf"$\sigma^2 = 10^{{{round(np.log10(variance))}}}$"
