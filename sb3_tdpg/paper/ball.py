@@ -84,7 +84,7 @@ EARLIER_ENCODER = dict(
 
 
 def methods(launch: str) -> tuple[Method, ...]:
-    """List TDPG with its defaults, its variants (a label names the change), and baselines; all take the same steps."""
+    """List TDPG with its defaults, its variants (a label names the change) and baselines, all with as many steps."""
     env_kwargs = dict(LAUNCHES[launch])  # a mapping proxy cannot be sent to another process
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:

@@ -68,7 +68,7 @@ class Method:
 
 
 def seed_by_seed(methods: Sequence[Method], first_seed: int, n_seeds: int) -> list[tuple[Method, int]]:
-    """List all methods for the first seed, then for the next, so that an interrupted run has the same seeds of each."""
+    """List the methods seed by seed, so that an interrupted reproduction has the same seeds for all methods."""
     return [(method, first_seed + i) for i in range(n_seeds) for method in methods if i < method.max_seeds]
 
 
