@@ -7,6 +7,7 @@ Dimension key: N robots, Z task-relevant variables (TRVs), U action components, 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import warnings
 from pathlib import Path
@@ -265,6 +266,8 @@ def _write_onnx(step: ExportedStep, path: Path, metadata: str) -> None:
         return op.Reciprocal(op.Add(op.Exp(op.Neg(x)), op.Constant(value_float=1.0)))
 
     names = step.input_names
+    # It would warn that torchvision is missing, which no policy needs.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     program = th.onnx.export(
         step,
         step.example(),
