@@ -1,22 +1,20 @@
 """Extend the experiment manager of rl-zoo3 to the environments and the algorithm of this package."""
 
 import copy
-import inspect
 import json
 import os
 import re
 import shlex
 import shutil
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from functools import partial
 from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import rl_zoo3.train
 import torch as th
@@ -24,11 +22,9 @@ import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import get_callback_list, get_class_by_name, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from sb3_tdpg import hyperparams as yaml_files
 from sb3_tdpg.callbacks import SelectionCallback, TrainingCheckpointCallback
@@ -43,12 +39,6 @@ CHECKPOINT, RECORD = "checkpoint.zip", "run.json"
 CHECKPOINT_EPOCHS = 10
 # Keys whose text the zoo evaluates as Python code.
 EVALUATED = {"monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
-KEYWORDS_OF = {"monitor_kwargs": Monitor, "normalize": VecNormalize}
-# Keys that the zoo itself reads; all others are arguments of the algorithm.
-ZOO_KEYS = (
-    "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps", "noise_std",
-    "noise_type", "normalize", "vec_env_wrapper",
-)  # fmt: skip
 
 
 def find_file(algo: str, block: str) -> str | None:
@@ -59,16 +49,8 @@ def find_file(algo: str, block: str) -> str | None:
     return None
 
 
-def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
-    """Raise an error for unknown keys and wrong values in a block; ``where`` names the block in the message."""
-    cls = ALGOS[algo]
-    arguments = {name for base in cls.__mro__[:-1] for name in inspect.signature(base).parameters}
-    if unknown := sorted(set(block) - set(ZOO_KEYS) - arguments):
-        own = sorted(set(inspect.signature(cls).parameters) - {"env", "_init_setup_model"})
-        raise ValueError(
-            f"{where} has {', '.join(unknown)}, which is neither an argument of {cls.__name__} ({', '.join(own)}) nor "
-            f"a key of rl-zoo3 ({', '.join(ZOO_KEYS)})"
-        )
+def check_numbers(block: Mapping[str, Any], where: str) -> None:
+    """Raise an error for a number that YAML reads as text; ``where`` names the block in the message."""
     for key, value in block.items():
         try:
             number = float(value) if isinstance(value, str) else None
@@ -77,39 +59,6 @@ def check_block(block: Mapping[str, Any], algo: str, where: str) -> None:
         if number is not None:
             correct = yaml.safe_dump(int(number) if number.is_integer() else number).split()[0]
             raise ValueError(f"{where} has {key}: {value}, which YAML reads as text, not as a number: write {correct}")
-    kinds: dict[str, Any] = dict(n_timesteps=(int, float), n_envs=int, frame_stack=(int, type(None)))
-    for key in kinds.keys() & set(block):
-        value = block[key]
-        if not isinstance(value, kinds[key]) or (value is not None and value < 1):
-            kind = "a number" if key == "n_timesteps" else "an integer"
-            raise ValueError(f"{where} has {key}: {value!r}, which must be {kind} of at least 1")
-    if not isinstance(block.get("callback", []), (str, list, dict)):
-        raise ValueError(f"{where} has callback: {block['callback']!r}, which must be a class or a list of classes")
-    for key, value in block.items():
-        try:
-            _read(key, value)
-        except Exception as e:  # the value can be code, which can raise any error
-            reason = " ".join(str(e).split())
-            raise ValueError(f"{where} has {key}: {value!r}, which rl-zoo3 cannot read ({reason}): correct it") from e
-    for key in ("seed", "device", "verbose"):
-        if key in block:
-            raise ValueError(f"{where} has {key}: {block[key]!r}: give --{key} on the command line")
-    if "n_timesteps" not in block:
-        raise ValueError(f"{where} has no n_timesteps, the length of training in environment steps: add it")
-
-
-def _read(key: str, value: Any) -> None:
-    """Read a value as the zoo does, to find errors early: the zoo's messages do not name the key."""
-    if key in EVALUATED and isinstance(value, str):
-        value = eval(value, vars(rl_zoo3.exp_manager))
-    if key in KEYWORDS_OF and isinstance(value, dict):
-        inspect.signature(KEYWORDS_OF[key]).bind_partial(**value)
-    elif key == "callback":
-        get_callback_list({key: value})
-    elif key in ("env_wrapper", "vec_env_wrapper"):
-        get_wrapper_class({key: value}, key)
-    elif key == "policy" and "." in str(value):
-        get_class_by_name(value)
 
 
 class TDPGExperimentManager(ExperimentManager):
@@ -118,7 +67,7 @@ class TDPGExperimentManager(ExperimentManager):
 
     - Every algorithm runs environments of this package as a :class:`~sb3_tdpg.vec_env.BatchedVecEnv`, unless
       ``--vec-env subproc`` or wrappers of single environments are given.
-    - Blocks in this package's files are found without ``--conf-file``, and are checked before any file is written.
+    - Blocks in this package's files are found without ``--conf-file``. A training with bad settings leaves no files.
     - The evaluation environment gets the ``env_kwargs`` of the block unless other keywords are given for it.
     - The evaluation of TDPG uses the stochastic policy that is trained.
     - An interrupted training of TDPG leaves a checkpoint from which it can be resumed. A finished training leaves the
@@ -133,9 +82,7 @@ class TDPGExperimentManager(ExperimentManager):
     def __init__(self, args: Any, algo: str, env_id: str, *rest: Any, **kwargs: Any) -> None:
         kwargs["config"] = kwargs.get("config") or find_file(algo, self.block or env_id)
         super().__init__(args, algo, env_id, *rest, **kwargs)
-        for flag, number in {"--n-eval-envs": self.n_eval_envs, "--eval-episodes": self.n_eval_episodes}.items():
-            if number < 1:
-                raise ValueError(f"{flag} {number} must be at least 1")
+        self.where = f"block {self.block or env_id} of {self.config}"
         self.is_batch = batched_class(env_id) is not None and self.vec_env_class is DummyVecEnv
         self.is_interrupted = self.has_claimed = False
         self.deterministic_eval = self.deterministic_eval and algo != "tdpg"
@@ -147,16 +94,22 @@ class TDPGExperimentManager(ExperimentManager):
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Create the environment and the model; if this fails, remove the folder that was created for them."""
-        was_there = os.path.exists(self.save_path)
         try:
-            return super().setup_experiment()
+            with self.explained_errors():
+                return super().setup_experiment()
         except BaseException:
             if self.has_claimed:
                 shutil.rmtree(self.save_path, ignore_errors=True)
-            elif not was_there:  # another process may have started to use the folder in the meantime
-                with suppress(OSError):
-                    os.rmdir(self.save_path)
             raise
+
+    @contextmanager
+    def explained_errors(self) -> Iterator[None]:
+        """Turn Python's errors for unknown arguments, classes and names into a ``ValueError`` that names the block."""
+        try:
+            yield
+        except (AttributeError, LookupError, NameError, SyntaxError, TypeError) as e:
+            reason = f"({type(e).__name__}: {' '.join(str(e).split())})"
+            raise ValueError(f"{self.where} or a setting on the command line does not fit {reason}: correct it") from e
 
     def create_log_folder(self) -> None:
         """Create the folder of the training; processes that start at the same time get different numbers."""
@@ -185,13 +138,13 @@ class TDPGExperimentManager(ExperimentManager):
             self.env_name = env_name
         saved = copy.deepcopy(saved)  # the zoo adds gamma to normalize
         if self.resume is not None:
-            trained = json.loads(Path(self.resume, RECORD).read_text()).get("hyperparams", saved)
-            if changed := differences(*map(_without_addresses, (trained, saved))):
+            now = jsonable(saved)
+            if changed := differences(json.loads(Path(self.resume, RECORD).read_text()).get("hyperparams", now), now):
                 raise ValueError(f"{self.resume} was trained with other settings than {self.config} has now, {changed}")
             for key in EVALUATED & set(hyperparams):
                 if isinstance(text := hyperparams[key], str):
                     check_plain(text, f"{self.resume} was trained with {key}:")
-        check_block(hyperparams, self.algo, f"block {block} of {self.config}")
+        check_numbers(hyperparams, self.where)
         return hyperparams, saved
 
     def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
@@ -206,22 +159,16 @@ class TDPGExperimentManager(ExperimentManager):
             # Keywords from the command line replace those of the block.
             env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs")
             hyperparams["n_envs"] = self._default_n_envs(env_kwargs, hyperparams)
-        processed, wrap, *others = super()._preprocess_hyperparams(hyperparams)
-        self.env_wrapper = None if wrap is None else lambda env: _TaskHorizon(wrap(env), env)
+        processed = super()._preprocess_hyperparams(hyperparams)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
-        return processed, self.env_wrapper, *others
+        return processed
 
     def _default_n_envs(self, env_kwargs: dict[str, Any] | None, settings: Mapping[str, Any]) -> int:
         length = {name: settings.get(name) for name in ("n_episodes", "epoch_steps")}
-        with closing(self._make_env(env_kwargs, **length, use_processes=False)) as env:
+        env_id = self.env_name.gym_id
+        with closing(make_episodes_env(env_id, env_kwargs=env_kwargs, **length, use_processes=False)) as env:
             return env.num_envs if self.is_batch else largest_divisor(env.num_envs)
-
-    def _make_env(self, env_kwargs: dict[str, Any] | None, **kwargs: Any) -> VecEnv:
-        try:
-            return make_episodes_env(self.env_name.gym_id, env_kwargs=env_kwargs, **kwargs)
-        except TypeError as e:  # an unknown keyword
-            raise ValueError(f"{self.env_name.gym_id} cannot be made with env_kwargs={env_kwargs}: {e}") from e
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """Create the environments, as a batch if this is possible."""
@@ -234,14 +181,10 @@ class TDPGExperimentManager(ExperimentManager):
             logs = {int(path.name.partition(".")[0]): path for path in Path(self.save_path).glob("*.monitor.csv")}
             for number, path in sorted(logs.items(), reverse=True):
                 path.rename(path.with_name(f"{number + n_envs}.monitor.csv"))
-        try:
-            return super().create_envs(n_envs, eval_env, no_log)
-        except TypeError as e:  # an unknown keyword
-            mend = "correct env_kwargs, or the keywords of a wrapper"
-            raise ValueError(f"{self.env_name.gym_id} cannot be made with its keywords ({e}): {mend}") from e
+        return super().create_envs(n_envs, eval_env, no_log)
 
     def _make_batch(self, env_kwargs: dict[str, Any], is_logged: bool, env_fns: list[Any]) -> VecEnv:
-        env = self._make_env(env_kwargs, n_envs=len(env_fns), seed=self.seed)
+        env = make_episodes_env(self.env_name.gym_id, len(env_fns), env_kwargs=env_kwargs, seed=self.seed)
         # A resumed training logs its episodes to another file; the zoo's plots read all files of a folder.
         n_logs = len(list(Path(self.save_path).glob("*.monitor.csv")))
         with warnings.catch_warnings():
@@ -261,7 +204,8 @@ class TDPGExperimentManager(ExperimentManager):
         self.callbacks.append(TrainingCheckpointCallback(Path(self.save_path, CHECKPOINT), CHECKPOINT_EPOCHS))
         for callback in self.callbacks:
             if isinstance(callback, EvalCallback):
-                callback._on_step = _without_drawing(callback._on_step)  # type: ignore[method-assign]
+                # A resumed training evaluates other episodes, but it must draw the same random numbers.
+                callback._on_step = th.random.fork_rng()(callback._on_step)  # type: ignore[method-assign]
 
     def learn(self, model: BaseAlgorithm) -> None:
         """Train the model. An interrupt ends the training; :meth:`save_trained_model` raises it again."""
@@ -322,24 +266,6 @@ def register(manager: type[ExperimentManager] = TDPGExperimentManager) -> None:
     rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
 
 
-def _without_addresses(settings: Mapping[str, Any]) -> Any:
-    return json.loads(re.sub(r" at 0x[0-9a-f]+", "", json.dumps(jsonable(settings))))
-
-
-def _without_drawing(evaluate: Callable[[], bool]) -> Callable[[], bool]:
-    """
-    Return an evaluation that does not change the training's random numbers.
-
-    A resumed training evaluates other episodes, but it must draw the same random numbers.
-    """
-
-    def apart() -> bool:
-        with th.random.fork_rng():
-            return evaluate()
-
-    return apart
-
-
 def _go_on_evaluating(callback: EvalCallback, n_timesteps: int) -> None:
     """Restore the evaluations before a checkpoint, and the best reward, in a resumed callback."""
     path = Path(f"{callback.log_path}.npz")
@@ -354,12 +280,3 @@ def _go_on_evaluating(callback: EvalCallback, n_timesteps: int) -> None:
             callback.evaluations_successes = found["successes"][kept].tolist()
         # The best model may come from an evaluation after the checkpoint.
         callback.best_mean_reward = float(found["results"].mean(axis=1).max())
-
-
-class _TaskHorizon(gym.Wrapper):
-    """Show the horizon of the task, since rl-zoo3's ``HistoryWrapper`` stores its own length under the same name."""
-
-    def __init__(self, env: gym.Env, task: gym.Env) -> None:
-        super().__init__(env)
-        limit = None if task.spec is None else task.spec.max_episode_steps
-        self.horizon = task.get_wrapper_attr("horizon") if task.has_wrapper_attr("horizon") else limit

@@ -3,7 +3,6 @@
 import argparse
 import json
 import os
-import pickle
 import runpy
 import sys
 import warnings
@@ -22,7 +21,7 @@ from sb3_tdpg.zoo.manager import CHECKPOINT, RECORD, TDPGExperimentManager, regi
 # The zoo's default of five episodes is too small to measure the information.
 TUNING_DEFAULTS = ("--eval-episodes", "200", "--n-trials", "50", "--num-threads", "1", "--verbose", "0")
 HELP = {"-h", "--help"}
-LOGS, FILES = ("-tb", "--tensorboard-log"), ("-conf", "--conf-file", "-i", "--trained-agent", "--storage")
+LOGS, FILES = ("-tb", "--tensorboard-log"), ("-conf", "--conf-file", "-i", "--trained-agent")
 BLOCK = dict(help="block of hyperparameters (default: the environment's block)")
 # The additional flags of each program.
 FLAGS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -80,7 +79,7 @@ class _PlainDict(StoreDict):
 def _split(
     program: str, arguments: Sequence[str], keywords: type[StoreDict] = StoreDict
 ) -> tuple[argparse.Namespace, list[str]]:
-    """Return the values of our flags, and the remaining flags, which are for the zoo."""
+    """Return the values of this package's flags, and the remaining flags for the zoo."""
     ours = argparse.ArgumentParser(f"sb3-tdpg {program}", add_help=False, allow_abbrev=False)
     for flag, options in FLAGS.get(program, {}).items():
         ours.add_argument(flag, **options)
@@ -90,14 +89,11 @@ def _split(
     given, flags = ours.parse_known_args(arguments)
     shared = argparse.ArgumentParser(ours.prog, add_help=False, allow_abbrev=False)
     shared.add_argument("--algo", default="tdpg")
-    shared.add_argument("-n", "--n-timesteps", type=int)
     shared.add_argument("-f", "--folder", default="logs")
     for names in (["--env-kwargs"], ["--eval-env-kwargs"], ["-params", "--hyperparams"]):
         shared.add_argument(*names, nargs="+", action=keywords)
     try:
         shared.parse_known_args(flags, given)
-        if given.n_timesteps is not None and given.n_timesteps < 1:
-            raise ValueError(f"-n {given.n_timesteps} must be at least 1: the environment steps of a training")
     except (NameError, SyntaxError) as e:
         raise ValueError(f"{e}: write key:value with a value in Python, text in quotes as in key:\"'text'\"") from e
     return given, flags
@@ -110,8 +106,6 @@ def _say_what_is_loaded(flags: list[str], *paths: str | Path) -> None:
 
 
 def _train(given: argparse.Namespace, flags: list[str]) -> None:
-    if given.algo == "tdpg" and {"-optimize", "--optimize-hyperparameters"} & set(flags):
-        raise ValueError("train does not tune TDPG: use `sb3-tdpg tune` with the same flags, but without -optimize")
     folder, seed = given.resume, []
     rl_zoo3.train.StoreDict = StoreDict if folder is None else _PlainDict  # type: ignore[misc]
     _say_what_is_loaded(flags, *(flag for flag in flags if flag.endswith(".zip")))  # the values of -i
@@ -120,9 +114,10 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
         say_what_is_trusted(folder)
         given, flags = _split("train", record["arguments"], _PlainDict)
         seed = ["--seed", str(record["seed"])]  # a random seed if the first start gave none
+    if given.algo == "tdpg" and {"-optimize", "--optimize-hyperparameters", "--storage"} & set(flags):
+        raise ValueError("tune TDPG with `sb3-tdpg tune`; to train, give the best.yml of a study with --conf-file")
     typed = ["--block", given.block, *flags] if given.block else flags
-    # Paths become absolute, so that --resume works in any folder. A word that is not an existing path is the name of a
-    # package or the address of a database.
+    # Paths become absolute, so that --resume works in any folder. Another word is the name of a package.
     recorded = [
         os.path.abspath(word) if flag in LOGS or (flag in FILES and os.path.exists(word)) else word
         for flag, word in zip(["", *typed], typed, strict=False)
@@ -130,16 +125,6 @@ def _train(given: argparse.Namespace, flags: list[str]) -> None:
 
     class Manager(TDPGExperimentManager):
         block, resume, arguments = given.block, folder, tuple(recorded)
-
-        def __init__(self, *args: Any, **kwargs: Any) -> None:
-            super().__init__(*args, **kwargs)
-            if self.algo == "tdpg" and self.storage and self.study_name:
-                from sb3_tdpg.zoo.tuning import block_of_trial
-
-                # The zoo's own code treats trial number 0 as no number and then loads no trial.
-                trial = block_of_trial(self.storage, self.study_name, self.trial_id)
-                self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
-                self.trial_id = None
 
     register(Manager)
     sys.argv += ["--algo", "tdpg", *flags, *seed]
@@ -150,12 +135,7 @@ def _read_record(folder: Path, has_flags: bool) -> dict[str, Any]:
     """Return the record of how the training in a folder was started; raise an error if it cannot be resumed."""
     if not (folder / RECORD).exists():
         raise ValueError(f"--resume {folder} is not the folder of a training: it has no {RECORD}")
-    try:
-        record: dict[str, Any] = dict(json.loads((folder / RECORD).read_text()))
-        record["arguments"] = [str(argument) for argument in record["arguments"]]
-        record["seed"] = int(record["seed"])
-    except (KeyError, TypeError, ValueError) as e:
-        raise ValueError(f"{folder / RECORD} does not say how its training was started ({e!r}): train anew") from e
+    record: dict[str, Any] = json.loads((folder / RECORD).read_text())
     if has_flags:
         raise ValueError(
             f"{folder} was started with `{' '.join(record['arguments'])}`, and other flags cannot change it: give "
@@ -169,7 +149,11 @@ def _read_record(folder: Path, has_flags: bool) -> dict[str, Any]:
 def _tune(given: argparse.Namespace, flags: list[str]) -> None:
     from sb3_tdpg.zoo.tuning import TuningManager
 
-    class Manager(TuningManager):
+    if given.algo != "tdpg" and (given.objective, given.cost_limit, given.space) != (None, None, None):
+        raise ValueError(f"--objective, --cost-limit and --space are for TDPG, not for {given.algo}")
+    base: Any = TuningManager if given.algo == "tdpg" else TDPGExperimentManager
+
+    class Manager(base):
         block, objective_kind = given.block, given.objective
         cost_limit, space_path = given.cost_limit, given.space
 
@@ -186,8 +170,6 @@ def _watch(program: str, given: argparse.Namespace, flags: list[str]) -> None:
     unsafe, yaml.UnsafeLoader = yaml.UnsafeLoader, PlainLoader  # the zoo's loader would run code in a file
     try:
         runpy.run_module(f"rl_zoo3.{program}", run_name="__main__")
-    except (EOFError, pickle.UnpicklingError) as e:
-        raise ValueError(f"a vecnormalize.pkl in {given.folder} is damaged ({e}): choose another training") from e
     finally:
         yaml.UnsafeLoader = unsafe
 
@@ -202,12 +184,7 @@ def _plot(given: argparse.Namespace, flags: list[str]) -> None:
         warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
     if given.kind == "from-file":
         _say_what_is_loaded(flags, *(flag for flag in flags if Path(flag).is_file()))
-    try:
-        {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
-    except (pickle.UnpicklingError, EOFError, LookupError, TypeError) as e:
-        if given.kind != "from-file":
-            raise
-        raise ValueError(f"`{' '.join(flags)}` names no results that `plot --kind all -o FILE` has written") from e
+    {"train": plot_train, "from-file": plot_from_file, "all": all_plots}[given.kind]()
     if given.save is not None and plt.get_fignums():  # --kind all prints tables only
         if not any(axes.has_data() for axes in plt.gcf().axes):
             mend = "name trainings of at least 100 episodes (--episode-window), or results with evaluations"

@@ -8,8 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import optuna
 import yaml
+from optuna.trial import BaseTrial, FixedTrial
 
 from sb3_tdpg import hyperparams
 from sb3_tdpg.policies import TRVPolicy
@@ -37,26 +37,15 @@ def read_space(path: Path | None = None) -> Space:
     policy = {f"policy_kwargs.{argument}" for argument in inspect.signature(TRVPolicy).parameters}
     allowed = {WEIGHT, *inspect.signature(TDPG).parameters, *policy}
     for name, entry in space.items():
-        where = f"{name} of {file}"
         if name not in allowed:
-            raise ValueError(f"{where} is no argument of TDPG, nor of its policy after 'policy_kwargs.', nor {WEIGHT}")
-        _check_range(where, entry)
+            mend = f"nor of its policy after 'policy_kwargs.', nor {WEIGHT}"
+            raise ValueError(f"{name} of {file} is no argument of TDPG, {mend}")
+        try:
+            sample(FixedTrial({name: entry["choices"][0] if "choices" in entry else entry["low"]}), {name: entry})
+        except (LookupError, TypeError, ValueError) as e:
+            needed = "must have numbers low and high (1.0e-3, not 1e-3), and may have log: true; or choices"
+            raise ValueError(f"{name} of {file} {needed}. It is {entry!r} ({e})") from e
     return space
-
-
-def _check_range(where: str, entry: Any) -> None:
-    keys = set(entry) if isinstance(entry, dict) else set()
-    if keys != {"choices"} and not {"low", "high"} <= keys <= {"low", "high", "log"}:
-        raise ValueError(f"{where} must have low and high, and may have log: true; or choices. It is {entry!r}")
-    choices, low, high = entry.get("choices", [0]), entry.get("low", 1), entry.get("high", 2)
-    if not isinstance(choices, list) or not choices:
-        raise ValueError(f"{where} must have a list of choices, not {choices!r}")
-    if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in (low, high)) or low >= high:
-        raise ValueError(f"{where} must have finite numbers low < high (write 1.0e-3, not 1e-3), not {low!r}, {high!r}")
-    if not isinstance(entry.get("log", False), bool):
-        raise ValueError(f"{where} has log: {entry['log']!r}, which must be true or false")
-    if entry.get("log", False) and low <= 0:
-        raise ValueError(f"{where} has log: true, for which low={low} must be positive")
 
 
 def relevant(space: Space, block: Mapping[str, Any]) -> Space:
@@ -65,7 +54,7 @@ def relevant(space: Space, block: Mapping[str, Any]) -> Space:
     return {name: entry for name, entry in space.items() if not (name == WEIGHT and is_fixed)}
 
 
-def sample(trial: optuna.Trial, space: Space) -> dict[str, Any]:
+def sample(trial: BaseTrial, space: Space) -> dict[str, Any]:
     """Sample a value for each name in the space."""
 
     def suggest(name: str, entry: Mapping[str, Any]) -> Any:

@@ -1,6 +1,5 @@
 """Workers that share a study: real processes on a real PostgreSQL and on a journal file."""
 
-import math
 import re
 import time
 
@@ -41,19 +40,13 @@ def workers(tmp_path, url):
         each.stop()
 
 
-def work_while_one_is_killed(team, *seconds):
-    """Let workers begin at once, and kill another one in its first trial; return it."""
-    (victim,) = team.start(60)
-    team.wait_for("begin", victim)  # the others might leave nothing to it
-    others = team.start(*seconds)
-    team.send("SIGKILL", victim)
-    team.join(others)
-    return victim
-
-
 def test_a_trial_whose_worker_is_killed_is_run_again_with_its_parameters(workers, url):
     team = workers(8)
-    victim = work_while_one_is_killed(team, 0.1, 0.1)
+    (victim,) = team.start(60)
+    team.wait_for("begin", victim)  # the others might leave nothing to it
+    others = team.start(0.1, 0.1)
+    team.send("SIGKILL", victim)
+    team.join(others)
     trials = open_quick(url).get_trials()
     finished = [t for t in trials if t.state in FINISHED]
     assert 8 <= len(finished) <= 8 + 2
@@ -255,22 +248,3 @@ def test_a_lock_that_a_killed_worker_has_left_on_a_journal_is_broken(tmp_path, m
     assert (tmp_path / "folder" / "study.log.lock").exists()
     lock.grace_period = 0.2
     assert study.ask().number == 0
-
-
-def test_a_file_that_is_no_journal_is_left_alone(tmp_path):
-    path = tmp_path / "training.log"
-    path.write_text("epoch 1\n")
-    with pytest.raises(ValueError, match="it is not a journal file"):
-        open_storage(path)
-    assert path.read_text() == "epoch 1\n"
-
-
-def test_bad_arguments_are_named(tmp_path):
-    for grace_period in (0.1, 1.5, math.inf, math.nan, 1e9):
-        with pytest.raises(
-            ValueError, match=rf"grace_period={re.escape(str(grace_period))} must be at least 2 seconds"
-        ):
-            open_storage(tmp_path / "study.log", grace_period)
-    assert not (tmp_path / "study.log").exists()
-    with pytest.raises(ValueError, match="n_trials=0"):
-        work(open_quick(tmp_path / "study.log"), lambda trial: 0.0, 0)

@@ -24,13 +24,10 @@ from sb3_tdpg.evaluation.information import encode_episodes, information_bounds
 pytest.importorskip("rl_zoo3")
 from sb3_tdpg.zoo.search import put_in, read_space, relevant, sample
 from sb3_tdpg.zoo.studies import open_storage
-from sb3_tdpg.zoo.tuning import _Measuring, _rank, best_trial, block_of_trial
+from sb3_tdpg.zoo.tuning import _Measuring, _rank, best_trial
 
 SMALL = ["--env", "Lava-v0", "--block", "Lava-v0-logdet", "-params", "n_episodes:20", "--eval-episodes", "40"]
 TINY = [*SMALL, "-n", "400", "--n-evaluations", "2"]
-
-
-# -- the space --------------------------------------------------------------------------------------------------------
 
 
 def test_sampled_values_lie_in_their_ranges_and_go_where_they_belong():
@@ -49,10 +46,7 @@ def test_sampled_values_lie_in_their_ranges_and_go_where_they_belong():
         assert made["policy_kwargs"]["squash_trv_mean"] is False
         assert made["n_episodes"] == 7
     assert block["policy_kwargs"]["trv_dim"] == 9
-
-
-def test_a_schedule_may_be_one_of_the_choices():
-    assert put_in({}, dict(learning_rate="lin_1e-3"), 1.0)["learning_rate"] == "lin_1e-3"
+    assert put_in({}, dict(learning_rate="lin_1e-3"), 1.0)["learning_rate"] == "lin_1e-3"  # one of the choices
 
 
 def test_the_weight_is_not_sampled_where_there_is_none_to_choose():
@@ -66,22 +60,17 @@ def test_the_weight_is_not_sampled_where_there_is_none_to_choose():
     ("a: [", "cannot be read"),
     ("[]", "must map names of arguments to ranges"),
     ("foo: {low: 1, high: 2}", "foo of .* is no argument of TDPG"),
-    ("policy_kwargs.foo: {low: 1, high: 2}", "policy_kwargs.foo of .* is no argument"),
-    ("gamma: {low: 1}", "gamma of .* must have low and high"),
-    ("gamma: {low: 2, high: 1}", "gamma of .* low < high"),
-    ("gamma: {low: 1, high: 1}", "gamma of .* low < high"),
-    ("gamma: {low: 1e-3, high: 1}", r"gamma of .* \(write 1.0e-3, not 1e-3\), not '1e-3'"),
-    ("gamma: {low: 0, high: 1, log: true}", "low=0 must be positive"),
-    ("gamma: {choices: 3}", "list of choices"),
+    ("gamma: 3", "gamma of .* must have numbers low and high .* It is 3 "),
+    ("gamma: {low: 1}", "gamma of .* must have numbers low and high"),
+    ("gamma: {low: 2, high: 1}", "gamma of .* must have .*low=2, high=1"),
+    ("gamma: {low: 1e-3, high: 1}", r"gamma of .* \(1.0e-3, not 1e-3\).* It is {'low': '1e-3'"),
+    ("gamma: {choices: 3}", "gamma of .* or choices"),
 ], ids=str)  # fmt: skip
 def test_a_bad_space_is_refused_with_the_mend(text, message, tmp_path):
     path = tmp_path / "space.yml"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         read_space(path)
-
-
-# -- what is minimised ------------------------------------------------------------------------------------------------
 
 
 def test_policies_under_the_limit_come_before_all_others_whatever_the_sign_of_the_cost():
@@ -144,9 +133,6 @@ def test_the_best_trial_meets_the_limit():
     assert best_trial(none) is None
 
 
-# -- the command ------------------------------------------------------------------------------------------------------
-
-
 def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here, capsys):
     command = ["tune", *TINY, "--cost-limit", "1e6"]
     assert main([*command, "--n-trials", "3"]) == 0
@@ -165,29 +151,14 @@ def test_tune_leaves_a_block_that_train_takes_and_the_same_command_goes_on(here,
     block = yaml.safe_load((folder / "best.yml").read_text())["Lava-v0-logdet"]
     assert block["policy_kwargs"]["trv_dim"] == int(best["params_policy_kwargs.trv_dim"])
     assert block["n_timesteps"] == 400
-    assert block == block_of_trial(str(folder / "study.log"), folder.name[6:], int(best["number"]))
 
     assert main([*command, "--n-trials", "5", "-n", "500"]) == 2  # TINY's -n comes first
     assert "exists with other settings, block.n_timesteps: 400 there, 500 here" in capsys.readouterr().err
 
-    results = {path.name: path.read_bytes() for path in folder.iterdir()}
-    elsewhere = ["--storage", "another.log", "--cost-limit", "1e5"]  # of the same name
-    assert main([*command, *elsewhere]) == 2
-    assert "study with other settings, cost_limit: 1000000.0 there, 100000.0 here: choose" in capsys.readouterr().err
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == results
-    assert not (here / "another.log").exists()
-
     train = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet", "--eval-freq", "-1"]
-    where = ["--storage", str(folder / "study.log"), "--study-name", folder.name[6:]]
-    first = block_of_trial(str(folder / "study.log"), folder.name[6:], 0)
-    for n, (flags, trained) in enumerate((
-        (["--conf-file", str(folder / "best.yml")], block),
-        (where, block),  # the best one
-        ([*where, "--trial-id", "0"], first),
-    ), start=1):  # fmt: skip
-        assert main([*train, *flags]) == 0
-        model = TDPG.load(here / "logs" / "tdpg" / f"Lava-v0_{n}" / "Lava-v0.zip", device="cpu")
-        assert (model.beta, model.num_timesteps) == (pytest.approx(trained["beta"]), 400)
+    assert main([*train, "--conf-file", str(folder / "best.yml")]) == 0
+    model = TDPG.load(here / "logs" / "tdpg" / "Lava-v0_1" / "Lava-v0.zip", device="cpu")
+    assert (model.beta, model.num_timesteps) == (pytest.approx(block["beta"]), 400)
 
 
 def test_keywords_of_the_environment_belong_to_the_study_and_its_best_block(here, capsys):
@@ -246,7 +217,6 @@ def test_two_workers_share_a_study(here):
       for both in (("random", "none"), ("random", "halving"), ("tpe", "none"), ("tpe", "median"))),
 ])  # fmt: skip
 def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):
-    """As the zoo's own tests try them."""
     arguments = ["--env", "CartPole-v1", "-n", "100", "-params", 'policy_kwargs:"dict(trv_dim=3)"', "n_envs:1"]
     arguments += ["n_episodes:2", "batch_size:100", "--seed", "14", "--log-folder", "elsewhere", "--n-trials", "2"]
     arguments += ["--n-jobs", "1", "--sampler", sampler, "--pruner", pruner, "--n-evaluations", "2"]
@@ -258,31 +228,20 @@ def test_the_zoos_samplers_and_pruners_take_tdpg(sampler, pruner, here):
 
 def test_a_limit_that_no_trial_meets_is_told(here, capsys):
     assert main(["tune", *TINY, "--cost-limit", "1e-6", "--n-trials", "2"]) == 0
-    assert "keeps the expected cost below" in capsys.readouterr().out
+    assert "no complete trial of Lava-v0-logdet-information keeps the cost below 1e-06" in capsys.readouterr().out
     assert not list(here.rglob("best.yml"))
-    (path,) = here.rglob("study.log")
-    where = ["--storage", path, "--study-name", "Lava-v0-logdet-information"]
-    line = error_line(capsys, "train", *TINY[:4], *where)
-    assert line.startswith("error: study 'Lava-v0-logdet-information' has no trial that meets its limit on the cost")
 
 
 @pytest.mark.parametrize("arguments, message", [
-    (["--eval-env-kwargs", "foo:1"], "cannot be made with env_kwargs={'foo': 1}"),
+    (["--eval-env-kwargs", "foo:1"], "does not fit .TypeError: .*'foo'"),
     (["--storage", "postgresql://me:secret@127.0.0.1:1/db"], r"me:\*\*\*@127.0.0.1:1/db cannot be opened"),
     (["-params", "gamma:3"], "gamma=3 must"),
-    (["--eval-episodes", "33"], "--eval-episodes 33 are too few .* of up to 32 TRVs: give at least 34"),
-], ids=["keyword", "storage", "setting", "episodes"])  # fmt: skip
+], ids=["keyword", "storage", "setting"])  # fmt: skip
 def test_what_the_trials_would_fail_at_is_told_in_a_line(arguments, message, here, capsys):
     line = error_line(capsys, "tune", *TINY, *arguments)
     assert re.search(message, line)
     assert "secret" not in line
     assert not list(here.rglob("study.log"))
-
-
-def test_why_no_trial_could_be_trained_is_told(here, capsys):
-    (here / "space.yml").write_text("gamma: {low: 2.0, high: 3.0}")
-    line = error_line(capsys, "tune", *TINY, "--space", "space.yml", "--n-trials", "1")
-    assert "no trial of Lava-v0-logdet-information could be trained (gamma=" in line
 
 
 def test_other_algorithms_are_tuned_as_the_zoo_does_it(here, capsys):

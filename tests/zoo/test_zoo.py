@@ -19,6 +19,7 @@ from stable_baselines3.common.monitor import load_results
 from sb3_tdpg import TDPG, hyperparams
 from sb3_tdpg.cli import main
 from sb3_tdpg.hyperparams import load_hyperparams
+from sb3_tdpg.vec_env import make_episodes_env
 
 pytest.importorskip("rl_zoo3")
 
@@ -173,13 +174,13 @@ def test_plot_and_video_of_a_training(here, capsys):
 
 
 def test_the_evaluation_uses_the_keywords_of_the_block(here, monkeypatch):
-    from sb3_tdpg.zoo.manager import TDPGExperimentManager
-
     made = []
-    make = TDPGExperimentManager._make_env
-    monkeypatch.setattr(
-        TDPGExperimentManager, "_make_env", lambda self, kwargs, **k: (made.append(kwargs), make(self, kwargs, **k))[1]
-    )
+
+    def make(*arguments, env_kwargs, **others):
+        made.append(env_kwargs)
+        return make_episodes_env(*arguments, env_kwargs=env_kwargs, **others)
+
+    monkeypatch.setattr("sb3_tdpg.zoo.manager.make_episodes_env", make)
     arguments = ["train", "--env", "Lava-v0", "--block", "Lava-v0-logdet-table", "-n", "100"]
     assert main([*arguments, "-params", "n_episodes:20"]) == 0
     assert all(kwargs["lava_stage_cost"] == 3.0 for kwargs in made)

@@ -48,20 +48,19 @@ def test_an_environment_and_a_block_from_a_package_of_ones_own(here):
 
 @pytest.mark.parametrize("wrappers", [
     "env_wrapper: rl_zoo3.wrappers.TimeFeatureWrapper",
-    "env_wrapper: [{rl_zoo3.wrappers.HistoryWrapper: {horizon: 3}}, rl_zoo3.wrappers.TimeFeatureWrapper]",
     "env_wrapper: [{rl_zoo3.wrappers.DelayedRewardWrapper: {delay: 10}}, rl_zoo3.wrappers.ActionNoiseWrapper]",
     "vec_env_wrapper: {stable_baselines3.common.vec_env.VecFrameStack: {n_stack: 2}}",
     "vec_env_wrapper: [{stable_baselines3.common.vec_env.VecFrameStack: {n_stack: 3}}, "
     "stable_baselines3.common.vec_env.VecMonitor]",
     "frame_stack: 2, normalize: {norm_obs: true, norm_reward: false}",
-], ids=["one", "history", "noise", "stack", "stack and monitor", "stack and normalize"])  # fmt: skip
+], ids=["one", "noise", "stack", "stack and monitor", "stack and normalize"])  # fmt: skip
 @pytest.mark.parametrize("env", ["Pendulum-v1", "Lava-v0"])
 def test_wrappers_of_the_zoo(env, wrappers, here):
     (here / "mine.yml").write_text(f"{env}: {{{BLOCK}, {wrappers}}}\n")
     assert main(["train", "--env", env, "--conf-file", "mine.yml", "-n", "200", "--verbose", "0"]) == 0
     model = loaded(here, env)
     features, horizon = {"Pendulum-v1": (3, 200), "Lava-v0": (2, 5)}[env]
-    assert model.horizon == horizon  # and not that of the history
+    assert model.horizon == horizon
     assert (model.observation_space.shape == (features,)) == ("delay" in wrappers)
     assert main(["enjoy", "--env", env, "--no-render", "-n", "200"]) == 0
 
