@@ -2,13 +2,14 @@
 
 import argparse
 import contextlib
+import inspect
 import os
 import pkgutil
 import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -54,41 +55,30 @@ def _print_results(out: Path, make: Callable[[], str]) -> None:
     print(f"\n{text}\n\nresults are in {out}")
 
 
-class Experiment(NamedTuple):
-    """An experiment of the command ``reproduce``."""
-
-    function: str  # module and function in the package
-    folder: str  # default folder in results/
-    arguments: dict[str, Any] = {}  # fixed arguments of the function
-    flags: tuple[str, ...] = ()  # flags that only some experiments have
-
-
-EXPERIMENTS = {
-    "lava": Experiment("paper.lava_tables:reproduce_lava", "lava_reproduction", flags=("n_paper_seeds",)),
-    "ball": Experiment("paper.ball:reproduce_ball", "ball_catch", flags=("controls",)),
-    "ball-paper": Experiment("paper.ball_paper:reproduce_ball_paper", "ball_catch_paper"),
-    "ball-varying": Experiment(
-        "paper.ball:reproduce_ball", "ball_catch_varying", dict(launch="varying"), ("controls",)
-    ),
-    "grasp": Experiment("paper.grasp:reproduce_grasp", "panda_grasp"),
-    "grasp-camera": Experiment("paper.grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
-    "pays": Experiment("paper.pays:reproduce_pays", "pays", flags=("controls",)),
-    "pays-cue": Experiment("paper.pays:reproduce_pays", "pays_cue", dict(problems=("cue",)), ("controls",)),
-    "panda-squeeze": Experiment("paper.pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",)), ("controls",)),
+# The experiments of ``reproduce``: function in ``sb3_tdpg.paper``, default folder in results/, fixed arguments.
+EXPERIMENTS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "lava": ("lava_tables:reproduce_lava", "lava_reproduction", {}),
+    "ball": ("ball:reproduce_ball", "ball_catch", {}),
+    "ball-paper": ("ball_paper:reproduce_ball_paper", "ball_catch_paper", {}),
+    "ball-varying": ("ball:reproduce_ball", "ball_catch_varying", dict(launch="varying")),
+    "grasp": ("grasp:reproduce_grasp", "panda_grasp", {}),
+    "grasp-camera": ("grasp:reproduce_grasp", "panda_grasp_camera", dict(camera="varying")),
+    "pays": ("pays:reproduce_pays", "pays", {}),
+    "pays-cue": ("pays:reproduce_pays", "pays_cue", dict(problems=("cue",))),
+    "panda-squeeze": ("pays:reproduce_pays", "panda_squeeze", dict(problems=("panda",))),
 }
+# Flags that only some of these functions take.
+SPECIAL_FLAGS = {"controls": "--no-controls", "n_paper_seeds": "--n-paper-seeds"}
 
 
 def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
-    chosen = EXPERIMENTS[experiment]
+    name, folder, arguments = EXPERIMENTS[experiment]
+    function = pkgutil.resolve_name(f"sb3_tdpg.paper.{name}")
     given = {name: value for name, value in options.items() if value is not None}
-    for name in ("controls", "n_paper_seeds"):
-        if name in given and name not in chosen.flags:
-            flag = "--no-controls" if name == "controls" else f"--{name.replace('_', '-')}"
-            others = " and ".join(other for other in EXPERIMENTS if name in EXPERIMENTS[other].flags)
-            raise ValueError(f"{flag} is for {others}, not for {experiment}")
-
-    out = out or Path("results", chosen.folder)
-    _print_results(out, lambda: pkgutil.resolve_name(f"sb3_tdpg.{chosen.function}")(out, **chosen.arguments, **given))
+    for option in SPECIAL_FLAGS.keys() & given.keys() - inspect.signature(function).parameters.keys():
+        raise ValueError(f"{experiment} has no {SPECIAL_FLAGS[option]}: leave it out")
+    out = out or Path("results", folder)
+    _print_results(out, lambda: function(out, **arguments, **given))
 
 
 def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
@@ -183,9 +173,8 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
     """
     Parse keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
 
-    :param texts: Texts of the form ``key=value``. The value is YAML: a number, a text, true, false, null or a list of
-        these.
-    :raises ValueError: if a text has another form, or a key occurs twice.
+    :param texts: Texts of the form ``key=value``. The value is YAML: a number, a text, true, false, null or a list.
+    :raises ValueError: if a text has another form.
     """
     keywords: dict[str, Any] = {}
     for text in texts:
@@ -194,14 +183,10 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
             raise ValueError(
                 f"{text!r} is not a keyword or setting with a plain name: write key=value, for instance horizon=10"
             )
-        if key in keywords:
-            raise ValueError(f"{text!r}: {key} is given twice")
         try:
-            keywords[key] = _plain(yaml.load(value, _Loader))
-        except (yaml.YAMLError, TypeError) as e:
-            raise ValueError(
-                f"{text!r}: the value must be a number, a text, true, false, null or a list of these"
-            ) from e
+            keywords[key] = yaml.load(value, _Loader)
+        except yaml.YAMLError as e:
+            raise ValueError(f"{text!r}: the value must be YAML, such as a number, a text, true or a list") from e
     return keywords
 
 
@@ -211,15 +196,6 @@ class _Loader(yaml.SafeLoader):
 
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)$")
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789in"))
-
-
-def _plain(value: Any) -> Any:
-    """Return a scalar or a list of scalars; raise a ``TypeError`` for anything else."""
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if not isinstance(value, (str, bool, int, float, type(None))):
-        raise TypeError(f"{value!r} is a {type(value).__name__}")
-    return value
 
 
 # rl-zoo3's programs parse their own flags.
