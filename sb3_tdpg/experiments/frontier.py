@@ -48,7 +48,7 @@ def frontier(
     *,
     shares: Sequence[float] = SHARES,
     n_seeds: int = 3,
-    out: Path | None = None,
+    out: Path,
     jobs: int | None = None,
     n_timesteps: int | None = None,
     n_eval_episodes: int = 500,
@@ -70,7 +70,7 @@ def frontier(
     :param shares: Shares of the improvement in per cent, between 0 and 100.
     :param n_seeds: Number of training seeds of each row, from seed 0 on.
     :param out: Folder for ``frontier.md``, ``frontier.csv``, ``frontier.png``, ``runs.csv``, ``config.json`` and
-        ``runs/``; default: ``results/frontier-<block or environment>``.
+        ``runs/``.
     :param jobs: Number of runs at a time; default: the number of cores.
     :param n_timesteps: Environment steps of each training; default: as in the block, or TDPG's default.
     :param n_eval_episodes: Number of episodes of each evaluation.
@@ -87,7 +87,6 @@ def frontier(
     for name in {"beta", "cost_limit", "seed"} & set(settings or ()):
         raise ValueError(f"{name} is set by the frontier: leave it out of the settings")
     name = env_id.rpartition(":")[2]
-    out = out or Path("results", f"frontier-{block or name}")
     if block is None:
         with contextlib.suppress(KeyError):
             load_hyperparams(name)
@@ -141,41 +140,30 @@ def _build(run: Run) -> Training:
     """Build the model of a run, to find errors in the settings before any training."""
     try:
         training = make_training(run.env_id, run.settings, seed=0, device="cpu")
-    except gym.error.Error as e:
-        raise ValueError(f"env={run.env_id!r} cannot be made: {e}") from e
-    except KeyError as e:
-        raise ValueError(f"{e.args[0]}: choose one with --block") from e
-    except TypeError as e:
-        raise ValueError(f"the settings of block {run.block!r} do not fit: {e}") from e
+    except (gym.error.Error, KeyError, TypeError) as e:
+        raise ValueError(f"env={run.env_id!r} with block {run.block!r} and the settings cannot be made: {e}") from e
     assert training.model.env is not None
     training.model.env.close()
     return training
 
 
 def _measure(task: Task, label: str, n_eval_episodes: int) -> dict[str, Any]:
-    """Measure the cost and the information of a finished run; save and return its row of ``runs.csv``."""
+    """Measure the cost and the information of a finished run; return its row of ``runs.csv``."""
     run, folder, (scenario,) = task
-    path = folder / "row.json"
-    if path.exists():
-        return json.loads(path.read_text())
-    records = pd.read_csv(folder / "episodes.csv")
-    costs = summary_table(records).iloc[0]
+    costs = summary_table(pd.read_csv(folder / "episodes.csv")).iloc[0]
     model = TDPG.load(folder / "model.zip", device="cpu")
     scenario = scenario.with_kwargs(**(run.settings.get("env_kwargs") or {}))
     n_episodes = min(N_INFORMATION, max(n_eval_episodes, model.policy.trv_dim + 2))
     upper, lower = information_bounds(rollout_information(model, scenario, n_episodes))
-    row = dict(
+    return dict(
         label=label,
         seed=run.seed,
         cost=float(costs["mean"]),
         std=float(costs["std"]),
         information=upper,
         information_lower=lower,
-        met_block_limits=bool(records["selected"].iloc[0]),
         folder=folder.name,
     )
-    write_atomically(path, json.dumps(row))
-    return row
 
 
 def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
@@ -262,7 +250,7 @@ def verdict(table: pd.DataFrame) -> str:
 
 def report_command(out: Path, runs: pd.DataFrame, env_id: str, env_kwargs: Mapping[str, Any]) -> str:
     """
-    Return the command that tests the verdict: it compares each limit with no penalty under every fault.
+    Return the command that tests the verdict by comparing each limit with no penalty under every fault.
 
     :param out: Folder of the frontier.
     :param runs: ``label`` and ``folder`` of each run; the runs without a penalty come first.

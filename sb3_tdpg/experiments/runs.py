@@ -43,7 +43,7 @@ class Run:
 
     :param method: The label in tables ("PG", "TDPG").
     :param env_id: The training environment.
-    :param block: Block of ``hyperparams/<algo>.yml``. ``None``: only the overrides are the settings.
+    :param block: Block of ``hyperparams/<algo>.yml``. With ``None``, the overrides are all settings.
     :param seed: Training seed.
     :param overrides: Settings that replace those of the block.
     :param max_attempts: Maximum number of trainings from scratch, each with its own seed, until one meets the limits of
@@ -60,11 +60,6 @@ class Run:
     max_attempts: int = 1
     start: Path | None = None
     algo = "tdpg"  # not a field: the records of a TDPG run do not contain it
-
-    def __post_init__(self) -> None:
-        last = self.seed + SEEDS_BETWEEN_ATTEMPTS * (self.max_attempts - 1)
-        if not (self.seed >= 0 and last < 2**32):
-            raise ValueError(f"seed={self.seed} must be at least 0, and below 2**32 in the last attempt")
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -201,7 +196,7 @@ def complete_run(
     seeds, versions, commit) and ``episodes.csv`` (a row for each evaluation episode, written last). Earlier attempts
     are in ``attempt<i>/``.
 
-    :param run: The run.
+    :param run: The run to complete.
     :param folder: Folder of the run.
     :param scenarios: Scenarios to evaluate the policy on; their environment keywords replace those of the run.
     :param n_eval_episodes: Number of episodes of each scenario.
@@ -274,33 +269,19 @@ def complete_runs(tasks: Sequence[Task], *, n_eval_episodes: int = 1000, jobs: i
     :raises ValueError: if a folder contains a run with other settings; in this case no run has started.
     """
     jobs = jobs or usable_cores()
-    if len({folder for _, folder, _ in tasks}) < len(tasks):
-        raise ValueError(f"two of these runs have the same folder: {sorted(str(folder) for _, folder, _ in tasks)}")
     for run, folder, scenarios in tasks:  # errors are raised before the first run starts
         folder.parent.mkdir(parents=True, exist_ok=True)
         if run.start is None or (run.start / "model.zip").exists():
             check_folder(run, folder, scenarios, n_eval_episodes)
     waiting, unfinished = list(tasks), {folder for _, folder, _ in tasks}
     running: dict[Future[Path], Path] = {}
-    n_epochs = 0  # of finished runs
     with tqdm(total=len(tasks), unit="run") as progress, process_pool(jobs) as pool:
         while unfinished:
             # Submit only as many runs as there are free workers, so that a run that must wait keeps its place.
             for task in [t for t in waiting if t[0].start not in unfinished][: jobs - len(running)]:
                 waiting.remove(task)
                 running[pool.submit(complete_run, *task, n_eval_episodes=n_eval_episodes)] = task[1]
-            if not running:
-                raise ValueError(f"these runs wait for each other: {[task[0].folder_name for task in waiting]}")
-            for future in wait(running, timeout=1.0, return_when=FIRST_COMPLETED).done:
-                folder = running.pop(future)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
                 future.result()
-                unfinished.remove(folder)
-                n_epochs += _count_epochs(folder)
+                unfinished.remove(running.pop(future))
                 progress.update()
-            n_now = n_epochs + sum(_count_epochs(folder) for folder in running.values())
-            progress.set_postfix_str(f"{n_now:,} epochs of training")
-
-
-def _count_epochs(folder: Path) -> int:
-    """Count the rows of a run's training logs."""
-    return sum(max(0, path.read_bytes().count(b"\n") - 1) for path in folder.rglob("progress_*.csv"))

@@ -124,11 +124,10 @@ def test_an_environment_without_a_block_is_trained_with_the_defaults(tmp_path, m
 BAD = {
     "share": (["--shares", "95", "120"], "must be at least one number between 0 and 100"),
     "length": (["--n-timesteps", "1000"], "1000 steps are 10 epochs of 100"),
-    "environment": (["--env", "Lave-v0"], "env='Lave-v0' cannot be made"),
+    "environment": (["--env", "Lave-v0"], "env='Lave-v0' with block"),
     "block": (["--block", "Lava-v1"], "no block 'Lava-v1'"),
     "setting": (["--set", "learning_rat=1"], "no argument 'learning_rat'"),
     "beta": (["--set", "beta=1"], "beta is set by the frontier"),
-    "cost_limit": (["--set", "cost_limit=1"], "cost_limit is set by the frontier"),
     "keyword": (["--env-kwargs", "horizons=3"], "horizons"),
 }
 

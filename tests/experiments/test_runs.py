@@ -3,7 +3,6 @@
 import contextlib
 import io
 import json
-import re
 import shutil
 import signal
 from dataclasses import replace
@@ -144,9 +143,6 @@ def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
 def test_runs_that_would_be_mixed_up_are_refused(tmp_path):
     names = [replace(tiny_run(), method=method).folder_name for method in ("beta 1.25", "beta 1/25")]
     assert names == ["beta-1.25-seed0", "beta-1-25-seed0"]
-    tasks = [(tiny_run(seed), tmp_path / "one", LAVA[:1]) for seed in (0, 1)]
-    with pytest.raises(ValueError, match="the same folder"):
-        complete_runs(tasks)
     with pytest.raises(ValueError, match="does not keep the statistics"):
         complete_run(tiny_run(normalize={}), tmp_path / "two", LAVA[:1])
     assert not list(tmp_path.iterdir())
@@ -256,24 +252,9 @@ def test_a_run_waits_for_the_one_that_it_starts_from(tmp_path):
     assert_same_parameters(policy_of(tmp_path / "first"), policy_of(tmp_path / "second"))
 
 
-def test_the_progress_bar_counts_runs_and_moves_with_their_epochs(tmp_path, capsys):
-    run = Run("PG", "Lava-v0", "Lava-v0-pg", 0, dict(n_timesteps=300_050, n_episodes=20))
-    complete_runs([(run, tmp_path / "run", LAVA[:1])], jobs=1)
-    bars = [
-        (runs, int(epochs.replace(",", "")))
-        for runs, epochs in re.findall(r"(\d)/1 \[[^\]]*, ([\d,]+) epochs", capsys.readouterr().err)
-    ]
-    assert bars[-1] == ("1", 3001)
-    assert any(runs == "0" and 0 < epochs < 3001 for runs, epochs in bars)
-    assert bars == sorted(bars)
-
-
 def test_a_run_without_a_policy_to_start_from_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(ValueError, match="nowhere, and there is none: train it first"):
         complete_run(replace(tiny_run(), start=tmp_path / "nowhere"), tmp_path / "run", LAVA[:1], n_eval_episodes=4)
-    waits_for_itself = replace(tiny_run(), start=tmp_path / "run")
-    with pytest.raises(ValueError, match="wait for each other"):
-        complete_runs([(waits_for_itself, tmp_path / "run", LAVA[:1])], n_eval_episodes=4, jobs=1)
     assert not list(tmp_path.iterdir())
 
 
