@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command(**options)
     except KeyboardInterrupt:
-        out = options.get("out") if command in (_demo, _reproduce, _frontier, _report) else None
+        out = options.get("out") if command in (_demo, _reproduce, _frontier, _report, _rerun) else None
         advice = "" if out is None else f"; the results so far are in {out}, and the same command continues from there"
         print(f"\ninterrupted{advice}", file=sys.stderr)
         return 130
@@ -79,6 +79,12 @@ def _reproduce(out: Path | None, experiment: str, **options: Any) -> None:
         raise ValueError(f"{experiment} has no {SPECIAL_FLAGS[option]}: leave it out")
     out = out or Path("results", folder)
     _print_results(out, lambda: function(out, **arguments, **given))
+
+
+def _rerun(config: Path, out: Path) -> None:
+    from sb3_tdpg.experiments.rerun import rerun
+
+    print(f"results are in {rerun(config, out)}")
 
 
 def _enjoy(model: Path, env: str, env_kwargs: Sequence[str], **options: Any) -> None:
@@ -263,6 +269,10 @@ def _make_parser() -> argparse.ArgumentParser:
     add("--n-paper-seeds", type=_positive, help="training seeds of the paper's own settings (default: 3)")
     text = "ball: train TDPG, PG and RecurrentPPO only; pays: leave out PPO and RecurrentPPO; a later call may add them"
     add("--no-controls", action="store_false", dest="controls", default=None, help=text)
+
+    add = command(_rerun, "repeat the run that a config.json describes")
+    add("config", type=Path, help="the config.json of a run")
+    add("out", type=Path, help="folder for the new run")
 
     for program, text in ZOO_PROGRAMS.items():
         commands.add_parser(program, help=f"rl-zoo3: {text}", add_help=False)

@@ -1,14 +1,7 @@
-"""
-Repeat a recorded run.
+"""Repeat a recorded run: the command ``sb3-tdpg rerun config.json again``."""
 
-``python -m sb3_tdpg.experiments.rerun config.json again`` trains and evaluates the run that ``config.json`` describes,
-in the folder ``again``.
-"""
-
-import argparse
 import json
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,8 +19,8 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
 
     Rows with a function that changes the sensor are left out, because the file contains only the function's name.
 
-    :param config: The file. If the run started from the policy of another run, that policy must be in the same folder
-        as the file: ``<name of that run>/model.zip``.
+    :param config: The ``config.json``. If the run started from the policy of another run, that policy must be in the
+        same folder: ``<name of that run>/model.zip``.
     :param out: Folder of the new run, see :func:`~sb3_tdpg.experiments.runs.complete_run`.
     :param progress_bar: Show progress bars.
     :return: ``out``
@@ -62,28 +55,8 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
 
 
 def scenarios_of(rows: Sequence[Mapping[str, Any]]) -> list[Scenario]:
-    """Return the scenarios of a recorded run's evaluation that have no function that changes the sensor."""
+    """Return the scenarios of a recorded evaluation, without the functions that change the sensor."""
     return [
         Scenario(row["name"], row["env_id"], with_numbers(row["env_kwargs"]), n_episodes=row.get("n_episodes"))
         for row in rows
     ]
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run :func:`rerun` from the command line; return 0 if done, 2 for bad input and 130 if interrupted."""
-    parser = argparse.ArgumentParser(prog="python -m sb3_tdpg.experiments.rerun", description="repeat a recorded run")
-    parser.add_argument("config", help="the config.json of a run")
-    parser.add_argument("out", help="folder for the new run")
-    try:
-        rerun(**vars(parser.parse_args(arguments)))
-    except KeyboardInterrupt:
-        print("\ninterrupted; the same command continues from the last checkpoint", file=sys.stderr)
-        return 130
-    except (ValueError, ImportError, OSError) as e:
-        print(f"error: {e}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

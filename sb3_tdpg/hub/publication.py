@@ -102,7 +102,7 @@ def read_run(folder: Path) -> Publication:
         progress=read_progress(folder),
         notes=notes,
         command=_typed_command(config["provenance"]["command"]),
-        again="python -m sb3_tdpg.experiments.rerun config.json again" if is_repeatable else None,
+        again="sb3-tdpg rerun config.json again" if is_repeatable else None,
         how=config["provenance"],
         evaluated=datetime.fromtimestamp((folder / "episodes.csv").stat().st_mtime, timezone.utc),
         files={name: path for name, path in files.items() if path.exists()},

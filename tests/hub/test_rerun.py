@@ -15,8 +15,8 @@ from published_cards import blocks
 from small_problems import assert_same_parameters, parameters
 
 from sb3_tdpg import TDPG
+from sb3_tdpg.cli import main
 from sb3_tdpg.envs.scenarios import Scenario
-from sb3_tdpg.experiments.rerun import main as rerun_main
 from sb3_tdpg.experiments.rerun import rerun
 from sb3_tdpg.experiments.runs import SB3Run, complete_run
 from sb3_tdpg.robustness import PerturbedVecEnv
@@ -27,9 +27,9 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 def test_the_command_in_the_card_repeats_the_run(card, runs, tmp_path):
     copy = shutil.copytree(card, tmp_path / "copy")  # with the policy to start from in it
     program, *arguments = shlex.split(blocks(copy, "bash")[-1])
-    assert program == "python"
+    assert program == "sb3-tdpg"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    subprocess.run([sys.executable, *arguments], cwd=copy, check=True, env=environment)
+    subprocess.run([sys.executable, "-m", "sb3_tdpg", *arguments], cwd=copy, check=True, env=environment)
     assert (copy / "again" / "episodes.csv").read_bytes() == (runs / "tdpg-seed0" / "episodes.csv").read_bytes()
     first, second = (TDPG.load(f / "model.zip", device="cpu") for f in (runs / "tdpg-seed0", copy / "again"))
     assert_same_parameters(parameters(first.policy), parameters(second.policy))
@@ -68,10 +68,10 @@ def noisy(env):
 
 def test_a_rerun_that_cannot_write_or_is_interrupted_is_told_in_a_line(runs, capsys, monkeypatch):
     config = str(runs / "pg-seed0" / "config.json")
-    assert rerun_main([config, "/proc/nowhere"]) == 2
+    assert main(["rerun", config, "/proc/nowhere"]) == 2
     assert capsys.readouterr().err == "error: [Errno 2] No such file or directory: '/proc/nowhere'\n"
     monkeypatch.setattr("sb3_tdpg.experiments.rerun.complete_run", Mock(side_effect=KeyboardInterrupt))
-    assert rerun_main([config, "again"]) == 130
+    assert main(["rerun", config, "again"]) == 130
 
 
 def test_a_rerun_without_the_policy_that_the_run_started_from_is_refused(card, runs, tmp_path, capsys):
@@ -80,7 +80,7 @@ def test_a_rerun_without_the_policy_that_the_run_started_from_is_refused(card, r
         rerun(tmp_path / "config.json", tmp_path / "again")
     (tmp_path / "pg-seed0").mkdir()
     shutil.copy(runs / "tdpg-seed0" / "model.zip", tmp_path / "pg-seed0")  # another one
-    assert rerun_main([str(tmp_path / "config.json"), str(tmp_path / "again")]) == 2
+    assert main(["rerun", str(tmp_path / "config.json"), str(tmp_path / "again")]) == 2
     assert capsys.readouterr().err.startswith("error: the run started from the policy ")
     with pytest.raises(ValueError, match=r"nothing.json does not describe a run"):
         rerun(tmp_path / "nothing.json", tmp_path / "again")
