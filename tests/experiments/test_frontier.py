@@ -5,6 +5,7 @@ import math
 import re
 import shlex
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import Mock
 
 import gymnasium as gym
@@ -18,13 +19,14 @@ pytest.importorskip("rliable")
 
 from sb3_tdpg import TDPG
 from sb3_tdpg.cli import main
+from sb3_tdpg.experiments import frontier as module
 from sb3_tdpg.experiments.blind import BlindVecEnv
-from sb3_tdpg.experiments.frontier import NO_PENALTY, OPEN_LOOP, _task, frontier, frontier_table, knee, verdict
+from sb3_tdpg.experiments.frontier import NO_PENALTY, OPEN_LOOP, frontier, frontier_table, knee, verdict
 from sb3_tdpg.experiments.training import take_env
-from sb3_tdpg.report import parse_models
 from sb3_tdpg.vec_env import make_episodes_env
 
 COMMAND = ["frontier", "--env", "Lava-v0", "--shares", "90", "--seeds", "2", "--jobs", "1"]
+COMMAND += ["--block", "Lava-v0-logdet-table"]
 TINY = ["--n-timesteps", "1100", "--n-eval-episodes", "20", "--set", "n_episodes=20"]
 LABELS = [NO_PENALTY, "90 %", OPEN_LOOP]
 
@@ -33,8 +35,8 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
     monkeypatch.chdir(tmp_path)
     assert main([*COMMAND, *TINY]) == 0
     text = capsys.readouterr().out
-    assert "results are in results/frontier-Lava-v0" in text
-    out = tmp_path / "results" / "frontier-Lava-v0"
+    assert "results are in results/frontier-Lava-v0-logdet-table" in text
+    out = tmp_path / "results" / "frontier-Lava-v0-logdet-table"
     assert (out / "frontier.md").read_text() in text
     assert (out / "frontier.png").read_bytes().startswith(b"\x89PNG")
     table = pd.read_csv(out / "frontier.csv")
@@ -44,9 +46,10 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
     assert (table["cost_low"] <= table["cost"]).all() and (table["cost"] <= table["cost_high"]).all()
 
     (report,) = re.findall(r"^sb3-tdpg (report .*)$", text, re.MULTILINE)
+    assert "--env-kwargs" in report and "action_cost=1.0" in report  # of the block
     brief = ["--perturbations", "vector_noise", "--severities", "5", "--episodes", "5", "--jobs", "1"]
     assert main([*shlex.split(report), *brief]) == 0
-    measured = (tmp_path / "results" / "frontier-Lava-v0-report" / "report.md").read_text()
+    measured = (tmp_path / "results" / "frontier-Lava-v0-logdet-table-report" / "report.md").read_text()
     assert "| 90 %" in measured and f"| {NO_PENALTY}" in measured
 
     runs = pd.read_csv(out / "runs.csv")
@@ -71,13 +74,10 @@ def test_the_command_writes_everything_that_it_promises_and_a_second_call_trains
     pd.testing.assert_frame_equal(pd.read_csv(out / "frontier.csv"), table)
 
 
-def test_the_command_that_measures_it_has_the_keywords_of_the_block(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main([*COMMAND, *TINY, "--seeds", "1", "--block", "Lava-v0-logdet-table", "--out", "of [1]"]) == 0
-    (report,) = re.findall(r"^sb3-tdpg report .*$", capsys.readouterr().out, re.MULTILINE)
-    assert "--env-kwargs" in report and "action_cost=1.0" in report
-    words = shlex.split(report)
-    assert len(parse_models(words[2 : words.index("--env")])) == 2  # whatever the name of the folder
+def test_the_command_that_measures_it_finds_the_models_whatever_the_name_of_the_folder():
+    runs = pd.DataFrame(dict(label=[NO_PENALTY, OPEN_LOOP], folder=["no-penalty-seed0", "open-loop-seed0"]))
+    command = module.report_command(Path("of [1]"), runs, "Lava-v0", {})
+    assert shlex.split(command)[2:3] == ["no penalty=of [[]1]/runs/no-penalty-seed*/model.zip"]
 
 
 def test_an_interrupted_frontier_goes_on_and_more_shares_add_to_it(tmp_path, monkeypatch):
@@ -183,7 +183,7 @@ def test_without_a_penalty_all_of_the_improvement_is_kept_however_the_seeds_scat
 def test_the_open_loop_sees_an_unchanged_clock(tmp_path):
     noisy = {"sb3_tdpg.robustness.PerturbedVecEnv": dict(perturbation="vector_noise", scale=[1.0, 1.0])}
     shared = dict(policy="TRVPolicy", vec_env_wrapper=[noisy], n_episodes=4)
-    run, *_ = _task("Lava-v0", None, shared, OPEN_LOOP, 0, tmp_path)
+    run, *_ = module._task("Lava-v0", None, shared, OPEN_LOOP, 0, tmp_path)
     settings = dict(run.settings)
     np.testing.assert_array_equal(take_env("Lava-v0", settings).reset(), np.ones((4, 8)))
 
