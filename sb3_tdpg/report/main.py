@@ -197,7 +197,7 @@ class _Writer:
             figures["degradation"] = degradation_curves(numbers)
         if (numbers.groups["kind"] == "own").any():
             figures["own_rows"] = own_rows_figure(numbers)
-        # The examples leave out perturbations of the timing, which one picture cannot show.
+        # The examples leave out changes of the timing of the kind "any", which one picture cannot show.
         shown = [name for name in numbers.perturbations if PERTURBATIONS[name].kind == "image"]
         if is_finished and shown and kind_of(self.space) == "image":
             plan = self.plan

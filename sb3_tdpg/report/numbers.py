@@ -139,7 +139,7 @@ def _groups(rows: pd.DataFrame) -> dict[tuple[str, str], pd.Index]:
 
 
 def _interval_columns(cube: np.ndarray, seed: int, is_share: bool = False, prefix: str = "") -> dict[str, np.ndarray]:
-    """Aggregate costs ``(S, G, E)``; return columns with the mean and with both ends of its interval."""
+    """Aggregate costs ``(S, G, E)`` over models and episodes; return columns with the result and its interval."""
     names = (prefix, f"{prefix}_low", f"{prefix}_high") if prefix else ("iqm", "low", "high")
     one = len(cube) == 1
     columns = _mean_of_one(cube[0], is_share) if one else interquartile_means(cube.mean(axis=2), seed)
