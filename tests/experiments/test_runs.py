@@ -129,7 +129,7 @@ def test_a_run_keeps_the_selected_policy_and_says_whether_an_epoch_met_the_limit
 
 def test_a_run_with_other_rows_or_another_start_is_refused(tmp_path):
     complete_run(tiny_run(), tmp_path / "first", LAVA[:1], n_eval_episodes=4)
-    with pytest.raises(ValueError, match=r"scenarios\[1\]: not there, \{.* here"):
+    with pytest.raises(ValueError, match=r"scenarios\.1\.name: not there, .* here"):
         complete_run(tiny_run(), tmp_path / "first", LAVA[:2], n_eval_episodes=4)
     second = replace(tiny_run(), start=tmp_path / "first")
     complete_run(second, tmp_path / "second", LAVA[:1], n_eval_episodes=4)
