@@ -40,7 +40,7 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
     :param path: The ``.zip`` file that ``model.save`` wrote.
     :param env_id: Id of the environment, for the normalisation.
     :param env_kwargs: Keywords of the environment.
-    :raises ValueError: if the file cannot be read, or its algorithm is unknown.
+    :raises ValueError: if the file cannot be read, its algorithm is unknown, or the environment cannot be made.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -60,7 +60,10 @@ def load_model(path: Path, env_id: str, env_kwargs: Mapping[str, Any]) -> Any:
         reason = " ".join(str(e).split())
         raise ValueError(f"{path} looks like a model of {name} but cannot be loaded: {reason[:200]}") from e
     if found := statistics_beside(path):
-        env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
+        try:
+            env = make_episodes_env(env_id, model.n_envs, env_kwargs=env_kwargs, use_processes=False)
+        except Exception as e:
+            raise ValueError(f"{env_id} cannot be made: {e}") from e
         model.set_env(stacked_for(model, load_statistics(found, env, model)))
     return model
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 import sys
 from functools import partial
 from unittest.mock import Mock
@@ -317,6 +318,12 @@ def test_a_model_plays_with_the_statistics_and_the_stack_of_its_training(is_norm
         action, _ = model.predict(observation, deterministic=True)
         np.testing.assert_allclose(action[0], expected, rtol=1e-5)
         observation, *_ = env.step(action)
+
+
+def test_an_unknown_environment_is_told_in_a_line_also_for_a_model_with_statistics(lava, tmp_path, capsys):
+    model = shutil.copy(lava, tmp_path)
+    (tmp_path / "vecnormalize.pkl").touch()
+    assert "Nope-v0 cannot be made" in error_line(capsys, "enjoy", model, "--env", "Nope-v0")
 
 
 def test_a_model_of_another_environment_is_not_taken_for_a_stack(tmp_path, capsys):
