@@ -56,7 +56,8 @@ def certify_nuisance(
         cost of standing at the wall.
     :param env_kwargs: Keywords of the training environment.
     :param n_episodes: Number of training episodes for the distribution of the cost.
-    :param n_budget_episodes: Number of further training episodes, in which each member perturbs the observations.
+    :param n_budget_episodes: Number of further training episodes, in which each member perturbs the observations; at
+        most ``n_episodes``.
     :param n_test_episodes: Number of episodes in which the cost under each member is measured.
     :param confidence: Confidence of each certificate.
     :return: the summary, as Markdown
@@ -79,6 +80,7 @@ def certify_nuisance(
         # The stage costs at the wall, and the terminal cost there, which has a weight of 100.
         cost_bound = (next(iter(loaded.values())).horizon + 100.0) * float(GOAL[0] - WALL)
     out.mkdir(parents=True, exist_ok=True)
+    n_budget_episodes = min(n_budget_episodes, n_episodes)
     settings: dict[str, Any] = dict(n_episodes=n_episodes, cost_bound=cost_bound, confidence=confidence, seed=seed)
     rows: list[dict[str, Any]] = []
     with threads(1):

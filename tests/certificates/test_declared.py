@@ -26,7 +26,9 @@ def test_certified_bounds_hold_for_random_members(tmp_path):
     assert (records["measured_kl"] <= records["kl"] + 1e-6).mean() > 0.9
     summary = (tmp_path / "out" / "summary.md").read_text()
     assert "random members" in summary and "The trivial bound is 315" in summary and "Made by" in summary
-    assert json.loads((tmp_path / "out" / "config.json").read_text())["cost_bound"] == 315  # standing at the wall
+    config = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert config["cost_bound"] == 315  # standing at the wall
+    assert config["n_budget_episodes"] == 2000
 
 
 NUISANCE = ["--nuisance", "vector_bias"]
