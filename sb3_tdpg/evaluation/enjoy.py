@@ -105,6 +105,9 @@ class _Recorder(gym.Wrapper):
 
     def _picture(self) -> Any:
         try:
-            return self.env.render()
+            picture: Any = self.env.render()
         except gym.error.DependencyNotInstalled as e:
             raise ValueError(f"{self.env} cannot be drawn: {e}") from e
+        if not (isinstance(picture, np.ndarray) and picture.dtype == np.uint8):
+            raise ValueError(f"render() of {self.env} must return an array (height, width, 3) of uint8")
+        return picture

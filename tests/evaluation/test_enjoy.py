@@ -180,11 +180,14 @@ def test_a_small_picture_is_enlarged_and_an_episode_may_end_early(own, tmp_path)
     assert frames[0].shape == (8 * 30 + 180, 8 * 50, 3)
 
 
-def test_an_environment_that_cannot_draw_is_not_recorded(own, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(PictureEnv, "render", Mock(side_effect=gym.error.DependencyNotInstalled("no pygame")))
-    out = tmp_path / "film.gif"
-    assert "cannot be drawn: no pygame" in error_line(capsys, "enjoy", own, "--env", "Own-v0", "--record", out)
-    assert not out.exists()
+@pytest.mark.parametrize(("render", "message"), [
+    (dict(return_value=None), "must return an array (height, width, 3) of uint8"),
+    (dict(side_effect=gym.error.DependencyNotInstalled("no pygame")), "cannot be drawn: no pygame"),
+], ids=["nothing", "no package"])  # fmt: skip
+def test_an_environment_that_cannot_draw_is_not_recorded(render, message, own, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(PictureEnv, "render", Mock(**render))
+    assert message in error_line(capsys, "enjoy", own, "--env", "Own-v0", "--record", tmp_path / "film.gif")
+    assert not (tmp_path / "film.gif").exists()
 
 
 def test_only_few_trvs_have_a_legend(tmp_path):
