@@ -12,8 +12,8 @@ ENTRY_POINTS = {
     "PegCorner-v0": "sb3_tdpg.envs.peg_corner:PegCornerEnv",
 }
 
-# A problem counts as solved if the return is at least this threshold, which sets the default cost limit of `tune`. At
-# the threshold the robot ends within 5 cm of the ball, and the arm lifts 97 of 100 mugs.
+# A problem counts as solved if the mean return is at least this threshold, which sets the default cost limit of `tune`.
+# At the threshold the robot ends within 5 cm of the ball on average, and the arm lifts 97 of 100 mugs.
 REWARD_THRESHOLDS = {"BallCatch-v0": -5.0, "PandaGrasp-v0": -0.03}
 
 for _env_id, _entry_point in ENTRY_POINTS.items():

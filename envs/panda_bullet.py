@@ -19,7 +19,7 @@ HAND_ABOVE_GRASP = 0.1  # m: the height of a grasp is the height of a point betw
 # yaw.
 HAND_TURN = np.pi / 4 - np.pi
 LIFTED = 0.05  # m: a mug above this height counts as lifted
-LIFTED_FOR_GOOD = 0.06  # m
+LIFTED_FOR_GOOD = 0.06  # m: the fast motion ends once the mug is above this height
 ACCURACY = 1e-6  # of inverse kinematics
 
 

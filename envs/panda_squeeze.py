@@ -22,9 +22,9 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
     r"""
     Squeeze a part with the arm until its orientation is known, then press it into a slot that is only slightly wider.
 
-    State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv`. So a
-    policy for one environment can act in the other. Here PyBullet simulates the squeezes. In each step, the open jaws
-    move down over the part at the yaw ``u`` (modulo pi), close, open and move up.
+    State, observation, action and cost are those of :class:`~sb3_tdpg.envs.squeeze_insert.SqueezeInsertEnv` without a
+    cue. So a policy for one environment can act in the other. Here PyBullet simulates the squeezes. In each step, the
+    open jaws move down over the part at the yaw ``u`` (modulo pi), close, open and move up.
 
     Before each squeeze, the hand is centred on the part with a random error of up to ``centring_error``. Only the
     position of the part relative to the hand matters. So every squeeze is simulated at the same place on the table, and
@@ -45,8 +45,9 @@ class PandaSqueezeEnv(SharedEnv, SqueezeInsertEnv):
     :param friction: Friction coefficient between part and jaws, and between part and slot.
     :param centring_error: Largest offset of the part from the middle of the hand along x and along y, in m. The offset
         is drawn uniformly.
-    :param tolerance: Largest angle between part and slot that the slot tolerates, in rad. It determines the width of
-        the chamfer. (With a ``tolerance`` below 0.01 rad, the slot tolerates larger angles, because of its clearance.)
+    :param tolerance: Largest angle between part and slot, in rad, at which the insertion costs nothing. The chamfer of
+        the slot is just wide enough for this angle. (With a ``tolerance`` below 0.01 rad, the slot tolerates larger
+        angles, because of its clearance.)
     :param sensor_noise_std: Standard deviation of the noise on each of the two observed components, sine and cosine of
         twice the yaw.
     :param horizon: Number of squeezes T.

@@ -1,4 +1,4 @@
-"""Push a peg into the corner of a fence, then move it over a hole: a mechanical funnel in two dimensions."""
+"""Push a peg into the corner of a fence, then move it over a hole, which is possible without a sensor."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Define the training and test variants of the paper as data: each row of a table is a :class:`Scenario`."""
+"""Define the paper's training and test variants, and some of our own: each row of a table is a :class:`Scenario`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ class PaperResult:
     The paper's numbers in one row of a table.
 
     :param mean: Mean cost over episodes.
-    :param std: Standard deviation of the cost over episodes; ``None`` if the paper does not report it (Table II).
+    :param std: Standard deviation of the cost over episodes; ``None`` if the paper does not report it (Tables II
+        and III).
     :param distance: Mean distance between robot and ball at the end, in m (only in Table II).
     """
 

@@ -1,4 +1,4 @@
-"""Squeeze a part with a parallel gripper until its orientation is known, then insert it: a mechanical funnel."""
+"""Squeeze a part with a parallel gripper until its orientation is known, then insert it."""
 
 import math
 from collections.abc import Sequence

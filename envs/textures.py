@@ -119,7 +119,7 @@ _BUILT_IN: dict[str, tuple[Pattern, int, Colour, Colour]] = {
 
 TRAINING_TEXTURE = "brick"
 TEST_TEXTURES = tuple(name for name in _BUILT_IN if name != TRAINING_TEXTURE)
-"""The seven test backgrounds, in the order of Table II; the seventh has the hue of the training texture."""
+"""The seven test backgrounds, in the order of Table II; the seventh has nearly the hue of the training texture."""
 
 
 def floor_texture() -> np.ndarray:
