@@ -1,1 +1,1 @@
-"""Shared helpers: networks with weights per time step, running norms, files, provenance, threads and processes."""
+"""Shared helpers, such as networks with weights per time step, running norms, files, threads and processes."""

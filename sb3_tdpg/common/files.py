@@ -29,7 +29,8 @@ def replaced_atomically(path: Path) -> Iterator[Path]:
     Yield a temporary path; the file written there replaces the target when the block ends without an error.
 
     Missing folders are created. Several processes may replace the same target at once. After a power cut the target has
-    the old or the new content, never a part of it. Temporary files of a killed process are removed an hour later.
+    the old or the new content, never a part of it. Temporary files of a killed process are removed by the first
+    write to the same target that begins an hour later or more.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
@@ -60,6 +61,8 @@ def _flush(path: Path) -> None:
 def kept_by_this_process(folder: Path) -> Iterator[None]:
     """
     Create a folder for results, and keep other processes out of it until the block or this process ends.
+
+    Only processes that call this function are kept out, and none on Windows.
 
     A new folder that is still empty at the end is removed, together with the new folders above it.
 

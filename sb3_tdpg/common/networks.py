@@ -15,7 +15,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-# Above this horizon the steps share their weights: one set per step would be slow and would get too few samples.
+# Above this horizon the steps share their weights by default: one set per step would be slow and get too few samples.
 MAX_TIME_VARYING_HORIZON = 50
 VECTOR = 64  # a multiple of the vector length of any processor, in floats
 
@@ -100,7 +100,7 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
 
 def bounded_variance(log_var: th.Tensor, maximum: float, floor: float) -> th.Tensor:
     """Return ``exp(log_var) + floor``, bounded above so that unfamiliar observations cannot drive it to infinity."""
-    # A clamp would have a zero gradient at the maximum.
+    # A clamp would have a zero gradient above the maximum.
     return maximum * th.sigmoid(log_var - math.log(maximum)) + floor
 
 

@@ -27,7 +27,7 @@ def process_pool(
     before its first task. Workers themselves ignore Ctrl-C. An exception in the ``with`` block, such as the
     ``KeyboardInterrupt`` of Ctrl-C, stops all workers at once. Workers also end when this process is killed.
     """
-    # All workers are forked from one process that has imported the package once and computed nothing.
+    # A fork server forks all workers from one process that has imported the package once and computed nothing.
     context: Any = mp.get_context("spawn")
     if "forkserver" in mp.get_all_start_methods():
         from multiprocessing import forkserver, resource_tracker

@@ -124,7 +124,7 @@ def write_frame_atomically(frame: pd.DataFrame, path: Path) -> None:
     """
     Write a ``DataFrame`` as CSV without its index, atomically; the same data give the same bytes.
 
-    The path ends in ``.csv``, or for a compressed file in ``.csv.gz`` or ``.csv.xz`` (the smaller of the two). Missing
+    The path ends in ``.csv``, or for a compressed file in ``.csv.gz`` or ``.csv.xz`` (which is smaller). Missing
     folders are created.
     """
     if not path.name.endswith((".csv", ".csv.gz", ".csv.xz")):
@@ -171,7 +171,8 @@ def jsonable(value: Any) -> Any:
     """
     Convert a value to JSON types; NaN, infinite numbers and unknown types become strings, such as ``"inf"``.
 
-    A function gives the same string in every process, except for a closure, whose name does not identify its content.
+    A function gives the same string in every process, except for a lambda or a function that is defined inside another,
+    whose names do not identify them.
     """
     if isinstance(value, partial):
         return jsonable(dict(function=value.func, arguments=value.args, **value.keywords))

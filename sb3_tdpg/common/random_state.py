@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 @dataclass(frozen=True)
 class RandomState:
-    """A snapshot of all generators (Python, NumPy, torch, environments) and of the statistics of ``VecNormalize``."""
+    """A snapshot of all generators (Python, NumPy, torch, environments) and of ``VecNormalize.obs_rms``."""
 
     python: tuple[Any, ...]
     numpy: dict[str, Any]

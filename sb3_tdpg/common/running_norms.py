@@ -68,7 +68,7 @@ class Changes(nn.Module):
     @th.no_grad()
     def update(self, x: th.Tensor, alive: th.Tensor) -> None:
         """
-        Update the statistics with an epoch's steps; ``share`` becomes the mean over all epochs so far.
+        Update the statistics with an epoch's steps; ``share`` is the mean over the epochs so far with enough steps.
 
         :param x: the components at each step, ``(T, N, F)``
         :param alive: 1 while an episode runs, then 0, ``(T, N)``

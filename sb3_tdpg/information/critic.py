@@ -49,8 +49,8 @@ class CriticEstimator(InformationEstimator):
     :param batch_size: Minibatch size B. It is reduced to at most half of the episodes, because the joint and the
         marginal samples of an optimiser step come from different episodes. If some episodes end before others, it is
         reduced to at most a quarter.
-    :param gradient_steps: Number of optimiser steps ("MINE epochs") in each policy epoch.
-    :param warmup_gradient_steps: Number of optimiser steps in the first policy epoch.
+    :param gradient_steps: Number of optimiser steps ("MINE epochs") in each policy epoch after the first.
+    :param warmup_gradient_steps: Number of optimiser steps in the first policy epoch, if it exceeds ``gradient_steps``.
     :param refit_below: Lower limit in nats: a critic has diverged if its estimate on the batch is below this limit or
         not finite. A diverged critic is fitted from new weights for ``refit_gradient_steps`` steps. Without this guard
         a policy can exploit a frozen critic, whose bound has no lower limit.

@@ -16,8 +16,8 @@ class DirectedLogDet(LogDet):
     The bound of :class:`~sb3_tdpg.information.logdet.LogDet`, applied to the residuals of a linear regression of the
     TRVs on the previous TRVs.
 
-    The penalty becomes the directed information from the sensor to the TRVs, which is the information that the sensor
-    adds at each step. The influence of the actions on later observations does not count. Given x~_{t-1}, the TRVs
+    It bounds the directed information from the sensor to the TRVs, which is the information that the sensor adds at
+    each step. The influence of the actions on later observations does not count. Given x~_{t-1}, the TRVs
     depend on the past only through y_t, hence
 
     .. math::
@@ -52,8 +52,8 @@ class DirectedLeaveOneOut(LeaveOneOut):
         \frac{q_i(r_i)}{\frac{1}{N-1} \sum_{j \ne i} q_j(r_i)}\right].
 
     The first inequality follows from h(x~_t | x~_{t-1}) = h(r | x~_{t-1}) <= h(r), for any A_t. The second inequality
-    holds for any shape of the density, so a bit costs at most ln 2. With the log-det bound, the cost of a bit grows
-    with the distance between its two values, and the policy makes these values harder to distinguish.
+    holds for any shape of the density, so a bit costs about ln 2 at most. With the log-det bound, the cost of a bit
+    grows with the distance between its two values, and the policy makes these values harder to distinguish.
     """
 
     bound = "neither"  # type: ignore[assignment]  # not the inherited "upper": it bounds another quantity
