@@ -17,7 +17,7 @@ from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON
 from sb3_tdpg.common.running_norms import Changes, RunningNorm
 from sb3_tdpg.losses import cost_to_go
 
-N_CENTRES = 20
+N_CENTRES = 20  # of the radial basis functions of a regression
 # Number of centres if all time steps share one regression, whose samples are more numerous and lie further apart.
 N_SHARED_CENTRES = 100
 N_PASSES, BATCH_SIZE = 10, 64  # of the value network: passes over an epoch's steps, and minibatch size in steps
@@ -48,12 +48,12 @@ def regression_advantages(
     regression on the state and the remaining horizon. The reason is that a few long episodes have many samples in total
     but few at each step.
 
-    With ``gae_lambda=1`` an advantage is the cost-to-go minus the regression's prediction V_t(x_t). The gradient stays
-    unbiased, because only the baseline uses the true state, and x_t does not depend on the noise of step t. Each half
-    of the episodes gets its baseline from a regression on the other half, so the cost of an episode does not enter its
-    own baseline. A smaller ``gae_lambda`` replaces later costs by V_t(x_t). This prediction has less noise than the
-    costs but ignores the policy's memory. The TRVs (task-relevant variables) then get too little credit for the
-    information that they carry from step to step.
+    With ``gae_lambda=1`` an advantage is the cost-to-go minus the regression's prediction V_t(x_t), the baseline. The
+    gradient stays unbiased, because x_t does not depend on the noise of step t. Each half of the episodes gets its
+    baseline from a regression on the other half, so the cost of an episode does not enter its own baseline. A smaller
+    ``gae_lambda`` replaces a part of the later costs by predictions at later states. These predictions have less noise
+    than the costs but ignore the policy's memory. The TRVs (task-relevant variables) then get too little credit for
+    the information that they carry from step to step.
 
     :param costs: cost of each step, ``(T, N)``
     :param states: true state x_t, ``(T, N, X)``
@@ -88,7 +88,7 @@ class ValueFunction(nn.Module):
     A network that predicts the cost-to-go V_t(x_t) from the true state and the remaining time.
 
     The network is fitted to each epoch's rollouts. Unlike the regressions, it keeps what it has learnt in earlier
-    epochs, so a few long episodes per epoch suffice. Only the baseline uses the network. The robot therefore need not
+    epochs, so a few long episodes per epoch suffice. Only the training uses the network. The robot therefore need not
     know the true state (asymmetric critic, Pinto et al., 2018).
 
     :param state_dim: Number of components X of the state.
@@ -193,7 +193,7 @@ class ValueFunction(nn.Module):
 
 def _shared_values(states: th.Tensor, targets: th.Tensor, alive: th.Tensor, fold: th.Tensor, gamma: float) -> th.Tensor:
     """Predict the targets with one regression on the state and the remaining horizon: ``(T, N)``."""
-    # With a discount, to_go differs only between the last steps.
+    # With a discount, to_go differs noticeably only among the last steps.
     to_go = cost_to_go(th.ones_like(targets), gamma) / len(targets)
     living = alive.flatten().nonzero()[:, 0]
     # The order of the samples must not be periodic, because the centres are taken at regular intervals.

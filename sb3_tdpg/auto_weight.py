@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import warnings
 
-LEAST_SLACK = 0.01  # smallest slack, as a share of the limit or of the improvement, since costs scatter
+# Smallest slack, since costs scatter: a share of the limit or of the improvement so far, whichever is smaller.
+LEAST_SLACK = 0.01
 NO_SCALE = 1e-9  # a scale up to this counts as 0, and the weight does not start
-RATE = 0.3  # increase of log w per epoch if the cost is one scale below the limit, before clipping
+RATE = 0.3  # increase of log w per epoch if the cost is one `scale` below `aim` (see update), before clipping
 MAX_GROWTH = 1000.0  # largest ratio of w to its start; without it, w grows forever if no information is needed
 # The following constants are for a limit that is a share of the improvement.
 WINDOW = 5  # number of epochs over which a cost is averaged
 LEVEL_EPOCHS = 10  # a cost has levelled off if it falls by less than the slack in this many epochs
-LATEST_START = 0.5  # share of the training after which the weight starts in any case
+LATEST_START = 0.5  # share of the training after which the weight starts in any case, once WINDOW epochs have been run
 
 
 def share_of(cost_limit: object) -> float | None:
@@ -30,9 +31,10 @@ class AutoWeight:
     """
     Adapt the weight w of the information by dual ascent, to minimise the information subject to E[cost] <= C.
 
-    The weight is 0 until the cost first meets the limit. It starts at the value for which the penalty equals the scale
-    in the formula below (information below 1 nat counts as 1 nat). From then on it grows while the cost is below the
-    limit and shrinks while the cost is above the limit, as SAC adapts its entropy weight with ``ent_coef="auto"``:
+    The weight is 0 until the cost first meets the limit (for a share of the improvement, see below). It starts at the
+    value for which the penalty equals the scale in the formula below (information below 1 nat counts as 1 nat). From
+    then on it grows while the cost is below the limit and shrinks while the cost is above the limit, as SAC adapts its
+    entropy weight with ``ent_coef="auto"``:
 
         log w += 0.3 * clip((C - cost) / scale, -2, 1)
 
@@ -45,9 +47,9 @@ class AutoWeight:
     If the limit is **a share s of the improvement**, no cost has to be known in advance: C = first - s * (first -
     best). Here ``first`` is the cost of the first epoch, and ``best`` is the lowest mean cost of five successive epochs
     so far. The weight starts when the mean cost of five epochs has fallen by less than C - best in ten epochs, and at
-    the latest in the middle of the training. An earlier start would change the attainable cost. In the second half of
-    the training the weight grows more and more slowly, so that the last policy has settled. Costs may have either sign.
-    A share implies ``by_slack``.
+    the latest in the middle of the training (but not before the fifth epoch). An earlier start would change the
+    attainable cost. In the second half of the training the weight grows more and more slowly, so that the last policy
+    has settled. Costs may have either sign. A share implies ``by_slack``.
 
     :param cost_limit: Limit C on the expected cost, or a share of the improvement such as ``"95%"``.
     :param by_slack: Whether the scale is the slack, as described above.

@@ -47,7 +47,7 @@ class EpisodeBatch(NamedTuple):
     costs: th.Tensor  #: ``(T, N)``, zero after the end of the episode
     alive: th.Tensor  #: ``(T, N)``, 1.0 while the episode lasts
     advantages: th.Tensor  #: ``(T, N)``, zero until they are computed
-    prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at t = 0
+    prev_trvs: th.Tensor  #: ``(T, N, Z)``, x~_{t-1}, zero at the first step of an episode
     episode: th.Tensor  #: ``(T, N)``, index of the episode, also for segments
 
     def select(self, columns: th.Tensor | slice) -> EpisodeBatch:

@@ -145,7 +145,8 @@ class SelectionCallback(TDPGCallback):
                 "changing: give norm_obs=False and policy_kwargs=dict(normalize_observations=True)"
             )
         resumes = self.model.num_timesteps > 0
-        # The record is written after the model. If it is missing, that epoch runs again.
+        # The record is written after the model. A model without a record does not count: a resumed training runs its
+        # epoch again.
         saved = self.save_path is not None and self.save_path.exists() and _record_path(self.save_path).exists()
         if resumes and self.best is None and saved:
             assert self.save_path is not None
@@ -239,7 +240,8 @@ class TDPGProgressBar(ProgressBarCallback):
     """
     SB3's progress bar with the epoch's cost and information, and the failure rate if episodes report success.
 
-    If the output is not a terminal, a bar would appear only at the end, so a line is printed every 30 seconds instead.
+    If the output is neither a terminal nor a notebook, a bar would appear only at the end. So a line is printed
+    instead, after an epoch and at most every 30 seconds.
     """
 
     SECONDS = 30.0

@@ -23,7 +23,7 @@ from sb3_tdpg.information import get_estimator_class
 
 ENCODER_GRADIENTS = ("score", "pathwise")
 SUPPORTED_ACTION_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-LARGEST = 1e18  # the square of a larger number is not finite in float32
+LARGEST = 1e18  # well below 1.8e19: the square of a number above that is infinite in float32
 MIN_BATCH_STEPS = 32  # the information is estimated from the steps of a minibatch
 
 # Arguments of PPO and RecurrentPPO, and their equivalents in TDPG.

@@ -44,7 +44,11 @@ HARDLY_ANY = 0.1  # nats per episode, a seventh of a bit
 
 
 class TrainingDivergedError(ValueError):
-    """Raised if a loss is NaN or infinite. The model keeps the parameters of the last successful update."""
+    """
+    Raised if a cost, the information, a loss or a gradient is NaN or infinite.
+
+    The model keeps the parameters of the last successful update.
+    """
 
 
 class EpisodicAlgorithm(OnPolicyAlgorithm):
@@ -78,7 +82,10 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
     epoch: int = 0
     """Number of completed policy epochs."""
     information: np.ndarray | None = None
-    """Estimate of I[x_t; x~_t] for the last rollouts in nats, ``(T,)``; None without a penalty."""
+    """
+    Estimate of I[x_t; x~_t] for the last rollouts in nats, ``(T,)``; its sum over time, ``(1,)``, if one estimate pools
+    all steps; None without a penalty.
+    """
     normalizes: bool = False
     """Whether the training environment normalised observations (``VecNormalize``)."""
     _random_state: RandomState | None = None
@@ -130,7 +137,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
 
     @property
     def epoch_size(self) -> int:
-        """Number of environment steps of an epoch whose episodes all last to the horizon."""
+        """Number of steps of an epoch: ``epoch_steps``, or those of ``n_episodes`` episodes that reach the horizon."""
         if self.n_episodes is not None:
             return self.horizon * self.n_episodes
         assert self.epoch_steps is not None
@@ -159,7 +166,12 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return self._last_obs
 
     def _steps_of_this_epoch(self) -> int:
-        """Return the steps of this epoch: all that remain, but at most an epoch and at least about a tenth of one."""
+        """
+        Return the number of steps of this epoch: ``epoch_size`` for the first epoch of a training.
+
+        A later epoch has all remaining steps, but at most ``epoch_size``. It has at least about a tenth of that, and
+        enough steps for two episodes if each time step has its own weights.
+        """
         size = self.epoch_size
         if self.epoch == 0:
             return size
@@ -203,12 +215,13 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         After Ctrl-C the model has the parameters of the last finished update, and can be used, saved or trained
         further.
 
-        :param total_timesteps: Number of environment steps. Default: 400 policy epochs for vectors over a short horizon
-            (a million steps on Lava), 75 for images, and 100 for depth images and for vectors over a horizon of 50 or
-            more. Epochs consist of whole episodes, so the training can take more steps. With ``n_episodes``, it takes
+        :param total_timesteps: Number of environment steps. Default: 400 policy epochs for vectors over a horizon below
+            50 (a million steps on Lava), 75 for images, and 100 for depth images and for vectors over a longer horizon.
+            Epochs consist of whole episodes, so the training can take more steps. With ``n_episodes``, it takes
             up to one epoch more. With ``epoch_steps``, it takes up to one episode of each environment or a tenth of an
             epoch more.
-        :raises TrainingDivergedError: if a loss or a gradient is NaN or infinite; the model keeps its parameters.
+        :raises TrainingDivergedError: if a cost, the information, a loss or a gradient is NaN or infinite; the model
+            keeps the parameters of the last successful update.
         """
         if total_timesteps is None:
             total_timesteps = self._defaults.total_epochs * self.epoch_size
@@ -378,7 +391,7 @@ class EpisodicAlgorithm(OnPolicyAlgorithm):
         return [*super()._excluded_save_params(), "_problem", "_has_default_device"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        # The estimator's state dict also holds its optimiser.
+        # The state dict of an estimator with critics also holds Adam's moments.
         value = [] if self.value_function is None else ["value_function", "value_function.optimizer"]
         return ["policy", "policy.optimizer", "estimator", *value], []
 

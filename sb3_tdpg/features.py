@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 
 from sb3_tdpg.common.running_norms import RunningNorm
 
-MIN_SIDE = 12  # pixels, the minimum for the paper's two convolutions
+MIN_SIDE = 12  # pixels: floats with a shorter side are no depth image (the paper's two convolutions need 10)
 LEAST_MAP = 3  # pixels, side of the smallest feature map in which a position is meaningful
 
 
@@ -103,7 +103,7 @@ class TRVCnn(BaseFeaturesExtractor):
     By default, it has the paper's two layers (6 channels, stride 2, ELU), and its output is flattened.
 
     With ``pool``, every square of ``pool x pool`` pixels is first replaced by its mean. Otherwise a layer of stride 2
-    would turn fine textures into coarse ones (aliasing). Unseen textures would then have the largest effect on the
+    would turn fine textures into coarse ones (aliasing). Unseen textures would then have a large effect on the
     features.
 
     With ``keypoints``, a :class:`~sb3_tdpg.features.SpatialSoftmax` replaces the nonlinearity of the last layer. The

@@ -1,5 +1,5 @@
 """
-The loss of TDPG as pure functions, one per equation.
+The terms of TDPG's loss, and what they are computed from, as pure functions.
 
 Dimension key: T horizon, N episodes. ``alive`` is 1 while an episode runs and 0 after its end.
 """

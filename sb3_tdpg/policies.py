@@ -37,7 +37,7 @@ from sb3_tdpg.envs.checks import count as check_count
 from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, PolicyDefaults, default, fill_in_extractor, fill_in_trvs
 
-# These limits allow standard deviations of up to 7.4 for a TRV and 55 for an action.
+# These limits allow standard deviations of up to 7.4 for a TRV and 55 for an action, in units of the head's outputs.
 MAX_TRV_VAR = math.exp(4)
 MAX_ACTION_VAR = math.exp(8)
 
@@ -55,8 +55,8 @@ class TRVPolicy(BasePolicy):
 
     The defaults depend on the preset: "vector", "image" (uint8), "depth" (images of floats) or "long" (vectors over a
     long horizon). See the table in "TDPG: Defaults" of the documentation and :mod:`sb3_tdpg.presets`. The presets
-    "vector" and "depth" have the network sizes of the paper. The preset "paper" has the network sizes of the paper's
-    ball catching.
+    "vector" and "depth" have the network sizes of the paper, except for the keypoints of "depth". The preset "paper"
+    has the network sizes of the paper's ball catching.
 
     :param observation_space: Vectors, images with channels first, ``Discrete``, or a ``Dict`` of these.
     :param action_space: Box, Discrete, MultiDiscrete or MultiBinary.
@@ -71,7 +71,7 @@ class TRVPolicy(BasePolicy):
     :param skip: Whether the features are added to the means of the first TRVs. The encoder then need not learn to store
         an observation before the action head can use it.
     :param skip_changes: Whether the changes of the features since the last step are added to the means of the next
-        TRVs, after those of ``skip``. Each change is scaled by the information that it adds to the features
+        TRVs, after those of ``skip``. Each change is scaled by how much it helps to predict the next change
         (:class:`~sb3_tdpg.common.running_norms.Changes`). Such changes reveal hidden velocities.
     :param normalize_observations: Whether vectors are standardised by the mean and the standard deviation of all
         vectors seen in training, as in SB3's ``VecNormalize``.
@@ -80,8 +80,8 @@ class TRVPolicy(BasePolicy):
         bounds.
     :param shared_action_noise: Whether the variance of each action is a single parameter, as in SB3's PPO (Box
         actions). Otherwise it is an output of the head and depends on the TRVs.
-    :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs in [-1, 1], as in the paper's policies for images.
-        Unfamiliar observations then cannot drive the TRVs to values that the action head has never seen.
+    :param squash_trv_mean: Whether a tanh keeps the mean of the TRVs (with ``gate``: the candidate) in [-1, 1], as in
+        the paper's policies for images. Unfamiliar observations then cannot drive this mean out of [-1, 1].
     :param gate: Whether the encoder also outputs a gate g in [0, 1] for each TRV, like the update gate of a GRU. The
         gate decides how much of the last TRVs is kept: ``mean = g * candidate + (1 - g) * last TRVs``, where the
         candidate is the mean without a gate. The policy can then remember over many steps. ``gate`` cannot be combined
@@ -93,7 +93,7 @@ class TRVPolicy(BasePolicy):
     :param encoder_var_floor: Smallest variance of a TRV: ``variance = exp(log_var) + floor``, bounded above.
     :param action_var_floor: Smallest variance of an action, applied in the same way.
     :param features_extractor_class: Network in front of the encoder; default: ``FlattenExtractor`` for vectors,
-        :class:`~sb3_tdpg.features.TRVCnn` for images.
+        :class:`~sb3_tdpg.features.TRVCnn` for images, SB3's ``CombinedExtractor`` for a ``Dict``.
     :param features_extractor_kwargs: Keywords of the feature extractor.
     :param normalize_images: Whether to divide uint8 images by 255.
     :param optimizer_class: Optimiser of the policy.
@@ -278,7 +278,8 @@ class TRVPolicy(BasePolicy):
         :param observation: observations y_t, ``(N, *obs)``
         :param prev_trv: previous TRVs x~_{t-1}, ``(N, Z)``; zero at the start of an episode
         :param t: time step of each episode, ``(N,)``
-        :param deterministic: Whether to use the means of the TRVs and of the action instead of samples.
+        :param deterministic: Whether to use the means of the TRVs and of the action (of a discrete action: the most
+            probable value) instead of samples.
         """
         mean, std = self.encoder_density(observation, prev_trv, t)
         noise = th.zeros_like(mean) if deterministic else th.randn_like(mean)
@@ -430,9 +431,9 @@ class TRVPolicy(BasePolicy):
         :param observation: one observation, or one per environment
         :param state: the memory that the last call returned; ``None`` at the start
         :param episode_start: ``(n_envs,)`` bool; the memory is cleared where it is True
-        :param deterministic: Whether to use means instead of samples. Without the noise, through which the bottleneck
-            acts, the policy is not the one that was trained. The first such call warns. The paper's tables use
-            ``False``.
+        :param deterministic: Whether to use means instead of samples (of a discrete action: the most probable value).
+            Without the noise, through which the bottleneck acts, the policy is not the one that was trained. The first
+            such call warns. The paper's tables use ``False``.
         :return: the actions, clipped to their bounds, and the memory for the next call
         :raises ValueError: if the observation has a wrong shape, or an episode is longer than the horizon of a
             time-varying policy.

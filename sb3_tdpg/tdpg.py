@@ -85,8 +85,8 @@ class TDPG(EpisodicAlgorithm):
         (:class:`~sb3_tdpg.advantages.ValueFunction`). ``"mean"``: subtract the mean cost of the episodes, as in the
         paper.
     :param encoder_gradient: ``"score"``: likelihood-ratio gradient through log q (Equation 13), as in the paper.
-        ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Both gradients are unbiased; the
-        pathwise gradient has less variance.
+        ``"pathwise"``: hold the noise fixed and differentiate log pi through the TRVs. Over whole episodes, neither of
+        them adds a bias; the pathwise gradient has less variance.
     :param bptt_steps: Length of the segments through which the gradient flows back in time, for long horizons. The time
         steps must then share their weights (``time_varying=False``). Default: 5 for vectors over a horizon of 50 or
         more steps, otherwise whole episodes. A value of T gives whole episodes.
@@ -95,7 +95,7 @@ class TDPG(EpisodicAlgorithm):
         ``bptt_steps``, of segments.
     :param clip_range: PPO's clip range, a number or a schedule; ``inf``: no clipping.
     :param target_kl: Limit on the Kullback-Leibler divergence in nats per step, as in PPO. The passes of an epoch end
-        when the divergence exceeds 1.5 times this value. ``inf``: no limit.
+        when the divergence exceeds 1.5 times this value. ``inf``, or no clipping: no limit.
     :param normalize_advantage: Whether to normalise the advantages. The penalty is divided by the same standard
         deviation, so that ``beta`` keeps its meaning.
     :param gamma: Discount factor; the paper has none.
@@ -114,8 +114,8 @@ class TDPG(EpisodicAlgorithm):
     :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``. ``"auto"`` uses a GPU, if there is one, for images, and the CPU
         for vectors, for which it is faster.
     :param n_threads: Number of threads of torch and of NumPy's linear algebra during ``learn``. Default: torch's
-        setting for images, otherwise 1. One thread is fastest for small networks and gives the same numbers on any
-        number of cores.
+        setting for images, otherwise 1. For small networks one thread is nearly as fast as two, and it gives the same
+        numbers on any number of cores.
     :param _init_setup_model: Whether to build the networks in the constructor.
     :raises ValueError: if an argument is out of range or does not fit the environment.
     """
@@ -283,8 +283,8 @@ class TDPG(EpisodicAlgorithm):
 
         Each of the E environments runs N / E episodes, one after the other. Taking the first N episodes that finish
         would favour short episodes. With ``epoch_steps`` an environment begins another episode while fewer than that
-        many steps are stored, and the last epoch of ``learn`` takes only the remaining steps, but at least a tenth of
-        an epoch. All environments begin an epoch at t = 0.
+        many steps are stored, and the last epoch of ``learn`` takes only the remaining steps, but at least about a
+        tenth of an epoch (if it is also the first epoch: a whole one). All environments begin an epoch at t = 0.
 
         :param env: The training environments.
         :param callback: Called at each step, and at the beginning and the end of the rollout.
@@ -363,8 +363,8 @@ class TDPG(EpisodicAlgorithm):
         """
         Update the encoder and the action head from the rollouts (line 6 of Algorithm 2).
 
-        :raises TrainingDivergedError: if a cost, the loss or a gradient is NaN or infinite; the parameters keep their
-            values from before that step.
+        :raises TrainingDivergedError: if a cost, the information, a loss or a gradient is NaN or infinite; the
+            parameters keep their values from before that step.
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)

@@ -207,8 +207,10 @@ def make_episodes_env(
     :param epoch_steps: Number of steps per epoch, instead of ``n_episodes``.
     :param env_kwargs: Keywords for the environment's constructor.
     :param seed: Seed for the first reset.
-    :param use_processes: Whether the Panda environments use one process per core; the numbers are the same either way.
-    :return: a :class:`BatchedVecEnv` for an environment of this package, else SB3's ``DummyVecEnv``
+    :param use_processes: Whether the Panda environments, and BallCatch-v0 with PyBullet, use one process per core; the
+        numbers are the same either way.
+    :return: a :class:`BatchedVecEnv` for an environment of this package or another subclass of
+        :class:`~sb3_tdpg.envs.base.POMDPEnv`, else SB3's ``DummyVecEnv``
     :raises ValueError: if a number is not an integer of at least 1.
     :raises gymnasium.error.Error: if the id is not registered.
     """
