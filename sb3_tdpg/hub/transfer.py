@@ -27,7 +27,7 @@ from sb3_tdpg.tdpg import TDPG
 
 LIBRARY: Any = dict(library_name="sb3_tdpg")  # for the statistics of the Hub
 # Files that only some models have. An upload deletes them first, so that no file of an earlier model remains.
-OPTIONAL_FILES = ["command.txt", "replay.mp4", "selected.json", "training.png", "vec_normalize.pkl"]
+OPTIONAL_FILES = ["command.txt", "config.json", "replay.mp4", "selected.json", "training.png", "vec_normalize.pkl"]
 
 
 def write_model_card(

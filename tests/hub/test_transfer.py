@@ -128,9 +128,9 @@ def test_a_push_makes_the_repository_and_uploads_the_folder(card, api):
     assert api.made.call_args.kwargs["token"] == "secret"
     api.create_repo.assert_called_once_with(REPO_ID, private=True, exist_ok=True)
     folder = api.upload_folder.call_args.kwargs
-    # A video of an earlier model is deleted, and files of the user stay.
+    # Files that only an earlier model had are deleted, and files of the user stay.
     gone = folder.pop("delete_patterns")
-    assert {"replay.mp4", "vec_normalize.pkl"} <= set(gone)
+    assert {"config.json", "replay.mp4", "vec_normalize.pkl"} <= set(gone)
     assert all("*" not in name for name in gone)
     assert folder == dict(repo_id=REPO_ID, folder_path=card, commit_message="More epochs")
 
