@@ -110,10 +110,10 @@ def differences(found: Any, wanted: Any) -> str:
 
 
 def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and the JSON text of all values in nested dicts and lists of dicts."""
+    """Yield the path and the JSON text of all values, and of empty dicts, in nested dicts and lists of dicts."""
     if isinstance(value, list) and any(isinstance(row, dict) for row in value):
         value = dict(enumerate(value))
-    if not isinstance(value, dict):
+    if not (isinstance(value, dict) and value):
         yield where, json.dumps(value)
         return
     for key, item in value.items():

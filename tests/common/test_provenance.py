@@ -73,8 +73,10 @@ def test_a_run_configuration_holds_what_was_given_and_where_it_came_from(tmp_pat
 @pytest.mark.parametrize(("found", "wanted", "told"), [
     (dict(settings=dict(lr=0.001, beta=math.inf)), dict(settings=dict(lr=0.0005, beta=math.inf)),
      "settings.lr: 0.001 there, 0.0005 here"),
-    (dict(settings={}), dict(settings=dict(normalize=dict(norm_obs=True))),
+    (dict(settings=dict(lr=1)), dict(settings=dict(lr=1, normalize=dict(norm_obs=True))),
      "settings.normalize.norm_obs: not there, true here"),
+    (dict(wrappers=[dict(Blind={})]), dict(wrappers=[dict(Faulty={})]),
+     "wrappers.0.Blind: {} there, not here; wrappers.0.Faulty: not there, {} here"),
     (dict(seed=0, start=None), dict(seed=0), "start: null there, not here"),
     (dict(rows=[dict(name="a", std=1), dict(name="b", std=1)]), dict(rows=[dict(name="a", std=1), dict(name="b")]),
      "rows.1.std: 1 there, not here"),
