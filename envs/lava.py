@@ -66,7 +66,7 @@ class LavaEnv(POMDPEnv):
         self.sensor_noise_std = checks.not_negative("sensor_noise_std", sensor_noise_std, sigma)
         if not (np.shape(sensor_bias) == (2,) and np.isfinite(sensor_bias).all()):
             raise ValueError(f"sensor_bias={sensor_bias!r} must be two finite numbers, in m and m per step")
-        if start_beta is not None and not (np.shape(start_beta) == (2,) and min(start_beta) > 0):
+        if start_beta is not None and not (np.shape(start_beta) == (2,) and all(0 < a < np.inf for a in start_beta)):
             raise ValueError(f"start_beta={start_beta!r} must be two positive numbers, for instance (2, 1), or None")
         max_action = checks.positive("max_action", max_action)
         self.sensor_bias = np.array(sensor_bias, dtype=np.float64)

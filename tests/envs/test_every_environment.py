@@ -273,7 +273,7 @@ REFUSED = {
         *(({name: np.nan}, f"{name}=nan must be finite")
           for name in ("action_cost", "lava_stage_cost", "lava_terminal_cost")),
         (dict(sensor_bias=0.1), "sensor_bias=0.1 must be two finite numbers"),
-        (dict(start_beta=(0.0, 1.0)), r"start_beta=\(0.0, 1.0\) must be two positive numbers"),
+        *((dict(start_beta=(1.0, b)), r"start_beta=\(1.0, .*\) must be two positive") for b in (0.0, np.inf, np.nan)),
         (dict(render_mode="human"), r"render_mode='human' must be None or one of \['rgb_array'\]"),
     ],
     BallCatchEnv: [
