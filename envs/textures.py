@@ -147,7 +147,7 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
         :func:`random_texture`, the path of an image file, or an array ``(H, W, 3)`` uint8. ``"<percent>%-<name>"``
         draws a built-in or random texture over the brick with this opacity, as in ``"40%-violet_dots"``.
     :return: The texture, ``(H, W, 3)`` uint8.
-    :raises ValueError: if a name is unknown, or if an array is not an image.
+    :raises ValueError: if a name is unknown, an array is not an image, or a file has grey values of more than 8 bits.
     :raises OSError: if Pillow cannot read the file.
     """
     if isinstance(texture, np.ndarray):
@@ -173,4 +173,6 @@ def load_texture(texture: str | os.PathLike[str] | np.ndarray) -> np.ndarray:
             "'<0 to 100>%-<name>' with one of these names, or the path of an image file"
         )
     with Image.open(path) as image:
+        if image.mode.startswith("I"):  # Pillow would clip values above 255
+            raise ValueError(f"texture={name!r} has grey values of more than 8 bits: convert it to 8 bits")
         return np.array(image.convert("RGB"))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sb3_tdpg.envs.textures import TEST_TEXTURES, floor_texture, load_texture, random_texture
 
@@ -63,3 +64,9 @@ def test_a_texture_continues_over_its_edges():
         for rows in (texture, texture.transpose(1, 0, 2)):
             inside = abs(np.diff(rows, axis=0)).mean(axis=(1, 2)).max()
             assert abs(rows[0] - rows[-1]).mean() <= 1.1 * inside, name
+
+
+def test_a_file_whose_grey_values_have_more_than_eight_bits_is_refused(tmp_path):
+    Image.fromarray(np.full((4, 4), 1000, np.uint16)).save(tmp_path / "16.png")
+    with pytest.raises(ValueError, match=r"16.png' has grey values of more than 8 bits"):
+        load_texture(tmp_path / "16.png")
