@@ -108,9 +108,9 @@ class SelectionCallback(TDPGCallback):
     :param save_path: File of the selected model (``.zip``); a ``.json`` file beside it holds the epoch, cost and
         information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given. It is also raised at the start of a training if a ``VecNormalize``
-        normalises the observations with statistics that still change (``training=True``). Let the policy normalise the
-        observations instead (``normalize_observations``).
+    :raises ValueError: if neither limit is given, or no policy can meet a limit. It is also raised at the start of a
+        training if a ``VecNormalize`` normalises the observations with statistics that still change
+        (``training=True``). Let the policy normalise the observations instead (``normalize_observations``).
     """
 
     def __init__(
@@ -126,6 +126,8 @@ class SelectionCallback(TDPGCallback):
                 "give cost_limit (selects the lowest information below that cost), mi_limit (the lowest cost below "
                 "that information), or both"
             )
+        if math.isnan(cost_limit or 0.0) or not (mi_limit is None or mi_limit >= 0):
+            raise ValueError(f"cost_limit={cost_limit} must not be NaN, and mi_limit={mi_limit} must be at least 0")
         self.cost_limit = cost_limit
         self.mi_limit = mi_limit
         self.save_path = None if save_path is None else _zip_path(save_path)

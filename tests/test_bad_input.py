@@ -248,6 +248,8 @@ POLICY = dict(observation_space=spaces.Discrete(2), action_space=spaces.Discrete
 @pytest.mark.parametrize(("make", "kwargs", "message"), [
     (InformationCallback, dict(eval_freq=0), "eval_freq=0 must be at least 1"),
     (SelectionCallback, dict(), "give cost_limit .* mi_limit .* or both"),
+    (SelectionCallback, dict(cost_limit=math.nan), "cost_limit=nan must not be NaN"),
+    (SelectionCallback, dict(mi_limit=-0.1), "mi_limit=-0.1 must be at least 0"),
     (TrainingCheckpointCallback, dict(save_path="checkpoint", save_freq=0), "save_freq=0 must be at least 1"),
     (TRVPolicy, dict(POLICY, horizon=0), "horizon.*at least 1"),
     (TRVPolicy, dict(POLICY, horizon=2.5), "horizon.*at least 1"),
