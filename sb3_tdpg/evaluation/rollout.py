@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, is_vecenv_wrapped
@@ -123,6 +122,4 @@ def act(model: Any, observations: Any, prev_trvs: th.Tensor, t: np.ndarray) -> t
     model.policy.set_training_mode(False)
     with th.no_grad():
         step = model.policy.step(obs_as_tensor(observations, model.device), prev_trvs, t)
-    space = model.action_space
-    actions = step.actions.cpu().numpy().reshape((-1, *space.shape))
-    return step, np.clip(actions, space.low, space.high) if isinstance(space, spaces.Box) else actions
+    return step, model.policy.clipped(step.actions.cpu().numpy())
