@@ -34,7 +34,7 @@ CODE = [
     "certificates/shifts.py", "envs/*.py",
 ]  # fmt: skip
 # Code for pictures, and the table of scenarios, which is made at import, before mutmut activates a change.
-LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|show_window|_figure__")
+LEFT_OUT = re.compile(r"\.scenarios\.|SideView|render__|_figure__")
 TESTS = [
     "test_losses.py", "test_advantages.py", "test_gradients.py", "test_reference_loop.py", "test_buffers.py",
     "test_passes.py", "test_presets.py", "test_tdpg.py", "test_bad_input.py", "test_auto_weight.py",
