@@ -180,7 +180,7 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
     Parse keywords from the command line: ``["texture=violet_dots", "robot_range=[-1, 1]"]``.
 
     :param texts: Texts of the form ``key=value``. The value is YAML: a number, a text, true, false, null or a list.
-    :raises ValueError: if a text has another form.
+    :raises ValueError: if a text has another form, or a key occurs twice.
     """
     keywords: dict[str, Any] = {}
     for text in texts:
@@ -189,6 +189,8 @@ def parse_keywords(texts: Sequence[str]) -> dict[str, Any]:
             raise ValueError(
                 f"{text!r} is not a keyword or setting with a plain name: write key=value, for instance horizon=10"
             )
+        if key in keywords:
+            raise ValueError(f"{text!r}: {key} is given twice")
         try:
             keywords[key] = yaml.load(value, _Loader)
         except yaml.YAMLError as e:

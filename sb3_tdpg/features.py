@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 from torch.nn.functional import avg_pool2d
 
@@ -184,6 +184,15 @@ def pooled_steps(extractor: nn.Module, observations: th.Tensor | dict[str, th.Te
     if not isinstance(extractor, TRVCnn) or extractor.pool == 1 or isinstance(observations, dict):
         return observations
     return extractor.pooled(observations.flatten(0, 1)).unflatten(0, observations.shape[:2])
+
+
+def flat_steps(extractor: nn.Module, x: th.Tensor) -> th.Tensor:
+    """Flatten the steps of episodes for a feature extractor: ``(T, N, *obs) -> (T * N, *obs)``."""
+    x = x.flatten(0, 1)
+    # Change the layout while the pixels are still bytes, which is faster. Other extractors may need the usual layout
+    # (``view``).
+    is_faster = isinstance(extractor, NatureCNN) or (isinstance(extractor, TRVCnn) and extractor.pool == 1)
+    return x.contiguous(memory_format=th.channels_last) if x.dim() == 4 and is_faster else x
 
 
 class ObservationNorm(nn.Module):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from inspect import signature
 from typing import Any, cast
 
@@ -34,7 +35,7 @@ from sb3_tdpg.checks import (
 from sb3_tdpg.common.networks import MAX_TIME_VARYING_HORIZON, BatchedLinear, TimeMLP, bounded_variance
 from sb3_tdpg.common.running_norms import Changes
 from sb3_tdpg.envs.checks import count as check_count
-from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, observation_kind
+from sb3_tdpg.features import ObservationNorm, TRVCnn, flat_action_space, flat_steps, observation_kind
 from sb3_tdpg.presets import POLICY_DEFAULTS, PolicyDefaults, default, fill_in_extractor, fill_in_trvs
 
 # These limits allow standard deviations of up to 7.4 for a TRV and 55 for an action, in units of the head's outputs.
@@ -332,7 +333,7 @@ class TRVPolicy(BasePolicy):
 
     def episode_features(self, batch: EpisodeBatch) -> th.Tensor:
         """Extract the features of every observation: ``(T, N, F)``."""
-        flat = each_part(lambda x: x.flatten(0, 1), batch.observations)
+        flat = each_part(partial(flat_steps, self.features_extractor), batch.observations)
         return self._features(flat).unflatten(0, batch.alive.shape)
 
     def episode_action_density(self, trvs: th.Tensor) -> Distribution:

@@ -24,6 +24,7 @@ PANEL_HEIGHT = 180  # height of the plot of the TRVs
 LEFT, RIGHT, TOP, BOTTOM = 62, 76, 26, 42  # margins around the axes; the legend is at the right
 SYMBOLS = {"TRV": r"$\tilde{x}_t$", "action": "$u_t$"}
 HOLD = 1.0  # s: duration of the last frame of an episode
+MAX_LINES = 8  # more TRVs than this are drawn as rows of an image
 
 
 class Episode(NamedTuple):
@@ -94,7 +95,7 @@ class _Video:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        self.episodes = episodes
+        self.episodes, self._signal = episodes, signal
         height, width = episodes[0].pictures[0].shape[:2]
         self._factor = -(-MIN_WIDTH // width)
         height, width = self._factor * height, self._factor * width
@@ -114,23 +115,48 @@ class _Video:
         axes.locator_params(axis="x", integer=True)
         tidy(axes)
         # All frames share the limits of the axes.
-        signals = np.concatenate([episode.signals for episode in episodes])  # (n, Z)
+        signals = np.concatenate([episode.signals for episode in episodes])
+        self._lines: list[Any] = []
+        self._rows: Any = None
+        if signals.shape[1] <= MAX_LINES:
+            self._draw_lines(signals, horizon)
+        else:
+            self._draw_rows(signals, horizon)
+        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
+
+    def _draw_lines(self, signals: np.ndarray, horizon: int) -> None:
+        """Draw a line for each TRV: ``(n, Z)``."""
+        axes = self._axes
         low, high = float(signals.min()), float(signals.max())
         margin = 0.05 * (high - low) or 1.0
         axes.set(xlim=(0, horizon), ylim=(low - margin, high + margin))
         axes.grid(alpha=0.25)
-        axes.set_ylabel(f"{signal}s {SYMBOLS[signal]}", fontsize=9)
+        axes.set_ylabel(f"{self._signal}s {SYMBOLS[self._signal]}", fontsize=9)
         looks: dict[str, Any] = dict(linewidth=1.3, marker="o", markersize=2.5, clip_on=False)
         self._lines = [
-            axes.plot([], [], label=str(i + 1), color=PALETTE[i % len(PALETTE)], **looks)[0]
-            for i in range(signals.shape[1])
+            axes.plot([], [], label=str(i + 1), color=color, **looks)[0]
+            for i, color in zip(range(signals.shape[1]), PALETTE, strict=False)
         ]
-        if len(self._lines) <= len(PALETTE):
-            axes.legend(
-                title=signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8,
-                title_fontsize=9, handlelength=1.2, labelspacing=0.2,
-            )  # fmt: skip
-        self._now = axes.axvline(0, color=INK, linewidth=0.8, alpha=0.5)
+        axes.legend(
+            title=self._signal, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8,
+            title_fontsize=9, handlelength=1.2, labelspacing=0.2,
+        )  # fmt: skip
+
+    def _draw_rows(self, signals: np.ndarray, horizon: int) -> None:
+        """Draw a row of colours for each TRV: ``(n, Z)``."""
+        n_signals = signals.shape[1]
+        largest = float(np.abs(signals).max()) or 1.0
+        self._rows = self._axes.imshow(
+            np.full((n_signals, horizon), np.nan), aspect="auto", interpolation="nearest", cmap="RdBu_r",
+            vmin=-largest, vmax=largest, extent=(-0.5, horizon - 0.5, n_signals + 0.5, 0.5),
+        )  # fmt: skip
+        self._axes.set_xlim(-0.5, horizon + 0.5)  # the last picture shows the end, after the last TRVs
+        self._axes.set_ylabel(self._signal, fontsize=9)
+        box = self._axes.get_position()
+        bar = self.figure.add_axes((box.x1 + 0.012, box.y0, 0.012, box.height))
+        self.figure.colorbar(self._rows, cax=bar)
+        bar.tick_params(labelsize=8, length=2)
+        bar.set_title(SYMBOLS[self._signal], fontsize=9)
 
     def frames(self) -> Iterator[bool]:
         """Draw each frame in turn, and yield whether it is the last frame of its episode."""
@@ -140,8 +166,12 @@ class _Video:
                 t = int(time)
                 self._picture.set_data(self._enlarged(picture))
                 self._now.set_xdata([time, time])
-                for line, values in zip(self._lines, episode.signals.T, strict=True):
+                for line, values in zip(self._lines, episode.signals.T, strict=False):
                     line.set_data(np.arange(len(values))[: t + 1], values[: t + 1])
+                if self._rows is not None:
+                    shown = np.full(self._rows.get_array().shape, np.nan)
+                    shown[:, : min(t + 1, len(episode.signals))] = episode.signals[: t + 1].T
+                    self._rows.set_data(shown)
                 self._axes.set_title(
                     f"episode {number}, step {t}: cost so far {cost_so_far[t]:.2f}", loc="left", fontsize=9, color=INK
                 )

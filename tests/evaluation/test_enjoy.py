@@ -85,10 +85,10 @@ def frames_of(path):
     return frames, durations
 
 
-def animate(path, n_trvs):
+def animate(path, n_trvs, trv=0.0):
     """Record three steps with white pictures and constant TRVs."""
     pictures = [np.full((40, 400, 3), 255, np.uint8)] * 4
-    save_animation([Episode(pictures, np.zeros((3, n_trvs)), np.ones(3))], path, horizon=3, fps=1000)
+    save_animation([Episode(pictures, np.full((3, n_trvs), trv), np.ones(3))], path, horizon=3, fps=1000)
     return path
 
 
@@ -190,11 +190,17 @@ def test_an_environment_that_cannot_draw_is_not_recorded(render, message, own, t
     assert not (tmp_path / "film.gif").exists()
 
 
-def test_only_few_trvs_have_a_legend(tmp_path):
-    for n_trvs, has_legend in ((8, True), (9, False)):
-        frames, durations = frames_of(animate(tmp_path / "film.gif", n_trvs))
-        assert durations == [20, 20, 20, 1000]
-        assert (frames[0][40 + 26 : -42, -70:].min() < 128) == has_legend
+def test_few_trvs_are_lines_and_many_are_rows_of_colours_up_to_the_present_step(tmp_path):
+    for n_trvs, trv, is_coloured in ((8, 5.0, False), (9, 5.0, True), (20, 0.0, False)):
+        frames, durations = frames_of(animate(tmp_path / "film.gif", n_trvs, trv))
+        assert durations == [20, 20, 20, 1000]  # viewers slow down frames of less than 20 ms
+        panels = [frame[40 + 26 : -42, 62:-76].astype(int) for frame in frames]
+        # The largest value is dark red, and so is the whole row up to the present step.
+        red = [((x[..., 0] > x[..., 1] + 60) & (x[..., 0] > x[..., 2] + 60)).mean() for x in panels]
+        assert (red[2] > 0.5) == is_coloured
+        if is_coloured:
+            assert red[0] < red[1] < red[2]
+            assert red[0] == pytest.approx(red[2] / 3, abs=0.05)
 
 
 def test_an_mp4_is_written_without_an_ffmpeg_on_the_path(lava, tmp_path, monkeypatch):
@@ -230,6 +236,7 @@ def test_keywords_are_read_as_yaml():
     (["=3"], "'=3' is not a keyword"),
     (["a b=3"], "'a b=3' is not a keyword"),
     (["a=[1, 2"], "must be YAML"),
+    (["a=1", "a=2"], "a is given twice"),
 ], ids=str)  # fmt: skip
 def test_a_keyword_that_cannot_be_read_is_refused(texts, message):
     with pytest.raises(ValueError, match=message):
