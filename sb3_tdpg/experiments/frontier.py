@@ -61,10 +61,10 @@ def frontier(
 
     This function trains policies without the penalty, policies with limits on the cost, and open-loop policies. It
     draws their cost against their information and writes a :func:`verdict`. Each limit keeps a share of the improvement
-    during training (``beta="auto", cost_limit="95%"``). An open-loop policy is trained in the same way but observes
-    only the time; the seed with the lowest cost is the *best open loop*. The information is the log-det bound on fresh
-    episodes. An interval is a 95 % bootstrap interval over the seeds; with three seeds it is their range. The figure
-    marks the :func:`knee`. Finished runs are kept, so that the same call resumes an interrupted one.
+    of the cost during training (``beta="auto", cost_limit="95%"``). An open-loop policy is trained in the same way but
+    observes only the time; the seed with the lowest cost is the *best open loop*. The information is the log-det bound
+    on fresh episodes. An interval is a 95 % bootstrap interval over the seeds; with three seeds it is their range. The
+    figure marks the :func:`knee`. Finished runs are kept, so that the same call resumes an interrupted one.
 
     :param env_id: A registered id.
     :param shares: Shares of the improvement in per cent, between 0 and 100.
@@ -172,10 +172,11 @@ def frontier_table(runs: pd.DataFrame, first_cost: float) -> pd.DataFrame:
 
     :param runs: ``label``, ``seed``, ``cost`` and ``information`` of each run. The order of the labels is: no penalty,
         the shares, open loop.
-    :param first_cost: Cost of the first epoch of the training.
-    :return: a row for each label: ``seeds``; the means ``cost``, ``nats`` and ``kept`` (fraction of the nats that the
-        same seed has without a penalty), each with the ends ``_low`` and ``_high`` of its interval; the cost of the
-        ``best`` seed; and ``improvement``, the fraction of the improvement that the mean cost keeps
+    :param first_cost: Mean cost of the first epoch of the trainings without a penalty.
+    :return: a row for each label: ``seeds``; the interquartile means ``cost``, ``nats`` and ``kept`` (fraction of the
+        nats that the same seed has without a penalty), each with the ends ``_low`` and ``_high`` of its interval; the
+        cost of the ``best`` seed; and ``improvement``, the decrease of the cost from ``first_cost`` as a fraction of
+        its decrease without a penalty
     """
     # An open-loop policy's memory shares information with the state only through its actions, not through the sensor.
     runs = runs.assign(nats=runs["information"].where(runs["label"] != OPEN_LOOP, 0.0))
@@ -200,8 +201,8 @@ def knee(table: pd.DataFrame) -> str | None:
 
     A mixture uses the policy without a penalty in some episodes and the best open loop in the other episodes, so it
     lies on the line between these two policies. Nats and additional cost are divided by their values at the ends of
-    the line. The knee is the limit that is farthest below the line, if this distance is at least a tenth of the
-    distance from the origin to the line.
+    the line. The origin is the cost of the policy without a penalty, with no information. The knee is the limit that
+    is farthest below the line, if this distance is at least a tenth of the distance from the origin to the line.
 
     :param table: From :func:`frontier_table`.
     """

@@ -19,8 +19,8 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
 
     Rows with a function that changes the sensor are left out, because the file contains only the function's name.
 
-    :param config: The ``config.json``. If the run started from the policy of another run, that policy must be in the
-        same folder: ``<name of that run>/model.zip``.
+    :param config: The ``config.json``. If the run started from the policy of another run, that policy must be beside
+        this file: ``<name of that run>/model.zip``.
     :param out: Folder of the new run, see :func:`~sb3_tdpg.experiments.runs.complete_run`.
     :param progress_bar: Show progress bars.
     :return: ``out``

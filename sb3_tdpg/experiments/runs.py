@@ -191,10 +191,10 @@ def complete_run(
     """
     Train and evaluate a run, or resume an interrupted run. Do nothing if the run is finished.
 
-    ``folder`` then contains ``model.zip`` (the selected policy), ``selected.json`` (its epoch, cost and information;
-    missing if no epoch met the limits), ``progress_<timestep>.csv`` (the training log), ``config.json`` (settings,
-    seeds, versions, commit) and ``episodes.csv`` (a row for each evaluation episode, written last). Earlier attempts
-    are in ``attempt<i>/``.
+    ``folder`` then contains ``model.zip`` (the selected policy, or the last one if none was selected),
+    ``selected.json`` (its epoch, cost and information; missing if none was selected), ``progress_<timestep>.csv`` (the
+    training log), ``config.json`` (settings, seeds, versions, commit) and ``episodes.csv`` (a row for each evaluation
+    episode, written last). Earlier attempts are in ``attempt<i>/``.
 
     :param run: The run to complete.
     :param folder: Folder of the run.

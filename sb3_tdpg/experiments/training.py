@@ -29,8 +29,9 @@ def make_training(env_id: str, block: Mapping[str, Any], **overrides: Any) -> Tr
     """
     Build model and callbacks from a block of settings, as rl-zoo3 does.
 
-    ``n_timesteps``, ``env_kwargs``, ``vec_env_wrapper``, ``normalize`` and ``callback`` are keys of rl-zoo3. All other
-    keys are arguments of :class:`~sb3_tdpg.tdpg.TDPG`. ``lin_1e-3`` is a learning rate that decreases linearly to zero.
+    ``n_timesteps``, ``n_envs``, ``env_kwargs``, ``vec_env_wrapper``, ``normalize`` and ``callback`` are keys of
+    rl-zoo3. All other keys are arguments of :class:`~sb3_tdpg.tdpg.TDPG`. ``lin_1e-3`` is a learning rate that
+    decreases linearly to zero.
 
     :param env_id: A registered id.
     :param block: The settings, for instance from :func:`sb3_tdpg.hyperparams.load_hyperparams`.
@@ -48,7 +49,7 @@ def take_env(env_id: str, settings: dict[str, Any]) -> VecEnv:
     Make the environments of a training, and remove the settings of the environments from a block.
 
     These settings are ``n_envs``, ``env_kwargs``, ``vec_env_wrapper`` and ``normalize`` (a dict of keywords of
-    ``VecNormalize``, to which the zoo adds ``gamma``).
+    ``VecNormalize``, to which this function adds ``gamma``, as the zoo does).
     """
     env = make_episodes_env(
         env_id,

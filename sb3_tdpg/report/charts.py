@@ -65,7 +65,7 @@ def own_rows_figure(numbers: Numbers) -> Figure:
 
 
 def _grid(n: int) -> tuple[Figure, np.ndarray]:
-    """Make a figure with n panels that share their axes, in rows of equal length with up to five panels."""
+    """Make a figure with n panels that share their axes, in rows of up to five panels, with as few gaps as possible."""
     n_columns = n if n <= 5 else min((5, 4, 3), key=lambda columns: -n % columns)
     n_rows = -(-n // n_columns)
     figure, panels = new_panels(WIDTH, 0.7 + 1.8 * n_rows, n_rows, n_columns, sharex=True, sharey=True)

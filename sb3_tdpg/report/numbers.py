@@ -33,10 +33,10 @@ class Numbers:
     the other method's interval, and the p-value is at most 0.05."""
     comparisons: pd.DataFrame
     """The comparison of each method with the first method (``reference``), with a row for each perturbation. ``p_cost``
-    is the share of the pairs of models in which the method's model costs less. ``p_added`` is the share in which the
-    perturbation adds less to the cost of the method's model. ``pvalue_...`` is from the two-sided Mann-Whitney test,
-    which is exact if one of the two methods has at most ``MAX_EXACT`` models. ``cost`` and ``added`` are the verdicts:
-    ``"less"`` or ``"more"`` up to a p-value of 0.05, otherwise ``"undecided"``."""
+    is the share of the pairs of models in which the method's model costs less (a tie counts half). ``p_added`` is the
+    share in which the perturbation adds less to the cost of the method's model. ``pvalue_...`` is from the two-sided
+    Mann-Whitney test, which is exact if one of the two methods has at most ``MAX_EXACT`` models. ``cost`` and ``added``
+    are the verdicts: ``"less"`` or ``"more"`` up to a p-value of 0.05, otherwise ``"undecided"``."""
     model_levels: pd.DataFrame
     """The mean cost of each model in each row: ``model``, ``train_seed``, ``perturbation``, ``severity``, ``cost``."""
 

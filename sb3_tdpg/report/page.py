@@ -64,7 +64,7 @@ def write_page(numbers: Numbers, page: Page) -> str:
 
 
 class Costs:
-    """Format costs with the number of decimals that gives the unperturbed costs three significant digits."""
+    """Format costs with one to four decimals, if possible with three significant digits for each unperturbed cost."""
 
     def __init__(self, numbers: Numbers) -> None:
         self.numbers = numbers

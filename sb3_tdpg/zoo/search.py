@@ -49,7 +49,7 @@ def read_space(path: Path | None = None) -> Space:
 
 
 def relevant(space: Space, block: Mapping[str, Any]) -> Space:
-    """Remove the weight of the information from a space if the block's beta determines this weight."""
+    """Remove the weight of the information from a space unless the block's beta is a finite number or a schedule."""
     is_fixed = block.get("beta") in (None, "auto", math.inf)
     return {name: entry for name, entry in space.items() if not (name == WEIGHT and is_fixed)}
 

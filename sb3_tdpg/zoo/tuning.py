@@ -204,7 +204,8 @@ def _rank(cost: float, information: float, limit: float) -> float:
     """
     Return a number that orders policies; lower is better.
 
-    Policies that meet the limit have values below 1, ordered by information. All other policies are ordered by cost.
+    With an infinite limit, the number is the cost. Otherwise, policies that meet the limit have values below 1, ordered
+    by information, and all other policies are ordered by cost.
     """
     if math.isinf(limit):
         return cost
