@@ -75,7 +75,8 @@ def frontier(
     :param n_timesteps: Environment steps of each training; default: as in the block, or TDPG's default.
     :param n_eval_episodes: Number of episodes of each evaluation.
     :param block: Block of ``hyperparams/tdpg.yml``; default: the environment's block if there is one, or else TDPG's
-        defaults. The block's callbacks are ignored, and the estimator is the log-det bound.
+        defaults. The block's callbacks are ignored, and the estimator is the log-det bound, unless
+        the settings name another.
     :param env_kwargs: Keywords of the environment.
     :param settings: Settings that replace those of the block.
     :return: the summary, as Markdown

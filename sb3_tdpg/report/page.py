@@ -64,7 +64,7 @@ def write_page(numbers: Numbers, page: Page) -> str:
 
 
 class Costs:
-    """Format costs with one to four decimals, if possible with three significant digits for each unperturbed cost."""
+    """Format costs with one to four decimals, if possible at least three significant digits per unperturbed cost."""
 
     def __init__(self, numbers: Numbers) -> None:
         self.numbers = numbers

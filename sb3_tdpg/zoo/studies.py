@@ -1,8 +1,8 @@
 """
 Run Optuna studies that any number of worker processes share, on one machine or on many.
 
-Optuna's heartbeats show which workers are alive. The trial of a dead worker is put back into the queue. This module
-adds heartbeats for journal files, and a loop that waits for the trials of other workers.
+Optuna's heartbeats show which workers are alive. The trial of a dead worker is put back into the queue, at most three
+times. This module adds heartbeats for journal files, and a loop that waits for the trials of other workers.
 """
 
 import contextlib
@@ -176,8 +176,9 @@ def work(
     Run trials in parallel with any number of other workers until a study is finished.
 
     A ``ValueError``, for instance from a training that diverged, prunes the trial. The message becomes the trial's
-    attribute ``reason``. Any other exception and Ctrl-C end this worker and put the trial back into the queue. The
-    trial of a killed worker is put back by another worker, or by the next worker that starts.
+    attribute ``reason``. Any other exception (unless the storage does not answer) and Ctrl-C end this worker and put
+    the trial back into the queue. The trial of a killed worker is put back by another worker, or by the next worker
+    that starts.
 
     :param study: From :func:`open_study`.
     :param objective: Function that gets a trial and returns its value.
