@@ -1,5 +1,6 @@
 """
-Make videos of a policy: the environment's pictures, with the task-relevant variables (TRVs) over time below.
+Make videos of a policy: the environment's pictures, with the task-relevant variables (TRVs) or the actions over time
+below.
 
 Dimension key: T time steps of an episode, Z TRVs.
 """
@@ -45,7 +46,7 @@ class Episode(NamedTuple):
 
 
 def check_animation_path(path: str | os.PathLike[str]) -> None:
-    """Raise an error if the extension is not ``.gif`` or ``.mp4``, or if matplotlib or ffmpeg is missing."""
+    """Raise an error if the extension is not ``.gif`` or ``.mp4``, or if matplotlib, or ffmpeg for .mp4, is missing."""
     ending = Path(path).suffix
     if ending not in (".gif", ".mp4"):
         raise ValueError(f"{path}: the extension {ending!r} is not a video format: use .gif or .mp4")
@@ -55,7 +56,11 @@ def check_animation_path(path: str | os.PathLike[str]) -> None:
 
 
 def _ffmpeg() -> str | None:
-    """Return the path of the ffmpeg of Matplotlib's settings (by default, on the PATH) or of imageio-ffmpeg, if any."""
+    """
+    Return the path of the ffmpeg of Matplotlib's settings (by default, on the PATH), or else of imageio-ffmpeg.
+
+    If there is neither, the result is ``None``.
+    """
     import matplotlib as mpl
 
     if (found := shutil.which(mpl.rcParams["animation.ffmpeg_path"])) is not None:
@@ -77,9 +82,9 @@ def save_animation(
     :param episodes: Episodes with pictures of the same size.
     :param path: ``.gif`` or ``.mp4``. Folders are created, and the file appears only when it is complete.
     :param horizon: Number of controls T in an episode.
-    :param fps: Frames per second. A GIF rounds the duration of a frame to hundredths of a second.
+    :param fps: Frames per second. A GIF rounds the duration of a frame to hundredths of a second, at least two.
     :param signal: ``"TRV"`` or ``"action"``: what is drawn below the pictures.
-    :raises ValueError: if the video cannot be written there.
+    :raises ValueError: if the extension is another one, or an ``.mp4`` needs ffmpeg and there is none.
     """
     check_animation_path(path)
     path = Path(path)
@@ -206,7 +211,7 @@ def save_gif(
     :param path: The file; its folder exists.
     :param images: RGB images.
     :param durations: Duration of each image, in ms.
-    :param palette: An image with the palette to use; default: 256 colours from eight of the images.
+    :param palette: An image with the palette to use; default: 256 colours from at most eight of the images.
     """
     if palette is None:
         # MAXCOVERAGE keeps the colours of small objects, and k-means improves those of large ones.

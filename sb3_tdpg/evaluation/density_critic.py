@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 LOG_FLOOR = math.log(0.01)  # lower bound of the critic, against outliers
 LENGTHS = (0.3, 1.0)  # widths of the kernel, relative to the median distance
 RIDGES = (1e-9, 1e-3, 1e-2, 1e-1, 1.0)  # ridge penalties of the regressions, per episode
-SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 is the encoder's mixture, 1 is a Gaussian
+SMOOTHINGS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the marginal: 0 is the encoder's mixture, 1 a common mean
 CONSTANT = 1e-9  # a component that varies by less than this, relative to its size, is constant
 CUTOFF = 1e-9  # relative eigenvalue of the states' correlations below which a component is redundant
 LOG_2_PI = math.log(2 * math.pi)
@@ -38,16 +38,18 @@ class DensityCritic:
     r"""
     The critic :math:`F(x, \tilde x) = \log [r(\tilde x \mid x) / a(\tilde x) + 0.01]`, fitted without an optimiser.
 
-    For a Gaussian channel from the state to the TRVs, the optimal critic has this form.
+    Apart from the 0.01, the optimal critic has this form for a Gaussian channel from the state to the TRVs.
 
     - r is a Gaussian around a regression of the encoder's means on the state: a ridge regression plus a kernel ridge
       regression of its residuals. The covariance of r is that of the residuals plus the encoder's variance. The same
       kind of regression predicts the logarithm of the encoder's standard deviation.
-    - a is a smoothed mixture of the encoder's densities: every mean is moved towards the centre, and each density is
-      widened so that the covariance of the mixture stays the same. A smoothing of 0 gives the mixture itself, and 1
-      gives a Gaussian.
+    - a is a smoothed mixture of the encoder's densities: every mean is moved towards the mean of all of them, and each
+      density is widened so that the covariance of the mixture stays the same. A smoothing of 0 gives the mixture
+      itself. A smoothing of 1 gives all densities the same mean; if the encoder's variance is constant, the result is a
+      Gaussian.
 
-    The ridges and the smoothing minimise the leave-one-out error on the same episodes.
+    The ridges minimise the leave-one-out error of the regressions on these episodes, and the smoothing maximises the
+    leave-one-out log-density of their TRVs.
 
     :param train: The episodes to fit, with ``K >= 1`` draws each.
     """
@@ -199,7 +201,8 @@ def _choose_ridge(
     """
     Choose a ridge for each target by the leave-one-out error, which has a closed form.
 
-    :param basis: Orthonormal columns ``(n, R)``, with their squared singular values ``values``, ``(R,)``.
+    :param basis: Orthonormal columns ``(n, R)``.
+    :param values: Squared singular values of the inputs, or eigenvalues of the kernel matrix, ``(R,)``.
     :param otherwise: Leave-one-out residuals ``(n, Y)`` without this regression, which is one of the choices.
     :param leverage: Leverage of each episode in the fit of the mean that was subtracted from the targets.
     :param spare_before: If the targets are residuals of an earlier regression: ``1 - h``, ``(n, Y)``, with the leverage
@@ -222,7 +225,7 @@ def _choose_ridge(
 
 
 def whiten(noise: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return a map that whitens the noise and diagonalises the covariance, the diagonal, and the log-determinant."""
+    """Return a map that whitens the noise and diagonalises the covariance, the diagonal, and the map's log-det."""
     scale = 1 / np.sqrt(noise)
     values, vectors = np.linalg.eigh(covariance * scale[:, None] * scale)
     return vectors.T * scale, np.maximum(values, 0.0), float(np.log(scale).sum())

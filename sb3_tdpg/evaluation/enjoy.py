@@ -1,4 +1,4 @@
-"""Run some episodes of a saved policy, print their costs, and record them as a video."""
+"""Run some episodes of a saved policy, print their costs, and optionally record them as a video."""
 
 import contextlib
 import os
@@ -30,7 +30,7 @@ def enjoy(
     record: str | os.PathLike[str] | None = None,
 ) -> list[Episode]:
     """
-    Run episodes of a saved model and print the cost and the final state of each.
+    Run episodes of a saved model and print the cost of each, and its final state if the environment reports it.
 
     :param model_path: File written by ``model.save`` of TDPG, Stable-Baselines3 or sb3-contrib; see
         :func:`~sb3_tdpg.report.load_model`.
@@ -79,7 +79,7 @@ def enjoy(
 
 
 class _Recorder(gym.Wrapper):
-    """Keep an episode's pictures and exact costs, which a vectorised environment loses at its automatic reset."""
+    """Keep an episode's pictures (a vectorised environment loses the last one) and exact costs (it rounds them)."""
 
     def __init__(self, env: gym.Env, with_pictures: bool) -> None:
         super().__init__(env)

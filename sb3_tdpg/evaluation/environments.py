@@ -73,7 +73,7 @@ def load_statistics(path: Path, env: VecEnv, model: Any = None) -> VecNormalize:
 
     :param model: Model with stacked observations. They are stacked before the normalisation if the statistics have the
         shape of the stacked observations.
-    :raises ValueError: if the file is damaged.
+    :raises ValueError: if the file cannot be loaded or does not fit the environment.
     """
     try:
         normalize: VecNormalize = load_from_pkl(path)

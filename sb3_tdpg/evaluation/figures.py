@@ -83,7 +83,8 @@ def knowledge_map(frame: pd.DataFrame) -> Figure:
     """
     Draw the information in the TRVs about each component of the state at each time step, as a heat map.
 
-    Constant components are grey. Values in brackets have a lower confidence limit of 0.
+    A component is grey at steps at which it is constant or too few episodes are alive. Values in brackets have a lower
+    confidence limit of 0.
 
     :param frame: Result of :func:`~sb3_tdpg.evaluation.state_knowledge`.
     :raises ValueError: if the frame has no component.
@@ -158,7 +159,7 @@ def new_panels(
 
 
 def log_axis(axes: Axes, which: str, subs: tuple[float, ...]) -> None:
-    """Make an axis logarithmic, with the ticks (10, 30, 100, ...) as plain numbers."""
+    """Make an axis logarithmic, with ticks at ``subs`` times the powers of ten, as plain numbers."""
     axes.set(**{f"{which}scale": "log"})
     axis = getattr(axes, f"{which}axis")
     axis.set_major_locator(import_matplotlib().ticker.LogLocator(subs=subs))

@@ -97,7 +97,7 @@ def information_report(
     :param env: A ``VecEnv`` with any number of environments.
     :param n_episodes: Number of episodes N; if there are fewer environments, the episodes are run in rounds.
     :param seed: Seed of the episodes, of the policy's sampling and of the estimates.
-    :param at_end: Called at the end of each of the ``ESTIMATES``.
+    :param at_end: Called at the end of each part of the report (``ESTIMATES``).
     :raises ValueError: if model and environment do not fit, or there are too few episodes for an interval.
     """
     if not isinstance(model.policy, TRVPolicy):
@@ -133,9 +133,10 @@ def state_knowledge(batch: InformationBatch, names: Sequence[str] | None = None,
     :param batch: Rollouts ``(T, N, ...)``, for instance from :func:`~sb3_tdpg.evaluation.information.encode_episodes`.
     :param names: Names of the X components; default: ``x0``, ``x1``, ...
     :return: A row for each time step and component. The columns are ``t``, ``component``, ``nats`` (estimate of a lower
-        bound on I[x^k_t; x~_t]), ``nats_lower`` (95 % confidence limit of this bound) and ``r2`` (of a leave-one-out
-        regression of the component on the TRVs). The last three are clipped at 0. Values are NaN where a component is
-        constant and where too few episodes are alive. Components that are constant at all time steps are left out.
+        bound on I[x^k_t; x~_t]), ``nats_lower`` (lower 95 % confidence limit of this bound) and ``r2`` (of a
+        leave-one-out regression of the component on the TRVs). The last three are clipped at 0. Values are NaN where a
+        component is constant and where too few episodes are alive. Components that are constant at all time steps are
+        left out.
     """
     horizon, _, n_components = batch.states.shape
     names = [f"x{k}" for k in range(n_components)] if names is None else list(names)
@@ -189,8 +190,8 @@ def information_bounds(batch: InformationBatch) -> InformationBounds:
     """
     Return an upper and a lower bound on the information of a batch, summed over time.
 
-    A step with too few living episodes for an estimate counts as much as the last step with enough episodes. Policies
-    with many TRVs need more episodes for an estimate. If the step counted as 0, they would seem to have less
+    A step with living episodes, but too few for an estimate, counts as much as the last step with enough episodes.
+    Policies with many TRVs need more episodes for an estimate. If the step counted as 0, they would seem to have less
     information. The estimate of the lower bound can exceed that of the upper bound, because the TRVs are sampled. It is
     therefore clipped at the upper bound.
 
@@ -220,8 +221,8 @@ def _lower_bound(at_t: InformationBatch) -> float:
 
     With the mean m and the covariance C of the mixture of the N encoder densities, the difference of
     :math:`|(\tilde x_i - \mu_i) / \sigma_i|^2` and :math:`(\tilde x_i - m)^T C^{-1} (\tilde x_i - m)` has mean 0 given
-    the encoder's inputs. This difference is the control variate. If the mixture were Gaussian, the control variate
-    would remove all of the noise.
+    the encoder's inputs, on average over the episodes i. This difference is the control variate. If the mixture were
+    Gaussian, the control variate would remove all of the noise.
     """
     log_density = log_density_matrix(at_t)[0].double()
     own = log_density.diagonal() - log_density.logsumexp(dim=1) + math.log(len(log_density))  # (N,)

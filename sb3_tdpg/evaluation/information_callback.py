@@ -14,16 +14,18 @@ class InformationCallback(TDPGCallback):
     """
     Log a 95 % confidence interval of the information, in addition to the estimate that the policy is trained with.
 
-    The interval is computed from the epoch's rollouts, which were made with the current policy. The callback works
-    without the penalty and does not change the training. The keys ``mi/lower`` and ``mi/upper`` are the limits summed
-    over time. The keys ``mi/lower_t00``, ``mi/upper_t00``, ... are the limits of each time step (TensorBoard only). The
-    keys ``mi/knows_d``, ... are lower bounds of the information about each component of the state, averaged over the
-    time steps at which the component varies. The name of a component is that in the environment's ``state_names``,
-    without the unit, or ``x0``, ``x1``, ... The console does not show long keys.
+    The interval is computed from the epoch's rollouts, which were made with the current policy. The callback also
+    works without the penalty and does not change the training. The keys ``mi/lower`` and ``mi/upper`` are the limits
+    summed over time. The keys ``mi/lower_t00``, ``mi/upper_t00``, ... are the limits of each time step (TensorBoard
+    only). The keys ``mi/knows_d``, ... are estimated lower bounds on the information about each component of the state,
+    averaged over the time steps at which the component varies. The name of a component is that in the environment's
+    ``state_names``, without the unit, or ``x0``, ``x1``, ... The console does not show long keys.
 
     If the time steps share their weights, the interval uses one random step of each episode, since the steps of an
-    episode are not independent. Every episode then has the same weight. An epoch with too few episodes is skipped with
-    a warning.
+    episode are not independent. Every episode then has the same weight. The sums over time are the limits of this
+    sample times the mean number of steps of an episode, and the only keys of a time step are those with ``t00``.
+
+    An epoch with too few episodes is skipped with a warning.
 
     :param eval_freq: Number of epochs from one interval to the next, beginning with the first epoch.
     :raises ValueError: if ``eval_freq`` is below 1.

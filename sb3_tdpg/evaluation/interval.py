@@ -44,8 +44,8 @@ class InformationInterval:
     upper: np.ndarray
     """``(T,)``: upper confidence limits."""
     lower_name: tuple[str, ...]
-    """The bound that gives the lower limit of each step: ``"critic"`` or ``"gaussian"``, ``"zero"`` where both are
-    negative, ``""`` where there is no limit."""
+    """The bound that gives the lower limit of each step: ``"critic"`` or ``"gaussian"``, ``"zero"`` where
+    neither gives a positive limit, ``""`` where there is no limit."""
     upper_name: tuple[str, ...]
     """The bound that gives the upper limit of each step: ``"logdet"``, ``"loo"``, ``"marginal"`` or ``""``."""
     estimates: dict[str, np.ndarray]
@@ -75,11 +75,11 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
     r"""
     Divide the error probability between two limits, given the gap between their bounds.
 
-    The true value lies in the gap, and a limit that is far from the true value cannot miss it. In the worst case the
-    true value is at one end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits that
-    are c standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit gets
-    half of the probability. With a wide gap each limit gets the whole probability, because the true value can be close
-    to only one limit.
+    The true value lies in the gap, and a limit that is far from the true value hardly ever misses it. In the worst case
+    the true value is at one end of the gap, where :math:`\Phi(-c) + \Phi(-c - \text{gap}) = \text{miss}` for limits
+    that are c standard errors from their bounds (Imbens and Manski, 2004, Econometrica 72(6)). Without a gap each limit
+    gets half of the probability. With a wide gap each limit gets the whole probability, because the true value can be
+    close to only one limit.
 
     :param miss: Probability that either limit misses the true value.
     :param gap: Upper minus lower estimate, in standard errors; negative values and NaN count as 0.
@@ -98,11 +98,13 @@ def miss_of_each_limit(miss: float, gap: float) -> float:
 
 def joint_quantile(miss: float, correlations: Sequence[float]) -> float:
     r"""
-    Return how many standard errors any of several correlated Gaussians exceeds with a probability of at most ``miss``.
+    Return a common upper limit c for several correlated Gaussians, in standard errors.
 
-    Hunter's inequality (1976, Journal of Applied Probability 13(3)) gives the following upper bound: the sum of the
-    probabilities that each Gaussian exceeds this limit, minus the probabilities that the first Gaussian and each other
-    Gaussian exceed it together. With Owen's function T, the bound for c standard errors is
+    The probability that at least one of the Gaussians exceeds c is at most ``miss``. Hunter's inequality (1976, Journal
+    of Applied Probability 13(3)) bounds this probability from above: by the sum of the probabilities that each Gaussian
+    exceeds c, minus the probabilities that the first Gaussian and each other Gaussian exceed c together.
+    ``correlations`` are those of the first Gaussian with the others. With Owen's function T, the upper bound on the
+    probability is
     :math:`\Phi(-c) + 2 \sum_k T(c, \sqrt{(1 - \rho_k) / (1 + \rho_k)})`. Fully correlated Gaussians give the quantile
     of a single Gaussian, and independent Gaussians give about Bonferroni's quantile. ``miss`` must be below 0.5.
     """
@@ -160,13 +162,14 @@ def information_interval(batch: InformationBatch, *, seed: int = 0) -> Informati
 
     .. math:: I[x_t; \tilde x_t] \ge E[F(x, \tilde x)] - \log E_\perp[e^{F(x, \tilde x)}],
 
-    which holds for any F that is independent of the samples. Critics are fitted to some of the episodes and evaluated
-    on the others. Of two kinds of critics, the larger bound counts:
+    which holds for any F that is independent of the samples; x and x~ are independent in the second expectation.
+    Critics are fitted to some of the episodes and evaluated on the others. Of two kinds of critics, the one with the
+    higher limit counts:
 
     - ``"critic"``: :class:`~sb3_tdpg.evaluation.density_critic.DensityCritic`, fitted to halves of the episodes;
     - ``"gaussian"``: :class:`~sb3_tdpg.evaluation.density_critic.GaussianCritic`, fitted to most of the episodes.
 
-    **Upper limits** come from the smallest of three bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
+    **Upper limits** are the lowest of the limits of three upper bounds on I[e_t; x~_t] >= I[x_t; x~_t], where
     e_t = (x~_{t-1}, y_t) is the input of the encoder with density q:
 
     - ``"logdet"``: :class:`~sb3_tdpg.information.logdet.LogDet`, with its bias removed by the jackknife;
@@ -208,7 +211,7 @@ def component_estimates(batch: InformationBatch, *, seed: int = 0) -> tuple[np.n
 
     The bound is the larger of the two lower bounds of :func:`information_interval`, with one component in place of the
     state. If the TRVs depend on several components, their density given one component has a complicated shape, and the
-    Gaussian critic gives the better bound.
+    Gaussian critic can give the better bound.
 
     :param batch: As in :func:`information_interval`.
     :param seed: Seed of the division of the episodes and of the noise.

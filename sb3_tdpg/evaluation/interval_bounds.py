@@ -1,7 +1,7 @@
 """
 Estimate the bounds that give the limits of an information interval at one time step, with their standard errors.
 
-Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode.
+Dimension key: n episodes, X state, Z TRVs, K draws of the TRVs for each episode, C control variates.
 """
 
 from __future__ import annotations
@@ -112,10 +112,10 @@ class FreshPairs:
 
 def critic_bounds(step: Encoded, rng: np.random.Generator) -> tuple[Estimate, Estimate]:
     """
-    Fit critics to halves of the episodes and evaluate them on the other halves, averaged over several divisions.
+    Fit critics to halves of the episodes and evaluate them on the other halves, averaged over one or three divisions.
 
     One division into halves misses all pairs of episodes from different halves. Three divisions, each of which combines
-    quarters of the episodes to halves, cover all pairs.
+    quarters of the episodes to halves, cover all pairs. More than 300 episodes are divided only once.
 
     :return: the lower bound of the critic and the upper bound of its marginal density
     """
@@ -159,7 +159,7 @@ def donsker_varadhan(joint: np.ndarray, ratios: np.ndarray, n_pairs: int, log_cl
     Compute the Donsker-Varadhan bound from the scores.
 
     With several critics, e^F is averaged over all of them before the logarithm. By Jensen's inequality the result is
-    still a lower bound, and its mean is estimated from more pairs. The mean of e^F is at least that of ``MIN_HITS``
+    still a lower bound, and the mean of e^F is estimated from more pairs. This mean is at least that of ``MIN_HITS``
     clipped pairs, so that the bound stays finite if no episode's TRVs fit the state of another.
 
     :param joint: F of the TRVs of each episode with its own state, ``(n,)``.
@@ -193,7 +193,7 @@ def _marginal_gaps(step: Encoded, log_marginal: np.ndarray) -> np.ndarray:
 
 
 def log_det_bound(step: Encoded) -> Estimate:
-    """Compute the log-det bound from a Gaussian of the same covariance; the jackknife removes the 1/n bias."""
+    """Compute the log-det bound from a Gaussian with the covariance of the TRVs; the jackknife removes the 1/n bias."""
     n, dim = step.means.shape
     variances, log_stds = np.square(step.stds), np.log(step.stds).sum(axis=1)
     scale = np.sqrt(variances.mean(axis=0))

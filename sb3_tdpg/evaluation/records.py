@@ -41,13 +41,14 @@ def evaluate_scenarios(
 
     The frame has one row for each model, scenario and episode, in this order. The columns are ``model``, ``scenario``,
     ``env_id``, ``episode``, ``cost`` (the negative return), ``length`` (steps), ``final_*``, ``seed`` and
-    ``deterministic``. Every number in the last ``info`` has a column ``final_*``; the components of an array are
-    ``final_state_0``, ... If the environment reports ``info["is_success"]``, there is also a column ``failure``.
+    ``deterministic``. Every number in the last ``info`` has a column ``final_*``; the components of an array of
+    at most 32 numbers are ``final_state_0``, ... If the environment reports ``info["is_success"]``, there is also a
+    column ``failure``.
 
-    The same seed gives the same frame. In a scenario all models start from the same initial states. If the number of
-    random numbers that the environment draws does not depend on the actions, the models also meet the same noise, and
-    all scenarios of one environment share their initial states and noise. The global random generators are restored at
-    the end.
+    The same seed gives the same frame. In a scenario the first episode in each of the parallel environments has the
+    same initial state for all models. If the number of random numbers that the environment draws does not depend on the
+    actions, all models meet the same initial states and noise, and all scenarios of one environment share them. The
+    global random generators are restored at the end.
 
     :param model: One SB3 model, or a mapping from labels to models.
     :param scenarios: The scenarios to run, in the order of the rows.

@@ -1,5 +1,5 @@
 """
-Run a policy for whole episodes, step by step; all code after the training uses this loop.
+Run a policy for whole episodes, step by step; evaluations, reports and videos use this loop.
 
 Dimension key: E environments, X state, Z TRVs, ``*obs`` and ``*action`` as in the spaces.
 """
@@ -51,9 +51,9 @@ def rollout(
     """
     Run a policy and yield every step.
 
-    As in SB3's ``evaluate_policy``, each environment has a quota of episodes, because the first N episodes that finish
-    would be mostly short episodes. After its quota an environment continues to run, and the policy's memory is cleared
-    at every step. Only steps with ``finished`` end an episode that counts.
+    As in SB3's ``evaluate_policy``, each environment has a quota of episodes, because the first episodes that finish
+    would include too many short ones. After its quota an environment continues to run, and the policy's memory is
+    cleared at every step. Only steps with ``finished`` end an episode that counts.
 
     With ``seeds`` the rollout uses the global random generators until it ends, so do not draw from them in the body of
     the loop. The generators are restored when the loop ends, also by ``break`` or an exception.

@@ -67,7 +67,7 @@ def paired_difference(records_by_seed: pd.DataFrame, model: str, control: str) -
     """
     Estimate the mean over seeds of the cost of one method minus the cost of another method with the same seed.
 
-    Pairing removes the differences between seeds if both methods start from the same policy and run the same episodes.
+    Pairing removes the effects that a seed has equally on both methods, through the initial policy or the episodes.
 
     :param control: Label of the method to compare with; it must have the same seeds.
     :return: the mean difference over seeds, which is negative if ``model`` costs less, and the ends of its 95 %

@@ -57,8 +57,8 @@ def comparison_markdown(
     :param scenarios: The rows, in this order. The paper's numbers are shown for models whose label is a key of
         ``scenario.paper``.
     :param quantity: Name of the compared quantity, for the line below the table.
-    :return: the table, and a line on how it was made; our lowest number and the paper's lowest number of each row are
-        bold
+    :return: the table, and a line on how it was made; if there are several models, our lowest number and the paper's
+        lowest number of each row are bold
     """
     over_seeds = "iqm" in summary.columns
     if summary.duplicated(["model", "scenario"]).any():
