@@ -8,8 +8,8 @@ Donsker-Varadhan formula gives
     \mathbb E_{\check p}[c] \le \rho_\beta[c] + \tfrac1\beta \mathbb D[\check p \,\|\, p], \qquad
     \rho_\beta[c] = \tfrac1\beta \log \mathbb E_p\, e^{\beta c}.
 
-The right-hand side needs only costs under p. The bound corrects the paper's Theorem II.1. The derivation is in
-``docs/guide/certificate.md``.
+Apart from the divergence, the right-hand side needs only costs under p. The bound corrects the paper's Theorem II.1.
+The derivation is in ``docs/guide/certificate.md``.
 
 Dimension key: N episodes, M points of a distribution.
 """
@@ -42,7 +42,9 @@ class CostDistribution(NamedTuple):
 
     def capped(self, level: float) -> tuple[CostDistribution, float]:
         """
-        Cap the cost at the lowest value of the sample that it exceeds with a probability of at most ``level``, if any.
+        Cap the cost at the lowest value of the sample that it exceeds with a probability of at most ``level``.
+
+        If there is no such value, the cap is the highest value of the sample.
 
         :return: the distribution of the capped cost, and the probability of a cost above the cap
         """
@@ -81,11 +83,11 @@ def cost_distribution(costs: np.ndarray, cost_bound: float, confidence: float = 
     Bound the distribution of the cost from above by a confidence band around a sample of costs.
 
     Let F be the distribution function of the cost. At the i-th lowest of N costs, :math:`F(c_{(i)})` is stochastically
-    above a Beta(i, N + 1 - i) variable. Its lower quantiles at the level ``1 - confidence`` divided by the number of
-    used ranks hold simultaneously (Bonferroni). The step function through these quantiles is a lower bound on F. The
-    band leaves a probability of about ``log(400 / (1 - confidence)) / N`` above the highest cost, and assigns it to
-    ``cost_bound``. The number of used ranks is about 400 for a million costs. The band bounds the mean of every
-    increasing function simultaneously, so the entropic risk may be optimised over beta.
+    above a Beta(i, N + 1 - i) variable. With R used ranks, the lower quantiles of these variables at the level
+    ``(1 - confidence) / R`` are lower bounds on F that hold simultaneously (Bonferroni). The step function through
+    these quantiles is a lower bound on F. The band leaves a probability of about ``log(R / (1 - confidence)) / N``
+    above the highest cost, and assigns it to ``cost_bound``. R is about 400 for a million costs. The band bounds the
+    mean of every increasing function simultaneously, so the entropic risk may be optimised over beta.
 
     :param costs: Costs of independent episodes with the same distribution, ``(N,)``.
     :param cost_bound: Upper bound on the episode cost.
@@ -115,11 +117,11 @@ def check_allowance(confidence: float, cost_bound: float) -> None:
 
 def worst_mean(distribution: CostDistribution, kl: float) -> float:
     r"""
-    Bound the mean under any distribution within ``kl`` nats: the minimum of ``entropic_risk + kl / beta`` over beta.
+    Bound the mean under any distribution within ``kl`` nats of the given distribution.
 
-    As a function of :math:`s = 1 / \beta`, the bound is convex (the perspective of a convex function plus a linear
-    function), so a local search finds the minimum. Every beta gives a valid bound. Some distribution within ``kl`` nats
-    attains the minimum.
+    The bound is the minimum of ``entropic_risk + kl / beta`` over beta. As a function of :math:`s = 1 / \beta`, the
+    bound is convex (the perspective of a convex function plus a linear function), so a local search finds the minimum.
+    Every beta gives a valid bound. Some distribution within ``kl`` nats attains the minimum.
 
     :param kl: D[shifted || training] in nats, or an upper bound on it; inf gives the largest cost.
     """

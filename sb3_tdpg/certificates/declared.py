@@ -46,14 +46,14 @@ def certify_nuisance(
     Certify policies under a declared nuisance, and compare the bounds with the measured costs.
 
     In the first row of a model in ``nuisance.csv``, each episode has its own random member of the nuisance. In every
-    other row, all episodes have the same random member.
+    other row, all episodes have one random member in common.
 
     :param models: Files that ``model.save()`` wrote.
     :param env_id: Id of the training environment, which must be one of this package.
     :param declared: The nuisance, declared as for :class:`~sb3_tdpg.robustness.families.Family`.
     :param out: Folder for ``summary.md``, ``nuisance.csv`` and ``config.json``.
     :param cost_bound: Upper bound on the cost of an episode; the certified cost is clipped there. Default for Lava: the
-        cost of standing at the wall.
+        cost of standing at the wall for a whole episode.
     :param env_kwargs: Keywords of the training environment.
     :param n_episodes: Number of training episodes for the distribution of the cost.
     :param n_budget_episodes: Number of further training episodes, in which each member perturbs the observations; at
@@ -117,7 +117,7 @@ def _compare(episodes: TrainingEpisodes, shift: Shift, n_test_episodes: int, cos
 
 
 def nuisance_table(records: pd.DataFrame, trivial: float) -> str:
-    """Count the members whose cost exceeds the bound, and summarise how wide the bounds are."""
+    """Count the members whose cost exceeds the bound, and summarise how far the bounds are above the costs."""
     rows = []
     for label, group in records.groupby("model", sort=False):
         family, members = group[group["shift"] == FAMILY].iloc[0], group[group["shift"] != FAMILY]

@@ -69,7 +69,7 @@ class ShiftCertificate(NamedTuple):
 
     bound: float  #: the lower of the following two
     through_trvs: float  #: from the divergence of the TRVs
-    through_sensor: float  #: from the divergence of the sensor, which holds for every policy
+    through_sensor: float  #: from the divergence of the sensor, which is the same for every policy
     budget: Budget  #: divergence of the TRVs for ``through_trvs``
 
 
@@ -125,7 +125,7 @@ class TrainingEpisodes:
 
     def divergences(self, shift: Shift) -> np.ndarray:
         """
-        Compute the divergence at each step of the recorded episodes, given the noise that couples the sensors.
+        Compute the divergence at each step of the recorded episodes, given the sensor noise that both sensors share.
 
         :return: ``(T + 1, N)``: for each step D[q(. | x~_{t-1}, shifted y_t) || q(. | x~_{t-1}, y_t)] of the TRVs in
             nats, and in the last row the divergence of the last actions
@@ -164,7 +164,7 @@ class TrainingEpisodes:
         return ShiftCertificate(min(through_trvs, through_sensor), through_trvs, through_sensor, budget)
 
     def measure(self, shift: Shift, n_episodes: int = 2000, *, seed: int = 1) -> tuple[np.ndarray, float]:
-        """Run shifted episodes; return their costs, ``(N,)``, and their mean divergence, which a budget bounds."""
+        """Run shifted episodes; return their costs, ``(N,)``, and their mean divergence, summed over the steps."""
         shifted = record_episodes(self.model, self._shifted(shift), n_episodes, (seed, _TEST))
         by_step = _divergences(shifted.densities, encode(self.model, self._env, shifted)).mean(axis=1)
         return shifted.costs, shift.start_kl + float(by_step[:-2].sum() + by_step[-2:].min())

@@ -101,7 +101,7 @@ class Members:
 
 
 class Perturber(Members):
-    """Apply a perturbation, which must be applicable to the sensor's space, to batches of observations."""
+    """Apply a perturbation, which must be applicable to the sensor's space, to batches of observations or actions."""
 
     def __init__(
         self,

@@ -1,5 +1,5 @@
 """
-Define all perturbations. Each is a function of a batch of observations, actions or times.
+Define the perturbations with severities. Each is a function of a batch of observations, actions or times.
 
 The decorator ``@perturbation`` adds them to the registry. Two perturbations reuse the function of another one, and are
 added by a direct call.
@@ -215,7 +215,7 @@ def lag(t: np.ndarray, longest: float, episode: Episode, rng: np.random.Generato
 
 @perturbation(
     "any", "steps", (1, 2, 4, 8, 16), timing=True,
-    # The burst ends before the horizon if it is short enough.
+    # The blackout ends before the horizon if it is short enough.
     draw=lambda rng, n, steps, sensor: dict(start=rng.integers(1, max(1, sensor.horizon - int(steps)) + 1, n)),
 )  # fmt: skip
 def blackout(t: np.ndarray, steps: float, episode: Episode, rng: np.random.Generator) -> np.ndarray:

@@ -30,6 +30,7 @@ class Family:
     A declaration is one of the following:
 
     - a name in :data:`~sb3_tdpg.robustness.PERTURBATIONS`, or a :class:`~sb3_tdpg.robustness.Perturbation`;
+    - ``"images"`` or ``"noise_range"``, with the default keywords;
     - a dict with the keys below;
     - a list of entries, each ``(name, value)`` with a value as in a dict, ``(name, value, factor)`` with a factor for
       the scale, or ``None`` for no perturbation;

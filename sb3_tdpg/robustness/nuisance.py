@@ -40,7 +40,9 @@ def with_nuisance(env: VecEnv, declared: Any) -> VecEnv:
 
 def held_family(declared: Any, env: gym.Env | VecEnv) -> Family:
     """
-    Return the family of a declared nuisance of the sensor. With ``"auto"``, each episode keeps its changes.
+    Return the family of a declared nuisance of the sensor.
+
+    With ``"auto"`` for images of bytes, each episode keeps its changes, except for the noise.
 
     :raises ValueError: if there is no nuisance, or it changes the actions.
     """
@@ -57,7 +59,7 @@ def automatic(declared: Any, space: spaces.Space, **keywords: Any) -> Any:
     """
     Replace ``"auto"`` by random changes for images of bytes, or by noise and dropped pixels for depth images.
 
-    For vectors, and for depth images without bounds, the result is ``None``.
+    For all other observations, such as vectors, the result is ``None``. Any other declaration is returned as it is.
 
     :param keywords: Keywords of :func:`~sb3_tdpg.robustness.training.images`.
     """

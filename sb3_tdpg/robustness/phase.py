@@ -59,11 +59,11 @@ class NuisancePhase(TDPGCallback):
     In the list of callbacks of ``learn``, put this callback before a :class:`~sb3_tdpg.TrainingCheckpointCallback`. If
     a training is resumed, the optimiser of the phase starts anew.
 
-    :param nuisance: ``"auto"`` for random changes of images of bytes, which each episode keeps, or a declaration of a
-        :class:`~sb3_tdpg.robustness.families.Family`.
+    :param nuisance: ``"auto"`` for random changes of images of bytes (which each episode keeps, except for the noise)
+        or of depth images, or a declaration of a :class:`~sb3_tdpg.robustness.families.Family`.
     :param n_steps: Number of gradient steps per phase.
-    :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed or normalised
-        (``VecNormalize``).
+    :raises ValueError: if a perturbation does not exist or does not apply, or the rollouts are perturbed by TDPG's
+        ``nuisance`` or normalised (``VecNormalize``).
     """
 
     optimizer: th.optim.Optimizer

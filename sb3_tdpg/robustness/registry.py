@@ -45,7 +45,8 @@ class Perturbation:
     :param summary: The effect in a few words.
     :param channels: Permitted numbers of image channels. ``None`` permits any number.
     :param on_depth: Whether the perturbation makes sense on depth images, which have one channel of floats.
-    :param timing: Whether ``apply`` decides which observation is shown. It must show the first one of an episode.
+    :param timing: Whether ``apply`` decides which observation is shown, or which action is applied. It must show the
+        first observation of an episode.
     :raises ValueError: if the kind is unknown, or there are not five severities.
     """
 

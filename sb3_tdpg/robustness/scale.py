@@ -32,7 +32,7 @@ def observation_scale(env: VecEnv | gym.Env, model: Any = None) -> Any:
     that waits for the first reset, are restored, so the next episodes are the same as without the rollout.
 
     :param model: SB3 model that acts. With ``None``, the actions are clipped standard Gaussian, like those of an
-        untrained policy.
+        untrained policy; in a space that is not a ``Box`` they are its samples.
     :return: The standard deviations in the shape of the observation space, float64. For a ``Dict``, a dict of the
         standard deviations of each vector.
     """

@@ -16,7 +16,7 @@ VAST = 1e6  # bounds further apart count as infinite: some environments use the 
 
 
 def finite_range(space: spaces.Box) -> np.ndarray:
-    """Return the distance between the bounds of each component, in the space's shape; inf for missing bounds."""
+    """Return the distance between the bounds of each component, in the space's shape; inf if it is above 1e6."""
     with np.errstate(over="ignore", invalid="ignore"):
         distance = space.high.astype(np.float64) - space.low.astype(np.float64)
     return np.where(distance <= VAST, distance, np.inf)

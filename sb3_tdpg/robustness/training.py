@@ -14,9 +14,9 @@ from torch.nn.functional import interpolate
 from sb3_tdpg.robustness.registry import N_SEVERITIES, Episode, Perturbation
 from sb3_tdpg.robustness.sensor import Sensor
 
-PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # cells per side of the random patterns
+PATTERN_SIZES = (2, 4, 8, 16, 32, 64)  # rows and columns of coloured cells in the random patterns
 
-PATTERN_GROUP = 16  # number of images whose patterns have cells of one size
+PATTERN_GROUP = 16  # number of images whose patterns have equally many cells
 
 
 def images(
@@ -33,16 +33,17 @@ def images(
 
     1. colour: the channels are mixed, :math:`y \leftarrow M y`, where M is :math:`I + \mathtt{color} \cdot` a standard
        normal matrix. Each row of M is divided by its sum, or by 0.3 if the sum is smaller;
-    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random coloured pattern p. The pattern has 2 to 64 cells per
-       side, with sharp or smooth edges. Groups of 16 images have the same number of cells and the same kind of edges.
-       The opacity a is 0 with a probability of 0.3, and otherwise uniform up to ``pattern``. In one rectangle, a is 1;
-       the rectangle's sides are uniform up to ``patch`` times the image's sides;
-    3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that keeps y in
-       [0, 1];
+    2. pattern: :math:`y \leftarrow (1 - a) y + a p` with a random pattern p. The pattern is a grid of cells of random
+       colours, with 2, 4, 8, 16, 32 or 64 rows and as many columns, and sharp or smooth edges. Groups of 16 images have
+       the same number of cells and the same kind of edges. The opacity a is 0 with a probability of 0.3, and otherwise
+       uniform up to ``pattern``. In one rectangle, a is 1; the rectangle's sides are uniform up to ``patch`` times the
+       image's sides;
+    3. contrast: :math:`y \leftarrow s y + o` with s uniform in ``[1 - contrast, 1]`` and an offset o that is uniform in
+       ``[0, 1 - s]``;
     4. noise: Gaussian noise at every pixel, with a standard deviation that is uniform up to ``noise``.
 
-    The information bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"``) bound the information
-    about everything in the image, so they also count the information about these changes.
+    The information bounds that use the encoder's density (``"logdet"``, ``"loo"``, ``"vib"`` and the directed ones)
+    bound the information about everything in the image, so they also count the information about these changes.
 
     :param held: Whether an episode keeps the changes that were drawn at its beginning, except for the noise. Otherwise
         every image has its own changes.
@@ -90,7 +91,7 @@ def images(
 
 
 def patterns(rng: np.random.Generator, n: int, channels: int, height: int, width: int) -> np.ndarray:
-    """Draw random coloured cells: ``(n, C, H, W)``."""
+    """Draw random patterns of coloured cells: ``(n, C, H, W)``."""
     result = np.empty((n, channels, height, width), np.float32)
     for start in range(0, n, PATTERN_GROUP):
         group = result[start : start + PATTERN_GROUP]
