@@ -1,1 +1,1 @@
-"""Export one step of a policy to a file that a robot can run without this package and without PyTorch."""
+"""Export one step of a policy to a file that a robot can run without this package and, with ONNX, without PyTorch."""

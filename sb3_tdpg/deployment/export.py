@@ -181,12 +181,12 @@ def export_policy(
     Write one step of a policy to a file.
 
     :param policy: The policy.
-    :param path: The file. If it exists, it is replaced when the new file is complete.
+    :param path: The file; a missing suffix is added. If the file exists, it is replaced when the new file is complete.
     :param format: ``"onnx"`` (needs the extra ``export``) or ``"torchscript"``. By default the suffix of ``path``,
         ``.onnx`` or ``.pt``, determines the format.
     :param normalization: The statistics with which ``VecNormalize`` standardised the observations in training.
     :return: The file.
-    :raises ValueError: if the format is unknown.
+    :raises ValueError: if the format is unknown, or the statistics are those of observations before their stacking.
     :raises ImportError: if the packages for ONNX are missing.
     """
     path = Path(path)
@@ -223,7 +223,10 @@ def export_model(
     model: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, format: str | None = None
 ) -> Path:
     """
-    Write one step of a saved TDPG model to a file; use the ``vecnormalize.pkl`` in the model's folder, if there is one.
+    Write one step of a saved TDPG model to a file.
+
+    If statistics of observations lie beside the model (``vecnormalize.pkl`` or ``vec_normalize.pkl``), the file
+    contains them.
 
     :param model: File written by ``model.save``. It is unpickled, which can run any code.
     :param out: The file to write. By default it has the folder and the name of the model.

@@ -99,7 +99,7 @@ class RayVecEnv(VecEnv):
 
     If Ray is not initialised (``ray.init``), this class joins the cluster that the environment variable ``RAY_ADDRESS``
     names. Without this variable, it starts Ray on this machine, and ends Ray when the last ``RayVecEnv`` is closed.
-    Every machine of a cluster needs this package. In a cluster, each actor reserves one CPU.
+    Every machine of a cluster needs this package. Unless this class starts Ray, each actor reserves one CPU.
 
     An exception of an environment is raised unchanged. If an actor dies (killed, crashed, machine lost), the next call
     raises :class:`DeadActorError`. With ``max_restarts`` above 0, Ray restarts the actor instead, and the actor makes
@@ -239,7 +239,7 @@ class RayVecEnv(VecEnv):
         return self._join(parts)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Send to each actor the actions of its environments; ``actions`` has the shape ``(N, U)``."""
+        """Send to each actor the actions of its environments; ``actions`` has a row for each environment."""
         if len(actions) != self.num_envs:
             raise ValueError(f"{len(actions)} actions were given: {self.num_envs} environments need as many")
         self._replies = [self._send(i, "step", actions[share]) for i, share in enumerate(self._shares)]

@@ -114,8 +114,8 @@ def read_zoo_folder(folder: Path, n_eval_episodes: int) -> Publication:
     """
     Read a folder that rl-zoo3's ``train`` wrote (``logs/tdpg/<environment>_<number>``), and evaluate its policy.
 
-    The scenarios are the training environment and, if the paper has a table for it, the test rows of this table. The
-    test rows keep the keywords of the training environment that they do not replace.
+    The scenarios are the training environment and, if the paper has a table for it, the rows of this table except the
+    first (the training). These rows keep the keywords of the training environment that they do not replace.
 
     :param n_eval_episodes: Number of episodes of each scenario.
     """

@@ -41,8 +41,8 @@ def write_model_card(
     Write a folder with a model, its card and its records, ready for :func:`push_to_hub`.
 
     The folder has the files of a Stable-Baselines3 model on the Hub (``results.json`` is for the training environment),
-    and also ``episodes.csv`` and ``training.png``. It appears only when all its files are complete.
-    If you add a video ``replay.mp4`` (``sb3-tdpg enjoy --record``), the Hub plays it beside the card.
+    and also ``episodes.csv`` and, if there is a training log, ``training.png``. It appears only when all its files are
+    complete. If you add a video ``replay.mp4`` (``sb3-tdpg enjoy --record``), the Hub plays it beside the card.
 
     :param source: The folder of a run, or a folder of rl-zoo3 (whose policy is evaluated now).
     :param out: The folder to write, which must not exist yet.
@@ -124,7 +124,7 @@ def load_from_hub(
     :param trust_remote_code: Whether to unpickle the download, which can run any code. Default: whether the
         environment variable ``TRUST_REMOTE_CODE`` is set, as in ``huggingface_sb3``.
     :param kwargs: See :meth:`TDPG.load <sb3_tdpg.TDPG.load>`.
-    :raises ValueError: if ``trust_remote_code`` is not true, or if the repository has no such TDPG model.
+    :raises ValueError: if ``trust_remote_code`` is not true, or if the repository cannot be read or has no such model.
     """
     if trust_remote_code is None:
         trust_remote_code = os.environ.get("TRUST_REMOTE_CODE", "").lower() in ("1", "true", "yes", "y", "on", "t")

@@ -38,7 +38,7 @@ from sb3_tdpg.tdpg import TDPG
 FIRST_SEED = 310
 WALLS = range(500, 600)
 N_EPISODES, N_WALL_EPISODES = 200, 20  # number of episodes of each row, and in front of each wall
-N_CONTROLS = 5  # number of training seeds of the ablations and of the variants of PPO
+N_CONTROLS = 5  # number of training seeds of the ablations, of PPO and of RecurrentPPO with our encoder
 
 COLUMNS = ["model", "train_seed", "scenario", "renderer", "episode", "cost", "distance", "seed", "deterministic"]
 NOISE_ROWS = tuple(row.name for row in BALL_CATCH[1:5])
@@ -84,7 +84,7 @@ EARLIER_ENCODER = dict(
 
 
 def methods(launch: str) -> tuple[Method, ...]:
-    """List TDPG with its defaults, its variants (a label names the change) and baselines, all with as many steps."""
+    """List TDPG with its defaults, its variants (a label names the change) and baselines, with equally many steps."""
     env_kwargs = dict(LAUNCHES[launch])  # a mapping proxy cannot be sent to another process
 
     def method(label: str, renderer: str = "fast", **overrides: Any) -> Method:

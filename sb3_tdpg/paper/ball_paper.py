@@ -1,4 +1,4 @@
-"""Reproduce Table II with the paper's own algorithm, and compare TDPG with policy gradient that is trained longer."""
+"""Reproduce Table II with the paper's own algorithm, and compare TDPG with policy gradient stopped at three costs."""
 
 import math
 from collections.abc import Mapping
@@ -56,8 +56,8 @@ def methods() -> tuple[Method, ...]:
     """
     List policy gradient for each level of the cost (:data:`LEVELS`), and TDPG for each price (:data:`PRICES`).
 
-    Policy gradient starts from its own policy at the previous, higher level. TDPG starts from each policy of policy
-    gradient whose level is at least the paper's.
+    Except for the first level, policy gradient starts from its own policy at the previous, higher level. TDPG starts
+    from each policy of policy gradient whose level is at least that of the paper (:data:`PAPERS_LEVEL`).
     """
     found: list[Method] = []
     start = None

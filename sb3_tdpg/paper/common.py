@@ -119,7 +119,8 @@ def training_times(tasks: Iterable[Task]) -> pd.DataFrame:
 
 def methods_table(records: pd.DataFrame, rows: Sequence[str], times: pd.DataFrame) -> str:
     """
-    Make a table with a row for each method: its cost in each scenario, and its median training time.
+    Make a table with a row for each method: the interquartile mean of its cost in each scenario, and the median of its
+    training time.
 
     :param times: From :func:`training_times`.
     """

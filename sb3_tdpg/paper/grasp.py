@@ -58,7 +58,7 @@ def reproduce_grasp(out: Path, *, camera: str = "fixed", n_seeds: int = 5, **opt
 
     :param out: Folder for ``summary.md``, ``seeds.csv``, ``episodes.csv.xz``, figures, ``config.json`` and ``runs/``.
     :param camera: Height of the camera: ``"fixed"`` as in Table III, or ``"varying"``, which the paper does not have.
-    :param n_seeds: Number of training seeds of each method.
+    :param n_seeds: Number of training seeds of each method, but at most two for PG without the nuisance.
     :param options: See :class:`~sb3_tdpg.paper.common.Options`.
     :return: the summary, as Markdown
     """

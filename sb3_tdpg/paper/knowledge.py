@@ -77,8 +77,8 @@ def grasp_knowledge(batch: InformationBatch) -> dict[str, float]:
     Regress the mug's pose on the TRVs of a grasping policy.
 
     For half of the mugs, each quantity is regressed on the TRVs, their squares and their products. R^2 is computed on
-    the other half. R^2 is too low by about the number of regressors (152 for 16 TRVs) divided by half the number of
-    mugs.
+    the other half. R^2 is too low by at most about the number of regressors (152 for 16 TRVs) divided by half the
+    number of mugs.
 
     :param batch: From :func:`encode_mugs`, with an even number of mugs.
     :return: R^2, clipped at 0, of ``"x"``, ``"y"`` and ``"yaw"`` (its sine and cosine together), and of ``"camera"``

@@ -26,7 +26,7 @@ from sb3_tdpg.paper.plots import cost_histograms, lava_trajectories
 from sb3_tdpg.tdpg import TDPG
 
 READINGS = ("table", "text")
-"""Cost definitions of the lava problem: the one that fits Table I, and the one in the text of the paper."""
+"""Cost definitions of the lava problem: the one that fits Table I better, and the one in the text of the paper."""
 
 # The block of hyperparams/tdpg.yml for each method. With the cost definition of the table it has the suffix "-table".
 METHODS = {"PG": "Lava-v0-pg", "TDPG": "Lava-v0", "TDPG (log-det)": "Lava-v0-logdet"}
@@ -88,7 +88,7 @@ def demo(
     """
     Train PG and TDPG on the lava problem, compare them on the rows of Table I, and draw figures.
 
-    The other parameters are those of :class:`~sb3_tdpg.paper.common.Options`.
+    ``seed`` is the training seed, and the other parameters are those of :class:`~sb3_tdpg.paper.common.Options`.
 
     :param out: Folder for ``episodes.csv``, ``table.md``, ``histograms.png``, ``trajectories.png``, ``training.png``,
         ``config.json`` and the runs with their models.
@@ -162,7 +162,7 @@ def reproduce_lava(out: Path, *, n_seeds: int = 10, n_paper_seeds: int = 3, **op
 
 
 def _seed_table(records: pd.DataFrame) -> pd.DataFrame:
-    """Return mean and standard deviation in training, and the ratio of the noisiest row, for each method and seed."""
+    """Return mean and standard deviation of the cost in training and the noisiest row's ratio, by method and seed."""
     summary = add_ratio(summary_table(records))
     keys = ["model", "train_seed"]
     training = summary[summary["scenario"] == LAVA[0].name].set_index(keys)[["mean", "std"]]

@@ -65,8 +65,8 @@ class Problem:
     A task and its faults, which TDPG's training does not declare.
 
     :param block: Name of the task's block, which is the same in each algorithm's file in ``hyperparams/``.
-    :param scale: The size of one unit of the faults for each component of the observation. A component with 0 never has
-        a fault.
+    :param scale: The size of one unit of the faults for each component of the observation. Noise, bias, scale and
+        dropout do not change a component with 0.
     :param faults: Faults of the sensor and of the actuator.
     :param plant: Changes of the plant: keywords of the environment by the name of the change.
     :param goals: Upper limits of TDPG's interquartile mean over seeds, by row.
@@ -178,7 +178,7 @@ PROBLEMS: Mapping[str, Problem] = {
         block="SqueezeInsert-v0-cue",
         scale=(1.0, 1.0, 0.0),
         env_kwargs=dict(cue=True),
-        faults=_NO_BLACKOUT,  # the cue never has a fault
+        faults=_NO_BLACKOUT,  # a blackout would hide the cue in every episode
         plant=_TURNS,
         goals={MEAN: 12.0},
         labels=(

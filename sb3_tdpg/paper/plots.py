@@ -37,8 +37,8 @@ def cost_histograms(records: pd.DataFrame, scenarios: Sequence[Scenario]) -> Fig
     Draw histograms of the episode cost, as in the paper's Fig. 3: one panel for each scenario.
 
     :param records: From :func:`~sb3_tdpg.evaluation.evaluate_scenarios`.
-    :param scenarios: The panels from left to right. The bins have equal widths on a logarithmic axis, because costs
-        range over two decades.
+    :param scenarios: The panels from left to right. The bins have equal widths on a logarithmic axis and cover at
+        most three decades; lower costs are in the first bin.
     """
     shown = records[records["scenario"].isin([scenario.name for scenario in scenarios])]
     figure, (panels,) = new_panels(WIDTH, 2.9, 1, len(scenarios), sharex=True, sharey=True)
@@ -95,7 +95,7 @@ def lava_trajectories(
 
 def robustness_curves(records: pd.DataFrame, noise_rows: Sequence[str], other_rows: Sequence[str]) -> Figure:
     """
-    Draw each method's mean cost in the scenarios of a table, with a line at the median over seeds and a dot per seed.
+    Draw each method's mean cost in the scenarios of a table, with a dash at the median over seeds and a dot per seed.
 
     :param records: Episodes, with a column ``train_seed``.
     :param noise_rows: Scenarios of the left panel in the order of their noise; the training comes before them.
