@@ -243,7 +243,7 @@ class TDPG(EpisodicAlgorithm):
 
     @property
     def pools_information(self) -> bool:
-        """Whether one estimate pools the steps of all times; true if all steps share the policy's weights."""
+        """Whether one estimate of the information uses all time steps; true if they share the policy's weights."""
         return not self.policy.time_varying
 
     def _setup_beta(self) -> None:

@@ -17,7 +17,7 @@ def rerun(config: str | os.PathLike[str], out: str | os.PathLike[str], *, progre
     """
     Train and evaluate the run that a ``config.json`` describes. The same versions give the same numbers.
 
-    Rows with a function that changes the sensor are left out, because the file contains only the function's name.
+    Scenarios whose sensor is changed by a function are left out, because the file contains only the function's name.
 
     :param config: The ``config.json``. If the run started from the policy of another run, that policy must be beside
         this file: ``<name of that run>/model.zip``.

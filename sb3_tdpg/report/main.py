@@ -173,7 +173,7 @@ class _Writer:
         self.not_before = time.monotonic() + PAUSE * (time.monotonic() - began)
 
     def write(self, rows: Sequence[Row], records: pd.DataFrame, knowledge: Sequence[Knowledge] = ()) -> str:
-        """Write the page with some rows, and return it as Markdown."""
+        """Write the page with the given rows, and return it as Markdown."""
         # The first method must come first, because all methods are compared with it.
         records = pd.concat([records[records["model"] == label] for label in self.names], ignore_index=True)
         out, numbers = self.out, make_numbers(records, seed=self.plan.seed)

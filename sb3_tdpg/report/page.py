@@ -142,7 +142,7 @@ def _by_word(words: pd.Series) -> dict[str, list[str]]:
 
 def _comparisons_table(numbers: Numbers) -> str:
     """
-    Make a table of how often a model costs less than a model of the first method.
+    Make a table of the share of pairs in which a model costs less than a model of the first method.
 
     The table is empty if no difference can be clear.
     """

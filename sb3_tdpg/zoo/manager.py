@@ -112,7 +112,7 @@ class TDPGExperimentManager(ExperimentManager):
             raise ValueError(f"{self.where} or a setting on the command line does not fit {reason}: correct it") from e
 
     def create_log_folder(self) -> None:
-        """Create the folder of the training; processes that start at the same time get different numbers."""
+        """Create the folder of the training; trainings that start at the same time get folders of their own."""
         while not (self.has_claimed or self.resume is not None or self.optimize_hyperparameters):
             try:
                 os.makedirs(self.save_path)
