@@ -20,7 +20,7 @@ ACTION_SCALE = 0.1
 # presses on the rim. yaw: 1 rad to either side.
 LOWEST_ACTION = np.array([-1.5, -1.5, -0.1, -10.0], np.float32)
 HIGHEST_ACTION = np.array([1.5, 1.5, 1.0, 10.0], np.float32)
-# Range of the sensor in m. Table and mug are 0.31 to 0.61 m away.
+# Range of the sensor in m. In training, table and mug are 0.27 to 0.61 m away.
 MIN_DEPTH, MAX_DEPTH = 0.2, 0.7
 MAX_CAMERA_SHIFT = 0.1  # m
 WORKSPACE = np.array([0.5, 0.0])  # m, middle of the workspace

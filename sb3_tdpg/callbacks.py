@@ -108,9 +108,9 @@ class SelectionCallback(TDPGCallback):
     :param save_path: File of the selected model (``.zip``); a ``.json`` file beside it holds the epoch, cost and
         information.
     :param verbose: 1: print every new best epoch.
-    :raises ValueError: if neither limit is given, or no policy can meet a limit. It is also raised at the start of a
-        training if a ``VecNormalize`` normalises the observations with statistics that still change
-        (``training=True``). Let the policy normalise the observations instead (``normalize_observations``).
+    :raises ValueError: if neither limit is given, ``cost_limit`` is NaN, or ``mi_limit`` is NaN or negative. It is also
+        raised at the start of a training if a ``VecNormalize`` normalises the observations with statistics that still
+        change (``training=True``). Let the policy normalise the observations instead (``normalize_observations``).
     """
 
     def __init__(

@@ -24,8 +24,8 @@ def threads(n: int | None) -> Iterator[None]:
     """
     Limit torch and the linear algebra of NumPy and SciPy to ``n`` threads in a block or a decorated function.
 
-    The decorator is ``@threads(n)``; ``n=None`` changes nothing. One thread is the safest choice for small arrays.
-    Two threads are about 10 % faster than one at most, if a core is free. If other programs use the cores, the two
+    The decorator is ``@threads(n)``; ``n=None`` changes nothing. One thread is the safest choice for small arrays:
+    two threads are at most about 10 % faster, if a core is free. If other programs use the cores, the two
     threads wait for each other at every step and can take a hundred times as long.
     """
     if n is None:
