@@ -36,7 +36,7 @@ class Shot:
 
 
 def shoot(model: TDPG, seed: int, faulty: bool, film: bool = True) -> Shot:
-    """Run an episode in PyBullet; if ``film`` is false, leave out the pictures."""
+    """Run an episode in PyBullet, and keep its pictures if ``film`` is true."""
     env = PandaSqueezeEnv(render_mode="rgb_array" if film else None)
     fault = Family(FAULT["perturbation"], env, FAULT["severity"], FAULT["scale"]).members(1, FAULT["seed"])
     set_random_seed(seed)  # for the policy's noise
@@ -81,7 +81,7 @@ def frame(shots: list[Shot], faulty: bool, step: int, i: int) -> Image.Image:
 
 
 def panda_squeeze(path: Path) -> None:
-    """Train both policies in the batched model (a minute in total), and film one part with and without the fault."""
+    """Train both policies in the batched model (a minute in total), and record one part with and without the fault."""
     models = []
     for settings in POLICIES.values():
         env = make_episodes_env("SqueezeInsert-v0", env_kwargs=dict(PANDA_SQUEEZE))

@@ -1,4 +1,4 @@
-"""``python -m sb3_tdpg enjoy``: episodes of a saved model, printed and recorded as a film."""
+"""``python -m sb3_tdpg enjoy``: episodes of a saved model, printed and recorded as a video."""
 
 import math
 import re
